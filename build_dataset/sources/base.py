@@ -1,0 +1,92 @@
+"""What every source of recorded episodes serves."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.ids import EpisodeId
+
+__all__ = ["Frame", "Source", "SourceEpisode"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One recorded time step.
+
+    Attributes:
+        images: Camera name (`front`, `wrist`, …) to image, `(H, W, 3) uint8` RGB.
+        state: Robot state, `(8,) float32`: 7 joint positions in rad, gripper opening.
+        action: Action of this time step, `(8,) float32`: 7 absolute joint targets in rad,
+            gripper −1 closed to 1 open.
+        is_demonstration: Whether the frame belongs to the demonstration; None if the source
+            does not say.
+    """
+
+    images: dict[str, NDArray[np.uint8]]
+    state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    is_demonstration: bool | None
+
+
+@dataclass(frozen=True)
+class SourceEpisode:
+    """A recorded episode, as its source lists it.
+
+    Attributes:
+        id: Episode id.
+        goals: Wordings of the goal; at least one.
+        raw_length: Recorded frames.
+        demonstration_length: Frames of the demonstration, which come first; None if the source
+            does not mark them. The frame at this index is the first live observation.
+        seed: Seed of the simulator, or None if not recorded.
+        difficulty: `easy`, `medium` or `hard`, or None if not recorded.
+        simulator: `robomme`, `tabletop`, or what the source names; None for real robots.
+        exact: False if the frames were lossily compressed before they came here.
+        cameras: Camera name to `(height, width)` in pixels.
+        key: Where the source finds the episode again: must be picklable.
+    """
+
+    id: EpisodeId
+    goals: tuple[str, ...]
+    raw_length: int
+    demonstration_length: int | None
+    seed: int | None
+    difficulty: str | None
+    simulator: str | None
+    exact: bool
+    cameras: dict[str, tuple[int, int]]
+    key: Any = field(compare=False)
+
+
+class Source(Protocol):
+    """A place with recorded episodes. Instances are picklable: workers get a copy each.
+
+    Attributes:
+        kind: Name under which the source is registered, e.g. `robomme-h5`.
+        provenance: What a dataset built from it records about it; the same on every machine
+            (no local paths), e.g. a Hub repository with its commit.
+    """
+
+    kind: str
+    provenance: dict[str, Any]
+
+    def episodes(self) -> list[SourceEpisode]:
+        """List all episodes, in the canonical order of their ids.
+
+        Raises:
+            SourceError: The recordings cannot be used; says which, why and what to do.
+        """
+        ...
+
+    def read(self, episode: SourceEpisode) -> Iterator[Frame]:
+        """Stream the frames of an episode in order, a bounded number in memory at a time.
+
+        Callers may stop early; closing the generator releases the files.
+
+        Raises:
+            SourceError: The recording breaks off or does not fit what `episodes` said of it.
+        """
+        ...

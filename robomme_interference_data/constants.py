@@ -1,0 +1,75 @@
+"""Numbers and names fixed by the protocol, and every path inside a dataset or split."""
+
+FORMAT_VERSION = 1
+"""Version of the files that this package writes; a reader refuses one that it does not know."""
+
+RULE_VERSION = 1
+"""Version of the rule that draws distractor units for a query (see `draw.py`)."""
+
+# --- protocol (paper, section "The Benchmark") -----------------------------------------------
+
+FAMILIES = (
+    "VideoRepick",
+    "VideoPlaceOrder",
+    "VideoPlaceButton",
+    "VideoUnmask",
+    "VideoUnmaskSwap",
+    "MoveCube",
+    "InsertPeg",
+    "PatternLock",
+    "RouteStick",
+)
+"""The nine task families of the benchmark, in the paper's order (object, spatial, procedural)."""
+
+SPLITS = ("train", "val", "test")
+
+DEFAULT_K = (0, 1, 3, 7)
+"""Numbers of distractor sessions in the paper's conditions k0, k1, k3 and k7."""
+
+MAX_K = 63
+
+UNIT_FRAMES = 32
+"""Stored frames in a distractor unit."""
+
+UNIT_STRIDE = 8
+"""Raw frames from one stored frame of a unit to the next."""
+
+UNIT_MIN_RAW_FRAMES = (UNIT_FRAMES - 1) * UNIT_STRIDE + 1
+"""Raw frames that an episode needs to yield a unit: indices 0, 8, …, 248, so 249."""
+
+MAX_STEPS = 1300
+"""Executed steps after which a rollout times out."""
+
+POSITION_LIMIT = 4096
+"""Steps for which released MME-VLA servers hold position embeddings."""
+
+SAMPLE_FRAMES = 32
+"""Frames that FrameSamp keeps of its whole history."""
+
+FPS = 10
+"""Recorded frames per second."""
+
+# --- features of a dataset -------------------------------------------------------------------
+
+FRONT = "observation.images.front"
+WRIST = "observation.images.wrist"
+STATE = "observation.state"
+ACTION = "action"
+CAMERA_PREFIX = "observation.images."
+
+# --- paths inside a dataset (LeRobot v3 layout, plus our two files in meta/) --------------------
+
+INFO_PATH = "meta/info.json"
+TASKS_PATH = "meta/tasks.parquet"
+EPISODES_DIR = "meta/episodes"
+IDENTITY_PATH = "meta/interference.json"
+REPORT_PATH = "meta/build_report.json"
+
+# --- paths inside a split ----------------------------------------------------------------------
+
+DEMONSTRATIONS = "demonstrations"
+DISTRACTORS = "distractors"
+MANIFESTS = "manifests"
+MANIFEST_PARQUET = "buffers.parquet"
+MANIFEST_JSONL = "buffers.jsonl"
+MANIFEST_JSON = "manifest.json"

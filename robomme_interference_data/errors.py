@@ -1,0 +1,115 @@
+"""Every error that this package raises on purpose.
+
+Each is also a fitting builtin, so that callers can catch either, and carries a `hint`: what to
+do next, with the command to type where there is one.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+__all__ = [
+    "InterferenceError",
+    # what was asked for
+    "InvalidIdError",
+    "UnknownNameError",
+    "InvalidOptionError",
+    "MissingExtraError",
+    # what was read
+    "MissingFileError",
+    "FormatError",
+    "HashMismatchError",
+    "TruncatedVideoError",
+    "SourceError",
+    # what was to be written
+    "BuildError",
+    "PoolTooSmallError",
+    "HistoryTooLongError",
+    # helpers
+    "nearest",
+]
+
+
+class InterferenceError(Exception):
+    """Base of all errors of this package.
+
+    Args:
+        message: What was given and what was expected.
+        hint: What to do next, or None.
+    """
+
+    def __init__(self, message: str, hint: str | None = None):
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return self.message if self.hint is None else f"{self.message}\n{self.hint}"
+
+
+class InvalidIdError(InterferenceError, ValueError):
+    """An episode id that does not read `<Family>/<split>/<index>`."""
+
+
+class UnknownNameError(InterferenceError, LookupError):
+    """An episode, family, k or camera that the data does not hold."""
+
+
+class InvalidOptionError(InterferenceError, ValueError):
+    """An option or argument outside what it may be."""
+
+
+class MissingExtraError(InterferenceError, ImportError):
+    """A library of an optional extra is not installed."""
+
+
+class MissingFileError(InterferenceError, FileNotFoundError):
+    """A file that a dataset or split must have is not there."""
+
+
+class FormatError(InterferenceError, ValueError):
+    """A file that cannot be read as what it should be, or of an unknown format version."""
+
+
+class HashMismatchError(InterferenceError, ValueError):
+    """Decoded data whose SHA-256 is not the recorded one."""
+
+
+class TruncatedVideoError(InterferenceError, ValueError):
+    """A video that ends before the frames that it should hold, or skips some of them."""
+
+
+class SourceError(InterferenceError, ValueError):
+    """Recorded episodes that cannot be used as they are."""
+
+
+class BuildError(InterferenceError, RuntimeError):
+    """A build that cannot go on."""
+
+
+class PoolTooSmallError(InterferenceError, ValueError):
+    """Fewer eligible distractor units than a buffer needs."""
+
+
+class HistoryTooLongError(InterferenceError, ValueError):
+    """A buffer that exceeds the position limit of the systems it is planned for."""
+
+
+def nearest(given: str, known: Iterable[str]) -> str:
+    """Return a sentence that offers the nearest valid names.
+
+    Args:
+        given: The unknown name.
+        known: All valid names; at most 10 of them are listed when none is near.
+
+    Returns:
+        `"Did you mean 'a' or 'b'?"`, `"Known: …"`, or an empty string if `known` is empty.
+    """
+    names = sorted(known)
+    folded = {name.lower(): name for name in names}
+    close = get_close_matches(given.lower(), list(folded), n=3, cutoff=0.6)
+    if close:
+        return "Did you mean " + " or ".join(repr(folded[name]) for name in close) + "?"
+    if not names:
+        return ""
+    more = f", … ({len(names)} in all)" if len(names) > 10 else ""
+    return "Known: " + ", ".join(names[:10]) + more
