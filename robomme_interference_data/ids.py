@@ -79,7 +79,7 @@ class EpisodeId:
 
 
 def condition_name(k: int) -> str:
-    """Name of the condition with `k` distractor sessions: `k0`, `k1`, `k3`, `k7`, …"""
+    """Name of the condition with `k` distractor sessions: `k0`, `k1`, `k3`, `k7` and so on."""
     return f"k{k}"
 
 

@@ -61,9 +61,7 @@ def iter_frames(
         )
 
 
-def decode_into(
-    out: NDArray[np.uint8], path: Path, start: int, fps: float
-) -> NDArray[np.uint8]:
+def decode_into(out: NDArray[np.uint8], path: Path, start: int, fps: float) -> NDArray[np.uint8]:
     """Decode `len(out)` frames from number `start` on into `out`, `(T, H, W, 3) uint8`.
 
     Returns:

@@ -1,0 +1,316 @@
+"""A history buffer: its sessions in order, and their frames when asked for."""
+
+import os
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.cache import DecodedCache
+from robomme_interference_data.constants import CAMERA_PREFIX, STATE
+from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.digest import combine
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    InvalidOptionError,
+    UnknownNameError,
+    nearest,
+)
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema import BufferManifest, SessionEntry
+
+__all__ = ["Buffer", "Chunk", "Session"]
+
+_PIECE = 128
+"""Frames that one thread decodes at a time: a multiple of the key frame distance (16)."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session of a buffer.
+
+    Attributes:
+        role: `lesson`, `distractor`, … (see `schema.ROLES`).
+        family: Family of the recorded episode.
+        source: Id of the recorded episode.
+        start: First frame of the session in the buffer.
+        stop: Frame after its last one.
+        entry: Where the frames are stored.
+    """
+
+    role: str
+    family: str
+    source: EpisodeId
+    start: int
+    stop: int
+    entry: SessionEntry
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive frames of a buffer, as `Buffer.stream` gives them.
+
+    Attributes:
+        start: Index of the first frame in the buffer.
+        frames: Camera to `(n, H, W, 3) uint8`.
+        states: `(n, D) float32`.
+        session_index: `(n,) int64`.
+    """
+
+    start: int
+    frames: dict[str, NDArray[np.uint8]]
+    states: NDArray[np.float32]
+    session_index: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.session_index)
+
+
+class Buffer:
+    """A history buffer; made by `load_buffer`. Frames are decoded when asked for.
+
+    Attributes:
+        manifest: What the buffer holds, by name.
+    """
+
+    def __init__(
+        self,
+        manifest: BufferManifest,
+        datasets: Mapping[str, Dataset],
+        *,
+        cache: DecodedCache | None = None,
+        threads: int | None = None,
+    ):
+        self.manifest = manifest
+        self._datasets = datasets
+        self._cache = cache
+        self._threads = threads if threads is not None else os.cpu_count() or 1
+        if self._threads < 1:
+            raise InvalidOptionError(f"threads={threads}; expected 1 or more")
+
+    def __repr__(self) -> str:
+        return (
+            f"Buffer({self.episode_id}, k={self.k}, frames={len(self)}, "
+            f"sessions={len(self.manifest.sessions)}, cameras={list(self.cameras)})"
+        )
+
+    def __len__(self) -> int:
+        """Return the number of history frames, without the first live observation."""
+        return self.manifest.history_frames
+
+    @property
+    def episode_id(self) -> EpisodeId:
+        """Id of the query episode."""
+        return self.manifest.episode_id
+
+    @property
+    def k(self) -> int:
+        """Number of distractor sessions."""
+        return self.manifest.k
+
+    @property
+    def goal(self) -> str:
+        """The query's goal in words: the first of its wordings."""
+        return self.manifest.goal
+
+    @property
+    def exec_start_idx(self) -> int:
+        """Number of history frames before the first live observation."""
+        return self.manifest.history_frames
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, such as `front` and `wrist`."""
+        names = self._datasets[self.manifest.query.dataset].cameras
+        return tuple(name.removeprefix(CAMERA_PREFIX) for name in names)
+
+    @cached_property
+    def sessions(self) -> tuple[Session, ...]:
+        """The sessions in order, with their places in the buffer."""
+        entries = self.manifest.sessions
+        stops = list(accumulate(entry.num_frames for entry in entries))
+        return tuple(
+            Session(e.role, e.family, e.source, stop - e.num_frames, stop, e)
+            for e, stop in zip(entries, stops, strict=True)
+        )
+
+    @property
+    def session_index(self) -> NDArray[np.int64]:
+        """For each frame, the number of its session, `(T,) int64`."""
+        counts = [entry.num_frames for entry in self.manifest.sessions]
+        return np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+
+    @cached_property
+    def states(self) -> NDArray[np.float32]:
+        """Robot states, `(T, 8) float32`: joint positions in rad, gripper opening."""
+        return self._vectors(STATE)
+
+    def frames(self, camera: str = "front") -> NDArray[np.uint8]:
+        """Decode all frames of a camera, sessions side by side on several threads.
+
+        Args:
+            camera: Name of the camera, with or without `observation.images.`.
+
+        Returns:
+            `(T, H, W, 3) uint8` RGB; a new array.
+
+        Raises:
+            UnknownNameError: There is no such camera.
+            MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
+        """
+        feature = self._feature(camera)
+        out = np.empty((len(self), *self._shape(feature)), np.uint8)
+        with ThreadPoolExecutor(self._threads) as pool:
+            try:
+                finish = [self._start_reading(s, feature, out, pool) for s in self.sessions]
+                for step in finish:
+                    step()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return out
+
+    def query_frame(self, camera: str = "front") -> NDArray[np.uint8]:
+        """Decode the first live observation, `(H, W, 3) uint8` RGB; not part of the buffer."""
+        query = self.manifest.query
+        feature = self._feature(camera)
+        out = np.empty((1, *self._shape(feature)), np.uint8)
+        self._datasets[query.dataset].read_frames(query.episode_index, feature, query.frame, out)
+        return out[0]
+
+    def stream(self, chunk: int = 64, cameras: tuple[str, ...] | None = None) -> Iterator[Chunk]:
+        """Decode the buffer in chunks, in order, holding one chunk at a time.
+
+        Args:
+            chunk: Frames in a chunk; the last one may be shorter.
+            cameras: Names of the cameras; None for all.
+
+        Raises:
+            InvalidOptionError: `chunk` is not positive.
+            UnknownNameError, MissingFileError, FormatError, TruncatedVideoError: As `frames`.
+        """
+        if chunk < 1:
+            raise InvalidOptionError(f"chunk={chunk}; expected 1 or more")
+        names = {name: self._feature(name) for name in cameras or self.cameras}
+        decoders = {name: self._iter_frames(feature) for name, feature in names.items()}
+        session_index = self.session_index
+        try:
+            for start in range(0, len(self), chunk):
+                stop = min(start + chunk, len(self))
+                frames = {}
+                for name, feature in names.items():
+                    out = np.empty((stop - start, *self._shape(feature)), np.uint8)
+                    for position in range(stop - start):
+                        out[position] = next(decoders[name])
+                    frames[name] = out
+                yield Chunk(start, frames, self.states[start:stop], session_index[start:stop])
+        finally:
+            for decoder in decoders.values():
+                decoder.close()
+
+    def verify(self) -> None:
+        """Decode everything and compare it with the manifest's SHA-256.
+
+        Raises:
+            HashMismatchError: A session's data is not what the manifest names.
+        """
+        for session in self.sessions:
+            entry = session.entry
+            dataset = self._datasets[entry.dataset]
+            found = dataset.span_digests(entry.episode_index, entry.start, entry.stop)
+            if combine(found) == entry.sha256:
+                continue
+            recorded = dataset.digests(entry.episode_index, entry.start, entry.stop) or {}
+            differing = [name for name in found if found[name] != recorded.get(name)]
+            raise HashMismatchError(
+                f"{self.episode_id} at k={self.k}: {entry.role} {entry.source} "
+                f"({entry.dataset} episode {entry.episode_index}, frames {entry.start} to "
+                f"{entry.stop - 1}) does not have the SHA-256 of the manifest; differing: "
+                f"{', '.join(differing) or 'the manifest itself'}",
+                "The data is damaged or belongs to another version: download or build it again, "
+                "then run robomme-interference verify SPLIT",
+            )
+
+    def _start_reading(
+        self,
+        session: Session,
+        feature: str,
+        out: NDArray[np.uint8],
+        pool: ThreadPoolExecutor,
+    ) -> Callable[[], None]:
+        """Start to read a session into its place in `out`; the result waits until it is done."""
+        entry = session.entry
+        dataset = self._datasets[entry.dataset]
+        target = out[session.start : session.stop]
+        length = entry.stop - entry.start
+        digest = None
+        if self._cache is not None:
+            recorded = dataset.digests(entry.episode_index, entry.start, entry.stop)
+            digest = recorded[feature] if recorded else None
+        if self._cache is not None and digest is not None:
+            cached = self._cache.get(digest, (length, *out.shape[1:]))
+            if cached is not None:
+                copied = pool.submit(_copy_repeated, target, cached, entry.repeat)
+                return copied.result
+        span = target if entry.repeat == 1 else np.empty((length, *out.shape[1:]), np.uint8)
+        piece = _PIECE if self._threads > 1 else length
+        read = [
+            pool.submit(
+                dataset.read_frames,
+                entry.episode_index,
+                feature,
+                entry.start + first,
+                span[first : first + piece],
+            )
+            for first in range(0, length, piece)
+        ]
+
+        def finish() -> None:
+            for future in read:
+                future.result()
+            if span is not target:
+                _copy_repeated(target, span, entry.repeat)
+            if self._cache is not None and digest is not None:
+                self._cache.put(digest, span)
+
+        return finish
+
+    def _iter_frames(self, feature: str) -> Generator[NDArray[np.uint8]]:
+        for entry in self.manifest.sessions:
+            dataset = self._datasets[entry.dataset]
+            for frame in dataset.iter_frames(entry.episode_index, feature, entry.start, entry.stop):
+                for _ in range(entry.repeat):
+                    yield frame
+
+    def _vectors(self, feature: str) -> NDArray[np.float32]:
+        parts = []
+        for entry in self.manifest.sessions:
+            values = self._datasets[entry.dataset].read_vectors(
+                entry.episode_index, feature, entry.start, entry.stop
+            )
+            parts.append(np.repeat(values, entry.repeat, axis=0))
+        if not parts:
+            shape = self._datasets[self.manifest.query.dataset].features[feature]
+            return np.empty((0, *shape), np.float32)
+        return np.concatenate(parts)
+
+    def _feature(self, camera: str) -> str:
+        name = camera.removeprefix(CAMERA_PREFIX)
+        if name not in self.cameras:
+            raise UnknownNameError(
+                f"camera {camera!r} is not in the buffer of {self.episode_id}",
+                nearest(name, self.cameras),
+            )
+        return CAMERA_PREFIX + name
+
+    def _shape(self, feature: str) -> tuple[int, ...]:
+        return self._datasets[self.manifest.query.dataset].features[feature]
+
+
+def _copy_repeated(target: NDArray[np.uint8], frames: NDArray[np.uint8], repeat: int) -> None:
+    for offset in range(repeat):
+        target[offset::repeat] = frames

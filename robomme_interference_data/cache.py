@@ -1,0 +1,90 @@
+"""A cache of decoded frames: memory-mappable arrays by content hash, bounded in size."""
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.files import atomic_path
+
+__all__ = ["DecodedCache", "default_cache_folder"]
+
+_HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
+
+
+def default_cache_folder() -> Path:
+    """Return the folder for decoded frames, under `XDG_CACHE_HOME` or `~/.cache`."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "robomme-interference" / "decoded"
+
+
+@dataclass(frozen=True)
+class DecodedCache:
+    """Decoded frames of sessions, one `.npy` file each, named by the SHA-256 of the frames.
+
+    Files that were not used for longest are removed when the folder outgrows its bound. Several
+    processes may share a folder: files appear whole, and one that vanishes is decoded again.
+
+    Args:
+        folder: Where the arrays lie; made when first written to.
+        max_bytes: Bound on the folder's size, in bytes.
+
+    Raises:
+        InvalidOptionError: The bound is not positive.
+    """
+
+    folder: Path
+    max_bytes: int = 20 * 2**30
+
+    def __post_init__(self) -> None:
+        if self.max_bytes <= 0:
+            raise InvalidOptionError(f"cache bound of {self.max_bytes} bytes is not positive")
+
+    def get(self, sha256: str, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+        """Return cached frames as a read-only memory map, or None.
+
+        Args:
+            sha256: Digest of the frames.
+            shape: Expected shape, `(T, H, W, 3)`; a file of another one counts as absent.
+        """
+        path = self._path(sha256)
+        try:
+            frames = np.load(path, mmap_mode="r")
+            os.utime(path)
+        except (OSError, ValueError):
+            return None
+        return frames if frames.shape == shape and frames.dtype == np.uint8 else None
+
+    def put(self, sha256: str, frames: NDArray[np.uint8]) -> None:
+        """Store frames, unless they alone exceed the bound, and remove the least used ones."""
+        if frames.nbytes + _HEADER > self.max_bytes:
+            return
+        with atomic_path(self._path(sha256)) as partial, partial.open("wb") as file:
+            np.save(file, frames)
+        self._shrink()
+
+    def _path(self, sha256: str) -> Path:
+        return self.folder / f"{sha256}.npy"
+
+    def _shrink(self) -> None:
+        files = _stats(self.folder.glob("*.npy"))
+        size = sum(stat.st_size for _, stat in files)
+        for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
+            if size <= self.max_bytes:
+                return
+            path.unlink(missing_ok=True)
+            size -= stat.st_size
+
+
+def _stats(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
+    found = []
+    for path in paths:
+        try:
+            found.append((path, path.stat()))
+        except FileNotFoundError:  # removed by another process
+            continue
+    return found

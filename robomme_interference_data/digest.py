@@ -1,0 +1,54 @@
+"""SHA-256 over decoded data: what bit-exact means here, and how it is written down.
+
+The digest of a *feature* over a span of frames is the SHA-256 of its values in order, without any
+header: images as `(T, H, W, 3) uint8` RGB, vectors as `(T, D) float32` little-endian, C order. The
+digest of a *span* is the SHA-256 of the canonical JSON of all its feature digests by name. So any
+hashlib can recompute both from decoded arrays.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.files import canonical_json
+
+__all__ = ["FeatureDigests", "combine", "feature_digest"]
+
+
+def combine(digests: Mapping[str, str]) -> str:
+    """Return the digest of a span from the digests of its features, by feature name."""
+    return hashlib.sha256(canonical_json(dict(digests)).encode()).hexdigest()
+
+
+def feature_digest(values: NDArray[Any]) -> str:
+    """Return the digest of one feature: `(T, H, W, 3) uint8` images or `(T, D) float32`."""
+    return hashlib.sha256(_bytes(values)).hexdigest()
+
+
+class FeatureDigests:
+    """Digests of several features, computed while frames pass by."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, Any] = {}
+
+    def update(self, feature: str, values: NDArray[Any]) -> None:
+        """Add the next value, or several stacked along a first axis, of a feature."""
+        running = self._running.get(feature)
+        if running is None:
+            running = self._running[feature] = hashlib.sha256()
+        running.update(_bytes(values))
+
+    def current(self) -> dict[str, str]:
+        """Return the digests of all that came so far, by feature name; more may follow."""
+        return {name: running.copy().hexdigest() for name, running in self._running.items()}
+
+
+def _bytes(values: NDArray[Any]) -> memoryview:
+    if values.dtype == np.float32:
+        values = values.astype("<f4", copy=False)
+    elif values.dtype != np.uint8:
+        raise TypeError(f"digests are over uint8 or float32 values, not {values.dtype}")
+    return memoryview(np.ascontiguousarray(values)).cast("B")
