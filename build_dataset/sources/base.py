@@ -18,16 +18,17 @@ class Frame:
 
     Attributes:
         images: Camera name (`front`, `wrist`, …) to image, `(H, W, 3) uint8` RGB.
-        state: Robot state, `(8,) float32`: 7 joint positions in rad, gripper opening.
-        action: Action of this time step, `(8,) float32`: 7 absolute joint targets in rad,
-            gripper −1 closed to 1 open.
+        state: Robot state, `(S,) float32`; RoboMME's has 8 values: 7 joint positions in rad, and
+            the gripper opening in m.
+        action: Action of this time step, `(A,) float32`, or None if actions were not recorded;
+            RoboMME's has 8 values: 7 absolute joint targets in rad, gripper −1 closed to 1 open.
         is_demonstration: Whether the frame belongs to the demonstration; None if the source
             does not say.
     """
 
     images: dict[str, NDArray[np.uint8]]
     state: NDArray[np.float32]
-    action: NDArray[np.float32]
+    action: NDArray[np.float32] | None
     is_demonstration: bool | None
 
 
@@ -46,7 +47,10 @@ class SourceEpisode:
         simulator: `robomme`, `tabletop`, or what the source names; None for real robots.
         exact: False if the frames were lossily compressed before they came here.
         cameras: Camera name to `(height, width)` in pixels.
-        key: Where the source finds the episode again: must be picklable.
+        key: Where the source finds the episode again, and what changes if the recording does
+            (such as a file's time and size): must be picklable.
+        state_size: Values in a state.
+        action_size: Values in an action; None if actions were not recorded.
     """
 
     id: EpisodeId
@@ -59,6 +63,8 @@ class SourceEpisode:
     exact: bool
     cameras: dict[str, tuple[int, int]]
     key: Any = field(compare=False)
+    state_size: int = 8
+    action_size: int | None = 8
 
 
 class Source(Protocol):
