@@ -124,9 +124,8 @@ class RoboMMEH5Source:
                     numbers = _numbers(file, "episode_")
                     if not numbers:
                         raise SourceError(f"{path} holds no episode_<N> group")
-                    found += [
-                        self._describe(family, path, file, number, numbers[0]) for number in numbers
-                    ]
+                    ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
+                    found += [self._describe(ids[n], path, file, n) for n in numbers]
             except (OSError, KeyError) as error:
                 raise SourceError(
                     f"{path} is not a complete RoboMME recording: {error}",

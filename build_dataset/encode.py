@@ -1,0 +1,168 @@
+"""Encode frames as video with PyAV, and gather the image statistics that LeRobot stores."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import BuildError, InvalidOptionError, nearest
+
+__all__ = ["CODECS", "Codec", "ImageStats", "VideoEncoder", "get_codec"]
+
+
+@dataclass(frozen=True)
+class Codec:
+    """Video settings, in LeRobot's terms (`RGBEncoderConfig`).
+
+    Attributes:
+        name: Name on the command line.
+        vcodec: FFmpeg encoder.
+        pix_fmt: Pixel format.
+        settings: Further arguments of `RGBEncoderConfig`.
+        options: What they become for FFmpeg; a test holds the two against each other.
+        exact: Whether decoding gives back the very pixels.
+    """
+
+    name: str
+    vcodec: str
+    pix_fmt: str
+    settings: Mapping[str, Any]
+    options: Mapping[str, str]
+    exact: bool
+
+
+CODECS = {
+    codec.name: codec
+    for codec in (
+        # Exact in PyAV, torchcodec and browsers; a key frame every 16 frames and no reordering,
+        # so that seeking is safe.
+        Codec(
+            name="av1-lossless",
+            vcodec="libaom-av1",
+            pix_fmt="gbrp",
+            settings={
+                "g": 16,
+                "crf": None,
+                "extra_options": {
+                    "usage": 1,
+                    "cpu-used": 8,
+                    "row-mt": 1,
+                    "aom-params": "lossless=1",
+                },
+            },
+            options={
+                "g": "16",
+                "usage": "1",
+                "cpu-used": "8",
+                "row-mt": "1",
+                "aom-params": "lossless=1",
+            },
+            exact=True,
+        ),
+        Codec(
+            name="lerobot-default",
+            vcodec="libsvtav1",
+            pix_fmt="yuv420p",
+            settings={"g": 2, "crf": 30, "preset": 12},
+            options={"g": "2", "crf": "30", "preset": "12", "svtav1-params": "fast-decode=0"},
+            exact=False,
+        ),
+    )
+}
+"""The codecs that a dataset can be built with, by name."""
+
+
+def get_codec(name: str) -> Codec:
+    """Return a codec by name.
+
+    Raises:
+        InvalidOptionError: There is no such codec.
+    """
+    if name not in CODECS:
+        raise InvalidOptionError(f"--codec {name!r} is unknown", nearest(name, CODECS))
+    return CODECS[name]
+
+
+class VideoEncoder:
+    """Writes frames to one video file, in the calling thread: none can be dropped.
+
+    Args:
+        path: File to write.
+        codec: Settings.
+        fps: Frame rate in Hz.
+        height: Rows of pixels.
+        width: Columns of pixels.
+    """
+
+    def __init__(self, path: Path, codec: Codec, fps: int, height: int, width: int):
+        try:
+            self._container = av.open(str(path), "w")
+            self._stream = self._container.add_stream(
+                codec.vcodec, rate=fps, options=dict(codec.options)
+            )
+        except av.error.FFmpegError as error:
+            raise BuildError(f"{path}: the video cannot be written: {error}") from error
+        self._stream.pix_fmt = codec.pix_fmt
+        self._stream.height = height
+        self._stream.width = width
+        self._stream.codec_context.thread_count = 1  # episodes are encoded side by side instead
+        self._time_base = Fraction(1, fps)
+        self._stream.time_base = self._time_base
+        self._count = 0
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Encode the next frame, `(H, W, 3) uint8` RGB."""
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame.pts = self._count
+        frame.time_base = self._time_base
+        self._container.mux(self._stream.encode(frame))
+        self._count += 1
+
+    def close(self) -> None:
+        """Write what is pending and close the file."""
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+
+class ImageStats:
+    """Per-channel statistics of images, from every fourth row and column of every frame.
+
+    LeRobot, too, estimates image statistics from downsampled frames. Counting the 256 values
+    makes them exact on those pixels, and the same on every machine.
+    """
+
+    _STEP = 4
+    _QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+
+    def __init__(self) -> None:
+        self._counts = np.zeros((3, 256), np.int64)
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Count a frame, `(H, W, 3) uint8`."""
+        pixels = image[:: self._STEP, :: self._STEP]
+        for channel in range(3):
+            self._counts[channel] += np.bincount(pixels[..., channel].ravel(), minlength=256)
+
+    def result(self) -> dict[str, NDArray[np.float64]]:
+        """Return statistic name to one value per channel, `(3,)`, on the scale 0 to 255."""
+        values = np.arange(256, dtype=np.float64)
+        total = self._counts.sum(axis=1)
+        mean = (self._counts * values).sum(axis=1) / total
+        variance = (self._counts * (values[None] - mean[:, None]) ** 2).sum(axis=1) / total
+        cumulated = self._counts.cumsum(axis=1)
+        stats = {
+            "min": np.argmax(self._counts > 0, axis=1).astype(np.float64),
+            "max": 255.0 - np.argmax(self._counts[:, ::-1] > 0, axis=1),
+            "mean": mean,
+            "std": np.sqrt(variance),
+            "count": np.array([int(total[0])]),
+        }
+        for quantile in self._QUANTILES:
+            reached = cumulated >= quantile * total[:, None]
+            stats[f"q{round(quantile * 100):02d}"] = np.argmax(reached, axis=1).astype(np.float64)
+        return stats

@@ -1,0 +1,80 @@
+"""Show how far a build is: frames done, frames per second, time left."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Self
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+__all__ = ["BuildProgress"]
+
+
+class _FramesPerSecond(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:,.0f} frames/s" if speed else "", style="progress.data.speed")
+
+
+class BuildProgress:
+    """A progress bar on stderr; use as a context manager.
+
+    Args:
+        quiet: Show nothing.
+    """
+
+    def __init__(self, *, quiet: bool = False):
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+            _FramesPerSecond(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True, quiet=quiet),
+        )
+        self._task = None
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._progress.stop()
+
+    def start(self, description: str, frames: int) -> None:
+        """Begin a new bar of so many frames."""
+        self._task = self._progress.add_task(description, total=frames)
+
+    def advance(self, frames: int, *, before: bool = False) -> None:
+        """Count frames as done.
+
+        Args:
+            frames: How many.
+            before: They were done by an earlier run, and do not count for the speed.
+        """
+        if self._task is None:
+            return
+        if before:
+            task = self._progress.tasks[self._task]
+            self._progress.reset(self._task, completed=int(task.completed) + frames)
+        else:
+            self._progress.advance(self._task, frames)
+
+    @contextmanager
+    def status(self, description: str) -> Iterator[None]:
+        """Show a line while work of unknown length goes on."""
+        task = self._progress.add_task(description, total=None)
+        try:
+            yield
+        finally:
+            self._progress.remove_task(task)
