@@ -40,7 +40,7 @@ from robomme_interference_data.files import atomic_path, sha256_file, write_json
 from robomme_interference_data.ids import EpisodeId, condition_name
 from robomme_interference_data.manifest_io import QUERY_TYPE, SCHEMA, SESSION_TYPE
 
-__all__ = ["ManifestPlan", "check_history", "plan_manifests", "write_manifests"]
+__all__ = ["ManifestPlan", "check_history", "expected_rows", "plan_manifests", "write_manifests"]
 
 _BATCH = 1024
 """Queries in a batch; also bounds the rows of a row group, so that few bytes find one buffer."""
@@ -179,6 +179,12 @@ def write_manifests(plan: ManifestPlan, out: Path) -> Iterator[int]:
             },
         },
     )
+
+
+def expected_rows(plan: ManifestPlan) -> Iterator[dict[str, Any]]:
+    """Yield the rows that `write_manifests` would write, in order, as plain values."""
+    for batch in _Rows(plan).batches():
+        yield from batch.table.to_pylist()
 
 
 @dataclass(frozen=True)

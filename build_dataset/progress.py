@@ -1,4 +1,4 @@
-"""Show how far a build is: frames done, frames per second, time left."""
+"""Show how far work is: frames done, frames per second, time left."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,26 +19,31 @@ from rich.text import Text
 __all__ = ["BuildProgress"]
 
 
-class _FramesPerSecond(ProgressColumn):
+class _Speed(ProgressColumn):
+    def __init__(self, unit: str):
+        super().__init__()
+        self._unit = unit
+
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        return Text(f"{speed:,.0f} frames/s" if speed else "", style="progress.data.speed")
+        return Text(f"{speed:,.0f} {self._unit}/s" if speed else "", style="progress.data.speed")
 
 
 class BuildProgress:
     """A progress bar on stderr; use as a context manager.
 
     Args:
+        unit: What is counted.
         quiet: Show nothing.
     """
 
-    def __init__(self, *, quiet: bool = False):
+    def __init__(self, *, unit: str = "frames", quiet: bool = False):
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("frames"),
-            _FramesPerSecond(),
+            TextColumn(unit),
+            _Speed(unit),
             TimeRemainingColumn(),
             console=Console(stderr=True, quiet=quiet),
         )

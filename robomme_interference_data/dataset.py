@@ -258,14 +258,26 @@ class Dataset:
 
     def span_digests(self, episode_index: int, start: int, stop: int) -> dict[str, str]:
         """Decode a span and return the digests of all its features; one frame in memory."""
-        digests = FeatureDigests()
+        return next(iter(self._digests(episode_index, start, [stop])))
+
+    def prefix_digests(self, episode_index: int, stops: list[int]) -> list[dict[str, str]]:
+        """Decode an episode once; return its digests over frames 0 to each of `stops`."""
+        return self._digests(episode_index, 0, stops)
+
+    def _digests(self, episode_index: int, start: int, stops: list[int]) -> list[dict[str, str]]:
+        digests: dict[int, dict[str, str]] = {stop: {} for stop in stops}
         for name in self.features:
-            if name in self.cameras:
-                for frame in self.iter_frames(episode_index, name, start, stop):
-                    digests.update(name, frame)
-            else:
-                digests.update(name, self.read_vectors(episode_index, name, start, stop))
-        return digests.current()
+            running = FeatureDigests()
+            values = (
+                self.iter_frames(episode_index, name, start, max(stops))
+                if name in self.cameras
+                else iter(self.read_vectors(episode_index, name, start, max(stops)))
+            )
+            for index, value in enumerate(values, start + 1):
+                running.update(name, value)
+                if index in digests:
+                    digests[index] |= running.current()
+        return [digests[stop] for stop in stops]
 
     def _row(self, episode_index: int) -> dict[str, Any]:
         if not 0 <= episode_index < len(self):

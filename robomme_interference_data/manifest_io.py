@@ -126,8 +126,12 @@ class ManifestReader:
             filters: Conditions `(column, operator, value)` as of `pyarrow.parquet.read_table`;
                 an empty list selects all.
         """
-        for batch in self._batches(filters):
-            yield from (_manifest(row) for row in batch.to_pylist())
+        return map(_manifest, self.rows(filters))
+
+    def rows(self, filters: list[tuple[str, str, Any]] | None = None) -> Iterator[dict[str, Any]]:
+        """Yield the rows that pass all filters as plain values, in file order; see `select`."""
+        for batch in self._batches(filters or []):
+            yield from batch.to_pylist()
 
     @cached_property
     def _parquet(self) -> pq.ParquetFile:

@@ -1,0 +1,401 @@
+"""Commands that make and check splits: `build …`, `verify` and `audit`."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from robomme_interference_data.constants import (
+    DEFAULT_K,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    MANIFESTS,
+    POSITION_LIMIT,
+)
+from robomme_interference_data.errors import InvalidOptionError
+
+__all__ = ["app", "audit", "verify"]
+
+_ERR = Console(stderr=True)
+_OUT = Console()
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Build datasets of demonstrations and distractor units, and manifests of buffers.",
+    epilog="""Flow: record or download episodes, build both datasets and the manifests, verify.
+
+```
+robomme-interference build all --source robomme-h5:recordings/ --out my-split
+robomme-interference verify my-split
+robomme-interference show MoveCube/train/0 --split my-split --k 3 --out strip.png
+```
+
+`build all` is these three, with S=my-split:
+
+```
+robomme-interference build demonstrations --source robomme-h5:recordings/ --out $S/demonstrations
+robomme-interference build distractors --source robomme-h5:recordings/ --out $S/distractors
+robomme-interference build manifests --demonstrations $S/demonstrations \\
+    --distractors $S/distractors --out $S/manifests --k 0 1 3 7 --seed 0
+```
+""",
+)
+
+Sources = Annotated[
+    list[str],
+    typer.Option(
+        "--source",
+        help="KIND:LOCATION, with kind robomme-h5, lerobot or frames; may be given several times.",
+    ),
+]
+Families = Annotated[
+    str | None, typer.Option(help="Families to take, comma-separated; all by default.")
+]
+Episodes = Annotated[
+    str | None, typer.Option(help="Episode numbers to take, such as 0-49 or 0,3,10-12.")
+]
+Cameras = Annotated[
+    str | None, typer.Option(help="Cameras to store, such as front; all by default.")
+]
+CodecName = Annotated[
+    str, typer.Option(help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).")
+]
+Version = Annotated[str, typer.Option(help="Version that the dataset carries.")]
+Workers = Annotated[
+    int, typer.Option(help="Processes that encode side by side.", show_default="all processors")
+]
+TimeLimit = Annotated[
+    float,
+    typer.Option(help="Seconds that one episode may take before it is tried once more."),
+]
+Columns = Annotated[
+    str | None,
+    typer.Option(help="lerobot sources: NAME=COLUMN,… where the dataset's columns differ."),
+]
+FamiliesFile = Annotated[
+    Path | None, typer.Option(help="lerobot sources: file that names each episode's family.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+K = Annotated[
+    list[int] | None,
+    typer.Option("--k", help="Numbers of distractor sessions.", show_default="0 1 3 7"),
+]
+Seed = Annotated[int, typer.Option(help="Seed of the draw.")]
+Limit = Annotated[
+    str,
+    typer.Option(help="Positions that the systems hold for history and rollout, or none."),
+]
+
+_CPUS = os.cpu_count() or 1
+_TIME_LIMIT = 1800.0
+
+
+@app.command()
+def demonstrations(
+    source: Sources,
+    out: Annotated[Path, typer.Option(help="Folder of the dataset; made by the build.")],
+    families: Families = None,
+    split: Annotated[str | None, typer.Option(help="Only train, val or test.")] = None,
+    episodes: Episodes = None,
+    cameras: Cameras = None,
+    codec: CodecName = "av1-lossless",
+    version: Version = "1.0.0",
+    workers: Workers = _CPUS,
+    time_limit: TimeLimit = _TIME_LIMIT,
+    columns: Columns = None,
+    families_file: FamiliesFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Build the query episodes' demonstrations, each with its first live observation at the end.
+
+    Stopped with Ctrl-C, or killed, a build goes on where it was when the command is run again.
+    """
+    filters = (families, split, episodes)
+    settings = (codec, cameras, version, workers, time_limit)
+    _build(
+        DEMONSTRATIONS, source, out, filters, settings, (columns, families_file), as_json=as_json
+    )
+
+
+@app.command()
+def distractors(
+    source: Sources,
+    out: Annotated[Path, typer.Option(help="Folder of the dataset; made by the build.")],
+    families: Families = None,
+    split: Annotated[str, typer.Option(help="train; others leak query episodes.")] = "train",
+    episodes: Episodes = None,
+    cameras: Cameras = None,
+    codec: CodecName = "av1-lossless",
+    version: Version = "1.0.0",
+    workers: Workers = _CPUS,
+    time_limit: TimeLimit = _TIME_LIMIT,
+    columns: Columns = None,
+    families_file: FamiliesFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
+
+    Episodes of fewer than 249 raw frames yield no unit; they are listed in meta/build_report.json.
+    """
+    filters = (families, split, episodes)
+    settings = (codec, cameras, version, workers, time_limit)
+    _build(DISTRACTORS, source, out, filters, settings, (columns, families_file), as_json=as_json)
+
+
+@app.command()
+def manifests(
+    demonstrations: Annotated[Path, typer.Option(help="Dataset of demonstrations.")],
+    distractors: Annotated[Path, typer.Option(help="Dataset of distractor units.")],
+    out: Annotated[Path, typer.Option(help="Folder of the manifests.")],
+    k: K = None,
+    seed: Seed = 0,
+    position_limit: Limit = str(POSITION_LIMIT),
+    as_json: AsJson = False,
+) -> None:
+    """Plan the history buffers of all query episodes: the same inputs give the same bytes."""
+    _manifests(demonstrations, distractors, out, k, seed, position_limit, as_json=as_json)
+
+
+@app.command(name="all")
+def build_all(
+    source: Sources,
+    out: Annotated[Path, typer.Option(help="Folder of the split.")],
+    families: Annotated[
+        str | None, typer.Option(help="Families of the query episodes; all by default.")
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option(help="Split of the query episodes; distractors are train's.")
+    ] = None,
+    episodes: Annotated[
+        str | None, typer.Option(help="Numbers of the query episodes, such as 0-49.")
+    ] = None,
+    cameras: Cameras = None,
+    codec: CodecName = "av1-lossless",
+    version: Version = "1.0.0",
+    k: K = None,
+    seed: Seed = 0,
+    position_limit: Limit = str(POSITION_LIMIT),
+    workers: Workers = _CPUS,
+    time_limit: TimeLimit = _TIME_LIMIT,
+    columns: Columns = None,
+    families_file: FamiliesFile = None,
+) -> None:
+    """Build demonstrations, distractors and manifests from the same sources."""
+    settings = (codec, cameras, version, workers, time_limit)
+    opening = (columns, families_file)
+    for kind, filters in (
+        (DEMONSTRATIONS, (families, split, episodes)),
+        (DISTRACTORS, (None, "train", None)),
+    ):
+        _build(kind, source, out / kind, filters, settings, opening, as_json=False)
+    _manifests(
+        out / DEMONSTRATIONS,
+        out / DISTRACTORS,
+        out / MANIFESTS,
+        k,
+        seed,
+        position_limit,
+        as_json=False,
+    )
+    _ERR.print(f"Next: robomme-interference verify {out}")
+
+
+def verify(
+    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    decode: Annotated[
+        bool, typer.Option(help="Decode all frames; without, only tables and rules are checked.")
+    ] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Recompute every hash and rule of a split and name each violation; fails if there is one."""
+    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.build_dataset.verify import verify_split
+    from robomme_interference_data.loader import load_split
+
+    opened = load_split(split)
+    header = opened.reader.header["datasets"].values()
+    with BuildProgress() as progress:
+        progress.start("Verifying", sum(d["counts"]["frames"] for d in header) if decode else 0)
+        violations = list(verify_split(split, decode=decode, advance=progress.advance))
+    if as_json:
+        _print_json([{"where": v.where, "what": v.what} for v in violations])
+    else:
+        for violation in violations:
+            _OUT.print(f"{violation.where}: {violation.what}", soft_wrap=True, highlight=False)
+        what = "hashes and rules" if decode else "tables and rules (frames not decoded)"
+        _ERR.print(
+            f"{len(violations)} violations" if violations else f"All {what} of {split} hold."
+        )
+    if violations:
+        raise typer.Exit(1)
+
+
+def audit(
+    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    as_json: AsJson = False,
+) -> None:
+    """Print how often units are used and where families stand; fails on any leak."""
+    from robomme_interference_data.build_dataset.audit import audit_split
+    from robomme_interference_data.loader import load_split
+
+    opened = load_split(split)
+    report = audit_split(opened.manifests(), opened.datasets, opened.k_values)
+    if as_json:
+        _print_json(report.as_dict())
+    else:
+        largest = max(report.units)
+        use = Table("k", "units", "min", "mean", "max", "unused", title="Uses of a unit")
+        for k in sorted(report.units):
+            row = report.usage(k)
+            use.add_row(
+                str(k),
+                str(len(report.units[k])),
+                *(f"{row[name]:g}" if name != "mean" else f"{row[name]:.2f}" for name in row),
+            )
+        _OUT.print(use)
+        places = sorted(report.positions)
+        mix = Table(
+            "family", "units", "uses of a unit", *map(str, places), title=f"Families at k={largest}"
+        )
+        for family, row in report.family_usage(largest).items():
+            mix.add_row(
+                family,
+                f"{row['units']:g}",
+                f"{row['min']:g} to {row['max']:g}, mean {row['mean']:.2f}",
+                *(str(report.positions[place][family]) for place in places),
+            )
+        mix.caption = "Columns 1, 2, …: buffers with the family at that place after the lesson."
+        _OUT.print(mix)
+        for leak in report.leaks:
+            _OUT.print(f"LEAK, {leak.kind}: {leak.where}", soft_wrap=True, highlight=False)
+        _ERR.print(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
+    if report.leaks:
+        raise typer.Exit(1)
+
+
+def _build(
+    kind: str,
+    source: list[str],
+    out: Path,
+    filters: tuple[str | None, str | None, str | None],
+    settings: tuple[str, str | None, str, int, float],
+    opening: tuple[str | None, Path | None],
+    *,
+    as_json: bool,
+) -> None:
+    from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
+    from robomme_interference_data.build_dataset.encode import get_codec
+    from robomme_interference_data.build_dataset.plan import parse_ranges
+    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.build_dataset.sources import open_source
+
+    families, split, episodes = filters
+    codec, cameras, version, workers, time_limit = settings
+    columns, families_file = opening
+    chosen = Settings(
+        codec=get_codec(codec),
+        cameras=_names(cameras),
+        version=version,
+        workers=workers,
+        time_limit=time_limit,
+    )
+    wanted = Filters(
+        families=_names(families),
+        split=split,
+        numbers=parse_ranges(episodes) if episodes is not None else None,
+    )
+    opened = [
+        open_source(text, columns=_column_map(columns), families_file=families_file)
+        for text in source
+    ]
+    with _resumable(), BuildProgress() as progress:
+        result = build_dataset(kind, opened, out, wanted, chosen, progress)
+    if as_json:
+        _print_json(
+            {
+                "out": str(result.out),
+                "episodes": result.episodes,
+                "frames": result.frames,
+                "skipped": [vars(item) for item in result.skipped],
+                "existed": result.existed,
+            }
+        )
+        return
+    done = "was built before" if result.existed else "built"
+    _ERR.print(f"{out}: {done}, {result.episodes} episodes, {result.frames:,} frames")
+    for item in result.skipped[:10]:
+        _ERR.print(f"  left out {item.episode_id}: {item.reason}", highlight=False)
+    if len(result.skipped) > 10:
+        _ERR.print(f"  … {len(result.skipped)} left out in all: {out}/meta/build_report.json")
+
+
+def _manifests(
+    demonstrations: Path,
+    distractors: Path,
+    out: Path,
+    k: list[int] | None,
+    seed: int,
+    position_limit: str,
+    *,
+    as_json: bool,
+) -> None:
+    from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.dataset import Dataset
+    from robomme_interference_data.files import LocalFiles, read_json
+
+    queries = Dataset(LocalFiles(demonstrations))
+    units = Dataset(LocalFiles(distractors))
+    plan = plan_manifests(queries, units, k or DEFAULT_K, seed, _limit(position_limit))
+    with BuildProgress(unit="queries") as progress:
+        progress.start("Planning buffers", len(queries))
+        for done in write_manifests(plan, out):
+            progress.advance(done)
+    counts = read_json(out / "manifest.json")["counts"]
+    if as_json:
+        _print_json({"out": str(out), **counts})
+    else:
+        _ERR.print(f"{out}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
+
+
+def _limit(text: str) -> int | None:
+    if text == "none":
+        return None
+    if not text.isdigit() or int(text) == 0:
+        raise InvalidOptionError(f"--position-limit {text!r}; expected a positive number or none")
+    return int(text)
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(part.strip() for part in text.split(","))
+
+
+def _column_map(text: str | None) -> dict[str, str] | None:
+    if text is None:
+        return None
+    pairs = [part.partition("=") for part in text.split(",")]
+    if not all(name and equals and column for name, equals, column in pairs):
+        raise InvalidOptionError(
+            f"--columns {text!r} is not NAME=COLUMN,…", "For example: --columns front=image"
+        )
+    return {name.strip(): column.strip() for name, _, column in pairs}
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        _ERR.print("Stopped. Finished episodes are kept: run the same command again to go on.")
+        raise typer.Exit(130) from None
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))

@@ -1,0 +1,81 @@
+"""The `robomme-interference` command: a thin root, and how errors are shown.
+
+Each area has its own commands file; only this one sees all of them.
+"""
+
+import os
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from robomme_interference_data import commands
+from robomme_interference_data.build_dataset import commands as build_commands
+from robomme_interference_data.errors import InterferenceError
+
+__all__ = ["app", "main"]
+
+
+class _Root(TyperGroup):
+    """Lets `--k` take several numbers, as in `--k 0 1 3 7`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, spread(args))
+
+
+def spread(args: list[str]) -> list[str]:
+    """Repeat `--k` before each of several numbers: click's options take one value each."""
+    spreaded: list[str] = []
+    open_option = False
+    for arg in args:
+        if open_option and arg.isdigit() and spreaded[-2:-1] == ["--k"]:
+            spreaded += ["--k", arg]
+            continue
+        open_option = bool(spreaded) and spreaded[-1] == "--k"
+        spreaded.append(arg)
+    return spreaded
+
+
+app = typer.Typer(
+    cls=_Root,
+    name="robomme-interference",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="History buffers for RoboMME-Interference: build, load, stream and check.",
+    epilog="""A split is a folder with demonstrations, distractor units and manifests of buffers.
+
+```
+robomme-interference doctor
+robomme-interference build all --source robomme-h5:recordings/ --out my-split
+robomme-interference verify my-split
+robomme-interference list my-split
+robomme-interference show MoveCube/train/0 --split my-split --k 3 --out strip.png
+```
+""",
+)
+app.add_typer(build_commands.app, name="build")
+app.command()(build_commands.verify)
+app.command()(build_commands.audit)
+app.command(name="list")(commands.list_buffers)
+app.command()(commands.show)
+app.command()(commands.doctor)
+
+
+def main() -> None:
+    """Run the command line; known errors are shown without a traceback."""
+    try:
+        app()
+    except InterferenceError as error:
+        typer.secho(f"Error: {error.message}", fg=typer.colors.RED, err=True)
+        if error.hint:
+            typer.echo(error.hint, err=True)
+        sys.exit(1)
+    except BrokenPipeError:  # the reader of stdout (head, less) has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
