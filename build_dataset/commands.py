@@ -207,6 +207,24 @@ def build_all(
     _ERR.print(f"Next: robomme-interference verify {out}")
 
 
+@app.command()
+def sample(
+    out: Annotated[Path, typer.Option(help="Folder to write.")],
+    train: Annotated[int, typer.Option(help="Train episodes of each family.")] = 2,
+    test: Annotated[int, typer.Option(help="Test episodes of each family.")] = 1,
+) -> None:
+    """Record a small made-up sample, to try everything: --source frames:OUT."""
+    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.build_dataset.sample import write_sample
+    from robomme_interference_data.constants import FAMILIES
+
+    with BuildProgress(unit="episodes") as progress:
+        progress.start("Recording the sample", len(FAMILIES) * (train + test))
+        for _ in write_sample(out, train=train, test=test):
+            progress.advance(1)
+    _ERR.print(f"Next: robomme-interference build all --source frames:{out} --out my-split")
+
+
 def verify(
     split: Annotated[Path, typer.Argument(help="Folder of the split.")],
     decode: Annotated[
