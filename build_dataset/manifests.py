@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import (
+    ACTION,
     DEMONSTRATIONS,
     DISTRACTORS,
     FORMAT_VERSION,
@@ -108,10 +109,11 @@ def plan_manifests(
                 f"--{option} {dataset.files.describe()} is a dataset of {dataset.kind}",
                 f"Give the folder that robomme-interference build {option} made.",
             )
-    if demonstrations.features != distractors.features:
+    shown, others = _shown(demonstrations), _shown(distractors)
+    if shown != others:
         raise SourceError(
             f"sessions of both datasets cannot follow one another in a buffer: the demonstrations "
-            f"have {demonstrations.features}, the distractors {distractors.features}",
+            f"have {shown}, the distractors {others}",
             "Build both with the same --cameras, from sources with the same sizes.",
         )
     splits = set(distractors.episodes["split"].to_pylist())
@@ -122,6 +124,11 @@ def plan_manifests(
             "Build the distractors with --split train.",
         )
     return ManifestPlan(demonstrations, distractors, ordered, seed, position_limit)
+
+
+def _shown(dataset: Dataset) -> dict[str, tuple[int, ...]]:
+    """Return the features that a buffer shows, with their shapes: cameras and state."""
+    return {name: shape for name, shape in dataset.features.items() if name != ACTION}
 
 
 def write_manifests(plan: ManifestPlan, out: Path) -> Iterator[int]:

@@ -1,0 +1,139 @@
+"""Go the whole way: recorded episodes in, a history buffer out. Run it with `make demo`.
+
+Where RoboMME's recordings lie beside the project (../shared/data), the demonstrations are the
+nine families' first test episodes and the distractors come from its training episodes, filled up
+with made-up sessions; elsewhere, all of it is a sample that the project records itself. Everything
+lands in demo/; what is there already is not made again.
+"""
+
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+ROOT = Path(__file__).resolve().parent.parent
+DEMO = Path("demo")
+SHARED = Path("..") / "shared" / "data"
+SPLIT = DEMO / "split"
+COMMAND = Path(sys.executable).parent / "robomme-interference"
+
+FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour")
+"""Families of made-up sessions, so that every query has seven others to draw from."""
+
+
+def main() -> None:
+    """Build, load, verify, audit and draw."""
+    began = time.monotonic()
+    DEMO.mkdir(exist_ok=True)
+    queries, units = recorded_here() if (ROOT / SHARED).is_dir() else self_recorded()
+    run("build demonstrations", *queries, "--split test", f"--out {SPLIT}/demonstrations")
+    run("build distractors", *units, f"--out {SPLIT}/distractors")
+    run(
+        f"build manifests --demonstrations {SPLIT}/demonstrations",
+        f"--distractors {SPLIT}/distractors --out {SPLIT}/manifests --k 0 1 3 7 --seed 0",
+    )
+    load()
+    run(f"show VideoRepick/test/0 --split {SPLIT} --k 7 --out {DEMO}/strip.png")
+    run(f"audit {SPLIT}")
+    run(f"verify {SPLIT}")
+    say(f"\nDone in {time.monotonic() - began:.0f} s. Look at {DEMO}/strip.png")
+
+
+def recorded_here() -> tuple[list[str], list[str]]:
+    """Prepare RoboMME's recordings; return the sources of demonstrations and of distractors."""
+    recordings, lessons, fillers = DEMO / "recordings", DEMO / "lessons", DEMO / "fillers"
+    if not (recordings / "done").exists():
+        say("Unpacking RoboMME's own recordings (HDF5, five families)")
+        unpack = [sys.executable, str(SHARED / "unpack_h5.py"), str(recordings)]
+        subprocess.run(unpack, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        (recordings / "done").touch()
+    if not (lessons / "frames.parquet").exists():
+        say("Laying out the first test episode of each of the nine families (front camera)")
+        lay_out_lessons(SHARED / "lessons", lessons)
+    if not (fillers / "frames.parquet").exists():
+        say(f"Recording made-up sessions of {len(FILLERS)} further families")
+        record(fillers, FILLERS)
+    return (
+        [f"--source frames:{lessons}"],
+        [f"--source robomme-h5:{recordings} --source frames:{fillers}", "--cameras front"],
+    )
+
+
+def self_recorded() -> tuple[list[str], list[str]]:
+    """Record the sample; return the sources of demonstrations and of distractors."""
+    sample = DEMO / "sample"
+    if not (sample / "frames.parquet").exists():
+        run(f"build sample --out {sample}")
+    return [f"--source frames:{sample}"], [f"--source frames:{sample}"]
+
+
+def lay_out_lessons(lessons: Path, folder: Path) -> None:
+    """Bring the lessons into the layout of a `frames` source (docs/sources.md)."""
+    rows = []
+    for path in sorted(lessons.glob("*.npz")):
+        with np.load(path) as lesson:
+            episode_id = f"{lesson['env_id']}/test/{lesson['episode']}"
+            video = folder / "videos" / "front" / f"{episode_id}.mkv"
+            video.parent.mkdir(parents=True, exist_ok=True)
+            video.write_bytes(path.with_name(f"{path.stem}_front.mkv").read_bytes())
+            rows += [
+                {
+                    "episode_id": episode_id,
+                    "frame_index": index,
+                    "state": state,
+                    "is_demo": index < int(lesson["exec_start_idx"]),
+                    "goal": str(lesson["task_goal"].flat[0]),
+                    "seed": int(lesson["seed"]),
+                    "difficulty": str(lesson["difficulty"]),
+                    "simulator": "robomme",
+                    "exact": True,
+                }
+                for index, state in enumerate(lesson["state"])
+            ]
+    pq.write_table(pa.Table.from_pylist(rows), folder / "frames.parquet")
+
+
+def record(folder: Path, families: tuple[str, ...]) -> None:
+    """Record made-up sessions."""
+    from robomme_interference_data.build_dataset.sample import write_sample
+
+    for _ in write_sample(folder, families=families, train=2, test=0):
+        pass
+
+
+def load() -> None:
+    """Load a buffer by its episode id, as a notebook would."""
+    from robomme_interference_data import load_buffer
+
+    say('\n>>> buffer = load_buffer("VideoRepick/test/0", k=3, split="demo/split", verify=True)')
+    buffer = load_buffer("VideoRepick/test/0", k=3, split=SPLIT, verify=True)
+    say(f'>>> buffer\n{buffer}\n>>> buffer.goal\n"{buffer.goal}"')
+    say(f'>>> buffer.frames("front").shape\n{buffer.frames("front").shape}')
+    say(f">>> buffer.states.shape\n{buffer.states.shape}")
+    for session in buffer.sessions:
+        say(f"{session.start:5} – {session.stop - 1:4}  {session.role:10}  {session.source}")
+
+
+def run(*parts: str) -> None:
+    """Print and run one of the project's commands."""
+    words = " ".join(parts)
+    say(f"\n$ robomme-interference {words}")
+    subprocess.run([str(COMMAND), *shlex.split(words)], cwd=ROOT, check=True)
+
+
+def say(text: str) -> None:
+    """Print at once, so that lines and the commands' own output stay in order."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    import os
+
+    os.chdir(ROOT)
+    main()
