@@ -129,7 +129,9 @@ def _pool_leaks(datasets: dict[str, Dataset]) -> Iterator[Leak]:
         if query.seed is not None and query.id.split == "test"
     }
     for unit in units:
-        query = scenes.get((unit.simulator, unit.id.family, unit.seed))
+        query = (
+            None if unit.seed is None else scenes.get((unit.simulator, unit.id.family, unit.seed))
+        )
         if query is not None:
             yield Leak("same scene", f"unit {unit.id} and query {query} (seed {unit.seed})")
     for records in (units, queries):

@@ -11,6 +11,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -47,7 +48,7 @@ class BuildProgress:
             TimeRemainingColumn(),
             console=Console(stderr=True, quiet=quiet),
         )
-        self._task = None
+        self._task: TaskID | None = None
 
     def __enter__(self) -> Self:
         self._progress.start()

@@ -114,8 +114,8 @@ class _Scene:
         hue = 37 * family % 120
         rows = np.arange(size, dtype=np.int64)[:, None] * 256 // size
         shade = np.broadcast_to(rows // 4, (size, size))
-        self._table = np.stack([90 + hue + shade // 2, 200 - hue + shade // 8, 150 + shade], axis=2)
-        self._table = self._table.clip(0, 255).astype(np.uint8)
+        table = np.stack([90 + hue + shade // 2, 200 - hue + shade // 8, 150 + shade], axis=2)
+        self._table = table.clip(0, 255)
 
     def _gripper(self, step: int) -> tuple[int, int]:
         """Column and row of the gripper at a step."""
@@ -126,7 +126,7 @@ class _Scene:
 
     def front(self, step: int) -> NDArray[np.uint8]:
         """Draw the front view, `(size, size, 3) uint8`."""
-        image = self._table.copy()
+        image: NDArray[np.uint8] = self._table.astype(np.uint8)
         for (column, row), colour in zip(self._cubes, _CUBES, strict=True):
             self._box(image, column, row, 12, 12, colour)
         column, row = self._gripper(step)

@@ -211,7 +211,7 @@ def _chosen(source: Source, planned: PlannedEpisode) -> Iterator[Frame]:
     """Yield the planned frames of an episode, reading no further than the last."""
     count = 0
     frames = source.read(planned.episode)
-    with closing(frames):  # type: ignore[type-var]
+    with closing(frames):
         for index, frame in enumerate(frames):
             if index in planned.indices:
                 yield frame

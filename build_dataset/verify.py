@@ -113,7 +113,9 @@ def _identity(name: str, dataset: Dataset, reader: ManifestReader) -> Iterator[V
 
 
 def _episode(name: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
-    spans = [("frames", record.length, record.feature_sha256, record.sha256)]
+    spans: list[tuple[str, int, dict[str, str], str | None]] = [
+        ("frames", record.length, record.feature_sha256, record.sha256)
+    ]
     if record.exec_start_idx is not None:
         recorded = record.lesson_feature_sha256, record.lesson_sha256
         spans.append(("lesson", record.exec_start_idx, *recorded))

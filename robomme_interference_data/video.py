@@ -4,7 +4,7 @@ A LeRobot v3 video file holds many episodes one after the other at a constant fr
 frame is named by its number in the file: its presentation time multiplied by the rate.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing
 from pathlib import Path
 
@@ -19,7 +19,7 @@ __all__ = ["decode_into", "iter_frames"]
 
 def iter_frames(
     path: Path, start: int, stop: int | None, fps: float
-) -> Iterator[NDArray[np.uint8]]:
+) -> Generator[NDArray[np.uint8]]:
     """Decode the frames `start` (included) to `stop` (excluded) of a video file, in order.
 
     Decoding runs on the calling thread and holds one frame at a time. Every frame's presentation
@@ -86,7 +86,7 @@ def _to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:
     return frame.to_ndarray() if frame.format.name == "gbrp" else frame.to_ndarray(format="rgb24")
 
 
-def _indexed_frames(path: Path, start: int, fps: float) -> Iterator[tuple[int, av.VideoFrame]]:
+def _indexed_frames(path: Path, start: int, fps: float) -> Generator[tuple[int, av.VideoFrame]]:
     """Yield `(number, frame)` from frame `start` on."""
     try:
         container = av.open(str(path))

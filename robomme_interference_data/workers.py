@@ -151,7 +151,7 @@ def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
-            message = (function(task), None)
+            message: tuple[Any, Exception | None] = (function(task), None)
         except InterferenceError as error:
             message = (None, error)
         except Exception as error:

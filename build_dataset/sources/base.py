@@ -1,6 +1,6 @@
 """What every source of recorded episodes serves."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -77,7 +77,11 @@ class Source(Protocol):
     """
 
     kind: str
-    provenance: dict[str, Any]
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """See above."""
+        ...
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes, in the canonical order of their ids.
@@ -87,7 +91,7 @@ class Source(Protocol):
         """
         ...
 
-    def read(self, episode: SourceEpisode) -> Iterator[Frame]:
+    def read(self, episode: SourceEpisode) -> Generator[Frame]:
         """Stream the frames of an episode in order, a bounded number in memory at a time.
 
         Callers may stop early; closing the generator releases the files.

@@ -7,7 +7,7 @@ after action t.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,7 +133,7 @@ class RoboMMEH5Source:
                 ) from None
         return sorted(found, key=lambda episode: episode.id)
 
-    def read(self, episode: SourceEpisode) -> Iterator[Frame]:
+    def read(self, episode: SourceEpisode) -> Generator[Frame]:
         """Stream an episode's frames; see `Source.read`."""
         import h5py
 
