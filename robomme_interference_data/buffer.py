@@ -1,6 +1,7 @@
 """A history buffer: its sessions in order, and their frames when asked for."""
 
 import os
+from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -48,6 +49,11 @@ class Session:
     start: int
     stop: int
     entry: SessionEntry
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First frame in the buffer, and the one after the last."""
+        return (self.start, self.stop)
 
 
 @dataclass(frozen=True)
@@ -173,6 +179,30 @@ class Buffer:
                 pool.shutdown(cancel_futures=True)
                 raise
         return out
+
+    def frame(self, index: int, camera: str = "front") -> NDArray[np.uint8]:
+        """Decode one frame of the buffer, `(H, W, 3) uint8` RGB.
+
+        Args:
+            index: Index in the buffer, 0 to `len(buffer) - 1`.
+            camera: As for `frames`.
+
+        Raises:
+            UnknownNameError: There is no such frame or camera.
+            MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
+        """
+        if not 0 <= index < len(self):
+            raise UnknownNameError(
+                f"frame {index} is not in the buffer of {self.episode_id} at k={self.k}, which "
+                f"has {len(self)} history frames, numbered from 0"
+            )
+        session = self.sessions[bisect_right(self.sessions, index, key=lambda s: s.start) - 1]
+        entry = session.entry
+        feature = self._feature(camera)
+        out = np.empty((1, *self._shape(feature)), np.uint8)
+        stored = entry.start + (index - session.start) // entry.repeat
+        self._datasets[entry.dataset].read_frames(entry.episode_index, feature, stored, out)
+        return out[0]
 
     def query_frame(self, camera: str = "front") -> NDArray[np.uint8]:
         """Decode the first live observation, `(H, W, 3) uint8` RGB; not part of the buffer."""

@@ -48,8 +48,11 @@ def list_buffers(
 
 def show(
     episode: Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")],
-    split: Annotated[Path, typer.Option(help="Folder of the split.")],
     k: Annotated[int, typer.Option("--k", help="Number of distractor sessions.")],
+    split: Annotated[
+        Path,
+        typer.Option(envvar="ROBOMME_INTERFERENCE_SPLIT", help="Folder of the split."),
+    ] = Path(),
     out: Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")] = None,
     camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
     as_json: AsJson = False,
@@ -94,8 +97,8 @@ def doctor(as_json: AsJson = False) -> None:
 
     checks = module.checks()
     if as_json:
-        typer.echo(json.dumps([vars(check) for check in checks], indent=2))
+        typer.echo(module.to_json(checks))
     else:
         _OUT.print(module.render(checks))
-    if any(check.ok is False for check in checks):
+    if module.any_failed(checks):
         raise typer.Exit(1)

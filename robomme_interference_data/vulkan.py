@@ -13,11 +13,17 @@ from dataclasses import asdict, dataclass
 
 __all__ = ["VulkanDevice", "VulkanReport", "find_vulkan"]
 
-REQUIRED_EXTENSION = "VK_KHR_external_semaphore_fd"
-"""Device extension without which sapien 3.0 finds no supported device."""
+REQUIRED_FEATURE = "descriptorBindingPartiallyBound"
+"""Device feature without which sapien 3.0 finds no supported device. Mesa's software driver has it
+in the 25.0 of Debian's bookworm-backports, not in the 22.3 of Debian 12 itself."""
 
-_TYPE_CPU = 4  # VK_PHYSICAL_DEVICE_TYPE_CPU
-_STRUCTURE_TYPE_INSTANCE = 1  # VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO
+_DEVICE_TYPE_CPU = 4
+_API_VERSION_1_2 = (1 << 22) | (2 << 12)
+# Values of VkStructureType.
+_APPLICATION_INFO = 0
+_INSTANCE_CREATE_INFO = 1
+_FEATURES_2 = 1000059000
+_DESCRIPTOR_INDEXING_FEATURES = 1000161001
 _TIMEOUT_S = 20
 
 
@@ -28,7 +34,7 @@ class VulkanDevice:
     Attributes:
         name: Name that the driver gives it.
         software: Whether it renders on the CPU.
-        usable: Whether it has the extension that the simulator needs.
+        usable: Whether it has the feature that the simulator needs.
     """
 
     name: str
@@ -69,12 +75,24 @@ def find_vulkan() -> VulkanReport:
     return VulkanReport(devices, found["problem"])
 
 
+class _ApplicationInfo(ctypes.Structure):
+    _fields_ = (
+        ("structure_type", ctypes.c_int32),
+        ("next", ctypes.c_void_p),
+        ("application_name", ctypes.c_char_p),
+        ("application_version", ctypes.c_uint32),
+        ("engine_name", ctypes.c_char_p),
+        ("engine_version", ctypes.c_uint32),
+        ("api_version", ctypes.c_uint32),
+    )
+
+
 class _InstanceCreateInfo(ctypes.Structure):
     _fields_ = (
         ("structure_type", ctypes.c_int32),
         ("next", ctypes.c_void_p),
         ("flags", ctypes.c_uint32),
-        ("application_info", ctypes.c_void_p),
+        ("application_info", ctypes.POINTER(_ApplicationInfo)),
         ("layer_count", ctypes.c_uint32),
         ("layer_names", ctypes.c_void_p),
         ("extension_count", ctypes.c_uint32),
@@ -91,12 +109,26 @@ class _DeviceProperties(ctypes.Structure):
     )
 
 
-class _ExtensionProperties(ctypes.Structure):
-    _fields_ = (("name", ctypes.c_char * 256), ("version", ctypes.c_uint32))
+class _DescriptorIndexingFeatures(ctypes.Structure):
+    _fields_ = (
+        ("structure_type", ctypes.c_int32),
+        ("next", ctypes.c_void_p),
+        ("before", ctypes.c_uint32 * 17),
+        ("partially_bound", ctypes.c_uint32),
+        ("after", ctypes.c_uint32 * 2),
+    )
+
+
+class _Features2(ctypes.Structure):
+    _fields_ = (
+        ("structure_type", ctypes.c_int32),
+        ("next", ctypes.POINTER(_DescriptorIndexingFeatures)),
+        ("features", ctypes.c_uint32 * 55),
+    )
 
 
 def _search() -> VulkanReport:
-    """Ask the Vulkan loader in this process."""
+    """Ask the Vulkan loader, in this process."""
     if not sys.platform.startswith("linux"):
         return VulkanReport((), f"not looked for on {sys.platform}")
     try:
@@ -104,28 +136,27 @@ def _search() -> VulkanReport:
     except OSError:
         return VulkanReport((), "the Vulkan loader (libvulkan.so.1) is not installed")
     # Without argument types, ctypes would cut the 64-bit handles to 32 bits.
-    handle, pointer = ctypes.c_void_p, ctypes.c_void_p
+    pointer = ctypes.c_void_p
     vulkan.vkCreateInstance.argtypes = (pointer, pointer, pointer)
-    vulkan.vkDestroyInstance.argtypes = (handle, pointer)
-    vulkan.vkEnumeratePhysicalDevices.argtypes = (handle, pointer, pointer)
-    vulkan.vkGetPhysicalDeviceProperties.argtypes = (handle, pointer)
-    vulkan.vkEnumerateDeviceExtensionProperties.argtypes = (handle, pointer, pointer, pointer)
-    vulkan.vkGetPhysicalDeviceProperties.restype = None
-    vulkan.vkDestroyInstance.restype = None
+    vulkan.vkDestroyInstance.argtypes = (pointer, pointer)
+    vulkan.vkEnumeratePhysicalDevices.argtypes = (pointer, pointer, pointer)
+    vulkan.vkGetPhysicalDeviceProperties.argtypes = (pointer, pointer)
+    vulkan.vkGetPhysicalDeviceFeatures2.argtypes = (pointer, pointer)
 
+    application = _ApplicationInfo(_APPLICATION_INFO, api_version=_API_VERSION_1_2)
+    info = _InstanceCreateInfo(_INSTANCE_CREATE_INFO, None, 0, ctypes.pointer(application))
     instance = ctypes.c_void_p()
-    info = _InstanceCreateInfo(structure_type=_STRUCTURE_TYPE_INSTANCE)
     if vulkan.vkCreateInstance(ctypes.byref(info), None, ctypes.byref(instance)) != 0:
         return VulkanReport((), "no Vulkan driver is installed")
     try:
-        devices = tuple(_describe(vulkan, device) for device in _handles(vulkan, instance))
+        devices = tuple(_describe(vulkan, handle) for handle in _handles(vulkan, instance))
     finally:
         vulkan.vkDestroyInstance(instance, None)
     if any(device.usable for device in devices):
         return VulkanReport(devices, None)
     if devices:
-        return VulkanReport(devices, f"no device has {REQUIRED_EXTENSION}: the driver is too old")
-    return VulkanReport(devices, "the Vulkan drivers list no device")
+        return VulkanReport(devices, f"no device has {REQUIRED_FEATURE}: the driver is too old")
+    return VulkanReport((), "the Vulkan drivers list no device")
 
 
 def _handles(vulkan: ctypes.CDLL, instance: ctypes.c_void_p) -> list[int]:
@@ -136,18 +167,16 @@ def _handles(vulkan: ctypes.CDLL, instance: ctypes.c_void_p) -> list[int]:
     return [handle for handle in handles[: count.value] if handle is not None]
 
 
-def _describe(vulkan: ctypes.CDLL, device: int) -> VulkanDevice:
+def _describe(vulkan: ctypes.CDLL, handle: int) -> VulkanDevice:
     properties = _DeviceProperties()
-    vulkan.vkGetPhysicalDeviceProperties(device, ctypes.byref(properties))
-    count = ctypes.c_uint32()
-    vulkan.vkEnumerateDeviceExtensionProperties(device, None, ctypes.byref(count), None)
-    extensions = (_ExtensionProperties * count.value)()
-    vulkan.vkEnumerateDeviceExtensionProperties(device, None, ctypes.byref(count), extensions)
-    names = {extension.name.decode() for extension in extensions[: count.value]}
+    vulkan.vkGetPhysicalDeviceProperties(handle, ctypes.byref(properties))
+    indexing = _DescriptorIndexingFeatures(_DESCRIPTOR_INDEXING_FEATURES)
+    features = _Features2(_FEATURES_2, ctypes.pointer(indexing))
+    vulkan.vkGetPhysicalDeviceFeatures2(handle, ctypes.byref(features))
     return VulkanDevice(
         name=properties.name.decode(errors="replace"),
-        software=properties.device_type == _TYPE_CPU,
-        usable=REQUIRED_EXTENSION in names,
+        software=properties.device_type == _DEVICE_TYPE_CPU,
+        usable=bool(indexing.partially_bound),
     )
 
 

@@ -1,0 +1,50 @@
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.PHONY: help setup vulkan demo test check format types bench pins
+
+BIN := .venv/bin
+# The folders that pyproject.toml maps under robomme_interference_data.
+AREAS := $(filter-out robomme_interference_data,$(patsubst %/__init__.py,%,$(wildcard */__init__.py)))
+# Extra arguments for pytest, e.g. make test ARGS="-k loader".
+ARGS ?=
+
+help:  ## Print this list.
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' Makefile
+
+setup:  ## Install what is missing: the pinned packages in .venv, a Vulkan driver.
+	@scripts/setup.sh
+	@$(BIN)/python scripts/software_vulkan.py
+
+vulkan:  ## Install only the software Vulkan driver: sudo make vulkan.
+	@python3 scripts/software_vulkan.py
+
+demo: setup  ## Set up, then go the whole way on real or recorded episodes.
+	@$(BIN)/python scripts/demo.py
+
+test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.
+	@$(BIN)/pytest -n 2 --dist loadfile $(ARGS)
+
+check: setup types  ## Lint, check the format and the types.
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy build/typecheck/robomme_interference_data
+
+format: setup  ## Mend what ruff can mend.
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+# Type checkers do not follow the mapping of pyproject.toml: links lay the package out as installed.
+types:
+	@rm -rf build/typecheck
+	@mkdir -p build/typecheck/robomme_interference_data
+	@ln -s $(addprefix $(CURDIR)/,$(wildcard robomme_interference_data/*) $(AREAS)) \
+	  build/typecheck/robomme_interference_data/
+
+bench: setup  ## Run every benchmark.
+	@for file in $(sort $(wildcard benchmarks/*.py)); do echo "== $$file"; $(BIN)/python "$$file"; done
+
+pins: setup  ## Remake requirements.txt; ARGS=--upgrade for newer versions.
+	@$(BIN)/uv pip compile --quiet --universal --python-version 3.12 --all-extras --group dev \
+	  --no-annotate --no-emit-index-url --no-emit-package opencv-python \
+	  --custom-compile-command "make pins" --output-file requirements.txt pyproject.toml $(ARGS)

@@ -1,0 +1,98 @@
+"""Isolation: every test runs without the network, without tokens and with caches of its own."""
+
+import os
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+# The libraries read these when they are imported, so they are set before any test module is.
+_SCRATCH = Path(tempfile.mkdtemp(prefix="robomme-interference-tests-"))
+_REMOVED = (
+    "FORCE_COLOR",
+    "HF_ASSETS_CACHE",
+    "HF_ENDPOINT",
+    "HF_HUB_CACHE",
+    "HF_TOKEN",
+    "HF_TOKEN_PATH",
+    "HF_XET_CACHE",
+    "HUGGING_FACE_HUB_TOKEN",
+)
+_SET = {
+    "COLUMNS": "120",  # tables and help texts are laid out alike everywhere
+    "HF_DATASETS_CACHE": str(_SCRATCH / "datasets"),
+    "HF_HOME": str(_SCRATCH / "huggingface"),
+    "HF_HUB_DISABLE_IMPLICIT_TOKEN": "1",
+    "HF_HUB_DISABLE_PROGRESS_BARS": "1",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+    "HF_HUB_OFFLINE": "1",  # a test with a server on the loopback interface sets it back
+    "HF_LEROBOT_HOME": str(_SCRATCH / "lerobot"),
+    "NO_COLOR": "1",
+    "XDG_CACHE_HOME": str(_SCRATCH / "cache"),
+}
+for _name in _REMOVED:
+    os.environ.pop(_name, None)
+os.environ.update(_SET)
+
+# No deadline: the first example of a test may import a library. In CI the examples are the same
+# in every run, so that a change is never blamed for what another one did.
+hypothesis.settings.register_profile(
+    "repository", deadline=None, derandomize=bool(os.environ.get("CI"))
+)
+hypothesis.settings.load_profile("repository")
+
+
+def pytest_unconfigure() -> None:
+    """Remove the caches."""
+    shutil.rmtree(_SCRATCH, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _loopback_only() -> Iterator[None]:
+    """Refuse connections that would leave this machine."""
+    lookup, connect, connect_ex = (
+        socket.getaddrinfo,
+        socket.socket.connect,
+        socket.socket.connect_ex,
+    )
+
+    def check(host: Any) -> None:
+        name = host.decode() if isinstance(host, bytes) else host
+        if name not in (None, "", "localhost", "::1") and not str(name).startswith("127."):
+            raise OSError(f"tests may not reach {name}: only the loopback interface is open")
+
+    def guarded_lookup(host: Any, *rest: Any, **options: Any) -> Any:
+        check(host)
+        return lookup(host, *rest, **options)
+
+    def guarded_connect(self: socket.socket, address: Any) -> None:
+        if isinstance(address, tuple):
+            check(address[0])
+        connect(self, address)
+
+    def guarded_connect_ex(self: socket.socket, address: Any) -> int:
+        if isinstance(address, tuple):
+            check(address[0])
+        return connect_ex(self, address)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket, "getaddrinfo", guarded_lookup)
+        patch.setattr(socket.socket, "connect", guarded_connect)
+        patch.setattr(socket.socket, "connect_ex", guarded_connect_ex)
+        yield
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real recordings that lie beside a checkout, on machines that have them."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings in {folder}")
+    return folder
