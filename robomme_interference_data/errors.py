@@ -4,6 +4,7 @@ Each is also a fitting builtin, so that callers can catch either, and carries a 
 do next, with the command to type where there is one.
 """
 
+from bisect import bisect
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -16,6 +17,7 @@ __all__ = [
     "MissingExtraError",
     # what was read
     "MissingFileError",
+    "HubError",
     "FormatError",
     "HashMismatchError",
     "TruncatedVideoError",
@@ -66,6 +68,10 @@ class MissingFileError(InterferenceError, FileNotFoundError):
     """A file that a dataset or split must have is not there."""
 
 
+class HubError(InterferenceError, OSError):
+    """The Hub refuses a repository, does not know it, or cannot be reached."""
+
+
 class FormatError(InterferenceError, ValueError):
     """A file that cannot be read as what it should be, or of an unknown format version."""
 
@@ -105,7 +111,9 @@ def nearest(given: str, known: Iterable[str]) -> str:
         `"Did you mean 'a' or 'b'?"`, `"Known: …"`, or an empty string if `known` is empty.
     """
     names = sorted(known)
-    folded = {name.lower(): name for name in names}
+    # Comparing takes long: of very many names, those that begin alike are compared.
+    place = bisect(names, given)
+    folded = {name.lower(): name for name in names[max(0, place - 1000) : place + 1000]}
     close = get_close_matches(given.lower(), list(folded), n=3, cutoff=0.6)
     if close:
         return "Did you mean " + " or ".join(repr(folded[name]) for name in close) + "?"

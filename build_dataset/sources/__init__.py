@@ -21,6 +21,8 @@ def _lerobot(location: str, columns: dict[str, str] | None, families_file: Path 
     from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
 
     name, _, revision = location.partition("@")
+    if Path(location).expanduser().is_dir():  # a folder's name may hold an @
+        name, revision = location, ""
     return LeRobotSource(
         name, columns=columns, families_file=families_file, revision=revision or None
     )

@@ -24,6 +24,7 @@ __all__ = ["RoboMMEH5Source", "identify"]
 
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
+_AGAIN = "Record or download the file again, or move it out of the folder."
 
 _TEST_SEEDS = 500_000
 _VAL_SEEDS = 1_000_000
@@ -119,17 +120,19 @@ class RoboMMEH5Source:
 
         found = []
         for family, path in self._files.items():
+            place = str(path)
             try:
                 with h5py.File(path, "r") as file:
                     numbers = _numbers(file, "episode_")
                     if not numbers:
                         raise SourceError(f"{path} holds no episode_<N> group")
                     ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
-                    found += [self._describe(ids[n], path, file, n) for n in numbers]
-            except (OSError, KeyError) as error:
+                    for number in numbers:
+                        place = f"{path}: episode_{number}"
+                        found.append(self._describe(ids[number], path, file, number))
+            except (OSError, KeyError, UnicodeDecodeError) as error:
                 raise SourceError(
-                    f"{path} is not a complete RoboMME recording: {error}",
-                    "Record or download the file again, or move it out of the folder.",
+                    f"{place} is not a complete RoboMME recording: {error}", _AGAIN
                 ) from None
         return sorted(found, key=lambda episode: episode.id)
 
@@ -138,16 +141,17 @@ class RoboMMEH5Source:
         import h5py
 
         path, number, first_step, *_ = episode.key
-        with h5py.File(path, "r") as file:
-            group = file[f"episode_{number}"]
-            for step in range(first_step, first_step + episode.raw_length):
-                try:
-                    yield _frame(group[f"timestep_{step}"], episode)
-                except (OSError, KeyError, ValueError) as error:
-                    raise SourceError(
-                        f"{path}: episode_{number}/timestep_{step} cannot be read: {error}",
-                        "Record or download the file again, or leave the episode out: --episodes",
-                    ) from None
+        place = f"episode_{number}"
+        try:
+            with h5py.File(path, "r") as file:
+                for step in range(first_step, first_step + episode.raw_length):
+                    place = f"episode_{number}/timestep_{step}"
+                    yield _frame(file[place], episode)
+        except (OSError, KeyError, ValueError) as error:
+            raise SourceError(
+                f"{path}: {place} cannot be read: {error}",
+                "Record or download the file again, or leave the episode out: --episodes",
+            ) from None
 
     def _describe(
         self, identity: EpisodeId, path: Path, file: "h5py.File", number: int
@@ -156,10 +160,7 @@ class RoboMMEH5Source:
         where = f"{path}: episode_{number}"
         steps = _numbers(group, "timestep_")
         if not steps or steps != list(range(steps[0], steps[0] + len(steps))):
-            raise SourceError(
-                f"{where} does not hold consecutive timestep_<T> groups",
-                "Record or download the file again, or leave the episode out: --episodes",
-            )
+            raise SourceError(f"{where} does not hold consecutive timestep_<T> groups", _AGAIN)
         flags = [bool(group[f"timestep_{step}/info/is_video_demo"][()]) for step in steps]
         length = flags.index(False) if False in flags else len(flags)
         if any(flags[length:]):
@@ -169,22 +170,27 @@ class RoboMMEH5Source:
                 "Only recordings that begin with their demonstration can be used.",
             )
         setup = group["setup"]
+        goals = tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()]))
         observation = group[f"timestep_{steps[0]}/obs"]
+        cameras = {
+            camera: (observation[name].shape[0], observation[name].shape[1])
+            for camera, name in _CAMERAS.items()
+            if name in observation
+        }
+        if not goals or not cameras:
+            missing = " or ".join(_CAMERAS.values()) if goals else "task_goal"
+            raise SourceError(f"{where} has no {missing}", _AGAIN)
         stat = path.stat()
         return SourceEpisode(
             id=identity,
-            goals=tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()])),
+            goals=goals,
             raw_length=len(steps),
             demonstration_length=length,
             seed=_seed(group),
             difficulty=_text(setup["difficulty"][()]) if "difficulty" in setup else None,
             simulator="robomme",
             exact=True,
-            cameras={
-                camera: (observation[name].shape[0], observation[name].shape[1])
-                for camera, name in _CAMERAS.items()
-                if name in observation
-            },
+            cameras=cameras,
             key=(str(path.resolve()), number, steps[0], stat.st_size, stat.st_mtime_ns),
         )
 

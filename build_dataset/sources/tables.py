@@ -1,0 +1,155 @@
+"""Values out of parquet columns, and images out of parquet files a few at a time."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.files import reading_parquet
+
+__all__ = ["RowSpan", "open_parquet", "scalars", "vectors"]
+
+_IMAGES_AT_ONCE = 8
+
+
+def open_parquet(path: Path) -> pq.ParquetFile:
+    """Open a parquet file for reading piece by piece.
+
+    Raises:
+        FormatError: It is not a parquet file.
+    """
+    with reading_parquet(path):
+        return pq.ParquetFile(path, buffer_size=1 << 20)
+
+
+def vectors(column: pa.ChunkedArray, what: str) -> NDArray[np.float32]:
+    """Return a column of lists of numbers as `(T, D) float32`; messages call it `what`.
+
+    Raises:
+        FormatError: It is none, has empty cells, or the lists are not equally long.
+    """
+    kind = column.type
+    listed = pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    listed = listed or pa.types.is_fixed_size_list(kind)
+    if not listed or not pa.types.is_floating(kind.value_type):
+        raise FormatError(f"{what} is of type {kind}; expected lists of floats")
+    lengths = pc.unique(pc.list_value_length(column))
+    flat = pc.list_flatten(column)
+    if column.null_count or flat.null_count or len(lengths) != 1:
+        raise FormatError(
+            f"{what} has empty values or vectors of several lengths: "
+            f"{sorted(lengths.drop_null().to_pylist())}",
+            "Every row needs a vector, and all of them the same length.",
+        )
+    values = flat.to_numpy().reshape(len(column), lengths[0].as_py())
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def scalars(column: pa.ChunkedArray, what: str) -> NDArray[np.int64]:
+    """Return a column of booleans or integers, or of lists of one such value, as `(T,) int64`.
+
+    Raises:
+        FormatError: It is none, or has empty cells.
+    """
+    kind = column.type
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        rows = len(column)
+        column, kind = pc.list_flatten(column), kind.value_type
+        if len(column) != rows:
+            raise FormatError(f"{what} has lists of several values; expected one value")
+    if not (pa.types.is_boolean(kind) or pa.types.is_integer(kind)) or column.null_count:
+        raise FormatError(
+            f"{what} is of type {kind} with {column.null_count} empty values; expected "
+            "booleans or integers, none empty"
+        )
+    return np.asarray(pc.cast(column, pa.int64()).to_numpy())
+
+
+class RowSpan:
+    """Rows of a parquet file that lie one after the other.
+
+    Args:
+        path: The file.
+        start: First row.
+        stop: Row after the last one; None for all that there are.
+
+    Raises:
+        FormatError: By every method: the file cannot be read as asked.
+    """
+
+    def __init__(self, path: Path, start: int = 0, stop: int | None = None):
+        self.path = path
+        self.start = start
+        self._file = open_parquet(path)
+        self.stop = self._file.metadata.num_rows if stop is None else stop
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def scalars(self, name: str) -> NDArray[np.int64]:
+        """Return a column of booleans or integers, `(T,) int64`."""
+        return scalars(self._column(name), f"{self.path}: column {name!r}")
+
+    def vectors(self, name: str) -> NDArray[np.float32]:
+        """Return a column of vectors, `(T, D) float32`."""
+        return vectors(self._column(name), f"{self.path}: column {name!r}")
+
+    def images(self, name: str) -> Iterator[bytes]:
+        """Yield the encoded images of a column in order, a few of them in memory at a time.
+
+        The column is a struct with the field `bytes`, as Hugging Face `Image` columns are. At
+        most the encoded bytes of one row group are held, and less where the writer allows it.
+        """
+        kind = self._type(name)
+        if not pa.types.is_struct(kind) or kind.get_field_index("bytes") < 0:
+            raise FormatError(
+                f"{self.path}: column {name!r} is of type {kind}; expected images as "
+                "struct<bytes, path>"
+            )
+        groups, row = self._row_groups()
+        batches = self._file.iter_batches(_IMAGES_AT_ONCE, row_groups=groups, columns=[name])
+        with reading_parquet(self.path):
+            for batch in batches:
+                for cell in batch.column(name):
+                    if self.start <= row < self.stop:
+                        data = cell["bytes"].as_py()
+                        if data is None:
+                            raise FormatError(
+                                f"{self.path}: the image in row {row} of column {name!r} is not "
+                                "stored in the file",
+                                "Write the dataset again with the images in its parquet files.",
+                            )
+                        yield data
+                    row += 1
+
+    def _column(self, name: str) -> pa.ChunkedArray:
+        self._type(name)
+        groups, first = self._row_groups()
+        with reading_parquet(self.path):
+            table = self._file.read_row_groups(groups, columns=[name])
+        return table[name].slice(self.start - first, len(self))
+
+    def _type(self, name: str) -> pa.DataType:
+        schema = self._file.schema_arrow
+        if name not in schema.names:
+            raise FormatError(
+                f"{self.path} has no column {name!r}; it has: {', '.join(schema.names)}"
+            )
+        return schema.field(name).type
+
+    def _row_groups(self) -> tuple[list[int], int]:
+        """Return the row groups that hold the span, and the first row of them."""
+        groups: list[int] = []
+        first = row = 0
+        for group in range(self._file.metadata.num_row_groups):
+            rows = self._file.metadata.row_group(group).num_rows
+            if row < self.stop and row + rows > self.start:
+                first = first if groups else row
+                groups.append(group)
+            row += rows
+        return groups, first
