@@ -225,7 +225,8 @@ class Buffer:
         """
         if chunk < 1:
             raise InvalidOptionError(f"chunk={chunk}; expected 1 or more")
-        names = {name: self._feature(name) for name in cameras or self.cameras}
+        wanted = self.cameras if cameras is None else cameras
+        names = {name: self._feature(name) for name in wanted}
         decoders = {name: self._iter_frames(feature) for name, feature in names.items()}
         session_index = self.session_index
         try:

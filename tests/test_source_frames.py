@@ -3,6 +3,7 @@
 import os
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,16 @@ def test_episodes_and_frames(tmp_path: Path) -> None:
             assert frame.action is not None
             assert frame.action.tolist() == [0.25 * step, 2.0]
             assert frame.is_demonstration is (step < 2)
+
+
+def test_only_the_cameras_asked_for_are_read(tmp_path: Path) -> None:
+    content = write_mixed(tmp_path)
+    source = FramesSource(tmp_path)
+    episode = replace(source.episodes()[0], cameras={"front": (48, 64)})
+    (tmp_path / "images" / "wrist" / str(episode.id) / "000000.png").write_bytes(b"no PNG")
+    frames = list(source.read(episode))
+    assert [list(frame.images) for frame in frames] == [["front"]] * LENGTHS[MOVE]
+    np.testing.assert_array_equal(frames[-1].images["front"], content[MOVE]["front"][-1])
 
 
 def test_actions_may_be_missing(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -185,6 +186,16 @@ def test_one_camera_is_enough(tmp_path: Path) -> None:
     (tmp_path / "f.csv").write_text("episode_index,family\n0,MoveCube\n")
     source = LeRobotSource(str(tmp_path / "one"), families_file=tmp_path / "f.csv")
     assert source.episodes()[0].cameras == {"front": (48, 64)}
+
+
+def test_only_the_cameras_asked_for_are_read(v21: Path, families: Path) -> None:
+    source = LeRobotSource(str(v21), families_file=families)
+    episode = source.episodes()[0]
+    assert sorted(episode.cameras) == ["front", "wrist"]
+    reduced = replace(episode, cameras={"front": episode.cameras["front"]})
+    both, one = list(source.read(episode)), list(source.read(reduced))
+    assert [list(frame.images) for frame in one] == [["front"]] * len(both)
+    np.testing.assert_array_equal(one[-1].images["front"], both[-1].images["front"])
 
 
 def test_copies_of_a_source_read_the_same(v21: Path, families: Path) -> None:

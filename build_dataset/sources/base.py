@@ -94,6 +94,9 @@ class Source(Protocol):
     def read(self, episode: SourceEpisode) -> Generator[Frame]:
         """Stream the frames of an episode in order, a bounded number in memory at a time.
 
+        The episode is one that `episodes` listed, with some of its cameras or all: only those in
+        `episode.cameras` are read.
+
         Callers may stop early; closing the generator releases the files.
 
         Raises:

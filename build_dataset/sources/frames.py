@@ -147,8 +147,8 @@ class FramesSource:
             actions = None if episode.action_size is None else rows.vectors("action")
             with ExitStack() as stack:
                 streams = {
-                    camera: stack.enter_context(closing(self._stream(episode, images)))
-                    for camera, images in key.images.items()
+                    camera: stack.enter_context(closing(self._stream(episode, key.images[camera])))
+                    for camera in episode.cameras
                 }
                 for number in range(episode.raw_length):
                     found = {}

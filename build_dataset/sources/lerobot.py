@@ -195,7 +195,8 @@ class LeRobotSource:
                         f"says {size}"
                     )
             fps, images = self._layout.fps, {}
-            for camera, column in columns.cameras.items():
+            for camera in episode.cameras:
+                column = columns.cameras[camera]
                 stream = iter_images(self._files, where, column, rows, fps, episode.exact)
                 images[camera] = stack.enter_context(closing(stream))
             for number in range(where.length):
