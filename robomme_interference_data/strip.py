@@ -7,9 +7,10 @@ from pathlib import Path
 
 from robomme_interference_data.buffer import Buffer, Session
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
+from robomme_interference_data.draw import even_sample
 from robomme_interference_data.page import Page, ink_on, open_page, tint
 
-__all__ = ["Block", "arrange", "draw_strip", "even_sample", "session_colors", "shown_frames"]
+__all__ = ["Block", "arrange", "draw_strip", "session_colors", "shown_frames"]
 
 LESSON_COLOR = "#D55E00"
 COLORS = (
@@ -57,21 +58,6 @@ class Block:
     slot: int
     slots: int
     frames: int
-
-
-def even_sample(history_frames: int, samples: int = SAMPLE_FRAMES) -> list[int]:
-    """Return the indices of the even sample in which `draw.lesson_share` counts the lesson.
-
-    Args:
-        history_frames: Frames of the history buffer; also the index of the live observation.
-        samples: Size of the sample, 2 or more.
-
-    Returns:
-        Indices, ascending; the last one is the live observation's.
-    """
-    if history_frames + 1 < samples:
-        return list(range(history_frames + 1))
-    return [j * history_frames // (samples - 1) for j in range(samples)]
 
 
 def shown_frames(start: int, stop: int, count: int) -> list[int]:

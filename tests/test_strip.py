@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from robomme_interference_data import load_buffer
 from robomme_interference_data.buffer import Buffer, Session
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.draw import lesson_share
+from robomme_interference_data.draw import even_sample, lesson_share
 from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
@@ -34,7 +34,6 @@ from robomme_interference_data.strip import (
     Block,
     arrange,
     draw_strip,
-    even_sample,
     session_colors,
     shown_frames,
 )
