@@ -109,8 +109,10 @@ def _buffer_leaks(manifest: BufferManifest) -> Iterator[Leak]:
     name = f"{manifest.episode_id} at k={manifest.k}"
     distractors = [session for session in manifest.sessions if session.role == "distractor"]
     for session in distractors:
-        if session.family == manifest.family:
+        if manifest.family in (session.family, session.source.family):
             yield Leak("same family", f"{name}: {session.source}")
+        if session.source.split != "train":
+            yield Leak("not a train episode", f"{name}: {session.source}")
     for source, count in Counter(session.source for session in distractors).items():
         if count > 1:
             yield Leak("repeated unit", f"{name}: {source}, {count} times")

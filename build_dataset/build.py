@@ -5,17 +5,16 @@ folder beside it and renamed at the end. An interrupted build goes on from its s
 """
 
 import dataclasses
-import fcntl
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from robomme_interference_data.build_dataset.encode import Codec
 from robomme_interference_data.build_dataset.finish import finish_dataset
+from robomme_interference_data.build_dataset.locks import locked, work_folder
 from robomme_interference_data.build_dataset.plan import (
     Plan,
     PlannedEpisode,
@@ -124,33 +123,50 @@ def build_dataset(
         MissingExtraError: lerobot is not installed.
     """
     require_lerobot()
+    out = out.resolve()  # a folder cannot be given the name of a link, or "."
     with progress.status("Listing episodes"):
-        listed = [_with_cameras(source.episodes(), settings.cameras) for source in sources]
-    plan = _plan(kind, listed, filters)
-    cameras = tuple(sorted(plan.episodes[0].episode.cameras))
+        listed = [source.episodes() for source in sources]
+    plan = _plan(kind, listed, filters, settings.cameras)
+    existed = _is_built(out, plan, settings)
+    if not existed:
+        with locked(out) as work:
+            existed = _is_built(out, plan, settings)  # another build may have ended just now
+            if not existed:
+                _make(work, plan, sources, settings, progress).rename(out)
+    shutil.rmtree(work_folder(out), ignore_errors=True)
     frames = sum(len(item.indices) for item in plan.episodes)
-    if out.exists() and (out.is_file() or any(out.iterdir())):
-        _require_same(out, plan, cameras, settings)
-        shutil.rmtree(out.parent / f".{out.name}.building", ignore_errors=True)
-        return BuildResult(out, len(plan.episodes), frames, plan.skipped, existed=True)
-    work = out.parent / f".{out.name}.building"
-    with _locked(work):
-        staged = _stage_all(work / "episodes", plan, cameras, sources, settings, progress)
-        episodes = list(zip(plan.episodes, staged, strict=True))
-        with progress.status("Loading lerobot"):
-            load_lerobot()
-        made = work / "dataset"
-        shutil.rmtree(made, ignore_errors=True)
-        progress.start("Writing the LeRobot dataset", frames)
-        for count in write_dataset(made, kind, episodes, cameras, settings.codec, FPS):
-            progress.advance(count)
-        with progress.status("Checking and hashing"):
-            provenance = [source.provenance for source in sources]
-            finish_dataset(made, kind, settings.version, plan, episodes, settings.codec, provenance)
-            os.sync()
-        made.rename(out)
-        shutil.rmtree(work)
-    return BuildResult(out, len(plan.episodes), frames, plan.skipped, existed=False)
+    return BuildResult(out, len(plan.episodes), frames, plan.skipped, existed)
+
+
+def _make(
+    work: Path,
+    plan: Plan,
+    sources: Sequence[Source],
+    settings: Settings,
+    progress: BuildProgress,
+) -> Path:
+    """Make the dataset in the work folder, going on from what an earlier build left there."""
+    cameras = _cameras(plan)
+    staged = _stage_all(work / "episodes", plan, cameras, sources, settings, progress)
+    episodes = list(zip(plan.episodes, staged, strict=True))
+    with progress.status("Loading lerobot"):
+        load_lerobot()
+    made = work / "dataset"
+    shutil.rmtree(made, ignore_errors=True)
+    progress.start("Writing the LeRobot dataset", sum(item.length for item in staged))
+    for count in write_dataset(made, plan.kind, episodes, cameras, settings.codec, FPS):
+        progress.advance(count)
+    with progress.status("Checking and hashing"):
+        provenance = [source.provenance for source in sources]
+        finish_dataset(
+            made, plan.kind, settings.version, plan, episodes, settings.codec, provenance
+        )
+        os.sync()
+    return made
+
+
+def _cameras(plan: Plan) -> tuple[str, ...]:
+    return tuple(sorted(plan.episodes[0].episode.cameras))
 
 
 def _with_cameras(
@@ -172,7 +188,12 @@ def _with_cameras(
     return reduced
 
 
-def _plan(kind: str, listed: Sequence[Sequence[SourceEpisode]], filters: Filters) -> Plan:
+def _plan(
+    kind: str,
+    listed: Sequence[Sequence[SourceEpisode]],
+    filters: Filters,
+    cameras: tuple[str, ...] | None,
+) -> Plan:
     everything = [episode for episodes in listed for episode in episodes]
     selected = select(
         everything,
@@ -182,7 +203,11 @@ def _plan(kind: str, listed: Sequence[Sequence[SourceEpisode]], filters: Filters
     )
     chosen = {id(episode) for episode in selected}
     plan = plan_dataset(
-        kind, [[episode for episode in episodes if id(episode) in chosen] for episodes in listed]
+        kind,
+        [
+            _with_cameras([episode for episode in episodes if id(episode) in chosen], cameras)
+            for episodes in listed
+        ],
     )
     if not plan.episodes:
         reasons = "; ".join(f"{item.episode_id}: {item.reason}" for item in plan.skipped[:5])
@@ -244,7 +269,10 @@ def _failure(
     _item, error = failures[0]
     if len(failures) == 1 and isinstance(error, InterferenceError):
         return error
-    lines = [f"  {item.episode.id}: {str(error).splitlines()[0]}" for item, error in failures[:10]]
+    lines = []
+    for item, error in failures[:10]:
+        name = f"{item.episode.id}: "
+        lines.append(f"  {name}{str(error).splitlines()[0].removeprefix(name)}")
     more = f"\n  … and {len(failures) - 10} more" if len(failures) > 10 else ""
     return BuildError(
         f"{len(failures)} of {total} episodes failed:\n" + "\n".join(lines) + more,
@@ -253,19 +281,21 @@ def _failure(
     )
 
 
-def _require_same(out: Path, plan: Plan, cameras: tuple[str, ...], settings: Settings) -> None:
-    """Check that a finished dataset is what this build would make.
+def _is_built(out: Path, plan: Plan, settings: Settings) -> bool:
+    """Tell whether the dataset is there already.
 
     Raises:
-        BuildError: It is something else.
+        BuildError: Something else is there.
     """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return False
     advice = "Choose another --out, or remove the folder first."
     if not (out / IDENTITY_PATH).is_file():
         raise BuildError(f"{out} exists and is not a dataset of this package", advice)
     dataset = Dataset(LocalFiles(out))
     identity = dataset.identity
     found = (dataset.kind, identity["version"], identity["codec"], tuple(identity["cameras"]))
-    wanted = (plan.kind, settings.version, settings.codec.name, cameras)
+    wanted = (plan.kind, settings.version, settings.codec.name, _cameras(plan))
     if found != wanted:
         raise BuildError(
             f"{out} exists and was built otherwise: kind, version, codec and cameras are {found}, "
@@ -281,19 +311,4 @@ def _require_same(out: Path, plan: Plan, cameras: tuple[str, ...], settings: Set
             f"{out} exists and holds other episodes: {len(stored)} stored, {len(planned)} planned",
             advice,
         )
-
-
-@contextmanager
-def _locked(work: Path) -> Iterator[None]:
-    """Hold the work folder, so that two builds of one dataset cannot disturb each other."""
-    work.mkdir(parents=True, exist_ok=True)
-    with (work / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise BuildError(
-                f"another build of {work.parent / work.name[1:].removesuffix('.building')} is "
-                "running",
-                "Wait for it to end, or stop it.",
-            ) from None
-        yield
+    return True

@@ -386,7 +386,7 @@ def _manifests(
 def _limit(text: str) -> int | None:
     if text == "none":
         return None
-    if not text.isdigit() or int(text) == 0:
+    if not text.isdecimal() or int(text) == 0:
         raise InvalidOptionError(f"--position-limit {text!r}; expected a positive number or none")
     return int(text)
 

@@ -1,6 +1,8 @@
 """Encode frames as video with PyAV, and gather the image statistics that LeRobot stores."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.codec.codec import UnknownCodecError
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import BuildError, InvalidOptionError, nearest
@@ -26,6 +29,7 @@ class Codec:
         settings: Further arguments of `RGBEncoderConfig`.
         options: What they become for FFmpeg; a test holds the two against each other.
         exact: Whether decoding gives back the very pixels.
+        min_side: Smallest height and width in pixels that the encoder takes.
     """
 
     name: str
@@ -34,6 +38,7 @@ class Codec:
     settings: Mapping[str, Any]
     options: Mapping[str, str]
     exact: bool
+    min_side: int = 1
 
 
 CODECS = {
@@ -71,6 +76,7 @@ CODECS = {
             settings={"g": 2, "crf": 30, "preset": 12},
             options={"g": "2", "crf": "30", "preset": "12", "svtav1-params": "fast-decode=0"},
             exact=False,
+            min_side=64,  # SVT-AV1 crashes on some smaller frames
         ),
     )
 }
@@ -97,16 +103,25 @@ class VideoEncoder:
         fps: Frame rate in Hz.
         height: Rows of pixels.
         width: Columns of pixels.
+
+    Raises:
+        BuildError: The file cannot be written, or the frames are too small for the codec.
     """
 
     def __init__(self, path: Path, codec: Codec, fps: int, height: int, width: int):
-        try:
+        if min(height, width) < codec.min_side:
+            raise BuildError(
+                f"{path.stem}: frames of {width}×{height} pixels are too small for {codec.name}, "
+                f"which takes {codec.min_side}×{codec.min_side} and more",
+                "Use --codec av1-lossless.",
+            )
+        self._path = path
+        os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
+        with self._errors():
             self._container = av.open(str(path), "w")
             self._stream = self._container.add_stream(
                 codec.vcodec, rate=fps, options=dict(codec.options)
             )
-        except av.error.FFmpegError as error:
-            raise BuildError(f"{path}: the video cannot be written: {error}") from error
         self._stream.pix_fmt = codec.pix_fmt
         self._stream.height = height
         self._stream.width = width
@@ -120,13 +135,22 @@ class VideoEncoder:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts = self._count
         frame.time_base = self._time_base
-        self._container.mux(self._stream.encode(frame))
+        with self._errors():
+            self._container.mux(self._stream.encode(frame))
         self._count += 1
 
     def close(self) -> None:
         """Write what is pending and close the file."""
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
+        with self._errors():
+            self._container.mux(self._stream.encode(None))
+            self._container.close()
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (av.error.FFmpegError, UnknownCodecError) as error:
+            raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
 
 
 class ImageStats:

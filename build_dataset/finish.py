@@ -1,8 +1,10 @@
 """Give a dataset that LeRobot wrote our columns, identity and report, and check its videos.
 
 LeRobot 0.6 offers no way to hand per-episode columns to its writer, but reads any that stand in
-`meta/episodes` and keeps them (`LeRobotDatasetMetadata.filter_episodes` can select by them, and its
-merge and delete tools carry them along). So they are added there, not in a file of their own.
+`meta/episodes`: `LeRobotDatasetMetadata.filter_episodes` can select by them. So they are added
+there, not in a file of their own. LeRobot's tools that merge datasets or change their features and
+tasks carry them along; those that delete episodes or split a dataset drop them, and refuse the
+lossless codec.
 """
 
 import hashlib

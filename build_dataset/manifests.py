@@ -5,6 +5,7 @@ that memory does not grow with their number.
 """
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robomme_interference_data.build_dataset.locks import locked
 from robomme_interference_data.constants import (
     ACTION,
     DEMONSTRATIONS,
@@ -46,7 +48,7 @@ __all__ = ["ManifestPlan", "check_history", "expected_rows", "plan_manifests", "
 _BATCH = 1024
 """Queries in a batch; also bounds the rows of a row group, so that few bytes find one buffer."""
 
-_SESSION_NAMES = [field.name for field in SESSION_TYPE]
+_FILES = (MANIFEST_PARQUET, MANIFEST_JSONL, MANIFEST_JSON)
 
 
 @dataclass(frozen=True)
@@ -144,13 +146,33 @@ def write_manifests(plan: ManifestPlan, out: Path) -> Iterator[int]:
     Raises:
         PoolTooSmallError: A query needs more units than the other families have.
         HistoryTooLongError: A buffer exceeds the position limit.
-        BuildError: `out` holds something else.
+        BuildError: `out` holds something else, or is being written by another process.
     """
-    if out.is_file() or (
-        out.exists() and any(out.iterdir()) and not (out / MANIFEST_JSON).is_file()
-    ):
-        raise BuildError(f"{out} exists and holds no manifests", "Choose another --out.")
+    out = out.resolve()
+    with locked(out) as work:
+        try:
+            _clear(out)
+            yield from _write(plan, out)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+def _clear(out: Path) -> None:
+    """Make the folder, and remove what a killed run left half-written in it."""
+    if out.is_file():
+        raise BuildError(f"{out} is a file", "Choose another --out.")
     out.mkdir(parents=True, exist_ok=True)
+    partial = {path for name in _FILES for path in out.glob(f".{name}.*.partial")}
+    others = set(out.iterdir()) - partial - {out / name for name in _FILES}
+    if others and not (out / MANIFEST_JSON).is_file():
+        raise BuildError(
+            f"{out} exists and holds no manifests, but {min(others).name}", "Choose another --out."
+        )
+    for path in partial:
+        path.unlink()
+
+
+def _write(plan: ManifestPlan, out: Path) -> Iterator[int]:
     rows = _Rows(plan)
     with (
         atomic_path(out / MANIFEST_PARQUET) as parquet,

@@ -67,8 +67,8 @@ def parse_ranges(text: str) -> frozenset[int]:
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         if (
-            not first.isdigit()
-            or (dash and not last.isdigit())
+            not first.isdecimal()
+            or (dash and not last.isdecimal())
             or (dash and int(last) < int(first))
         ):
             raise InvalidOptionError(

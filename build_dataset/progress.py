@@ -71,7 +71,7 @@ class BuildProgress:
         if self._task is None:
             return
         if before:
-            task = self._progress.tasks[self._task]
+            task = next(task for task in self._progress.tasks if task.id == self._task)
             self._progress.reset(self._task, completed=int(task.completed) + frames)
         else:
             self._progress.advance(self._task, frames)

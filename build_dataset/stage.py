@@ -227,21 +227,22 @@ def _chosen(source: Source, planned: PlannedEpisode) -> Iterator[Frame]:
 
 def _check(planned: PlannedEpisode, position: int, frame: Frame) -> None:
     episode = planned.episode
-    for camera, size in episode.cameras.items():
-        shape = frame.images[camera].shape if camera in frame.images else None
-        if shape != (*size, 3):
+    found: dict[str, NDArray[Any] | None] = {
+        camera: frame.images.get(camera) for camera in episode.cameras
+    }
+    found |= {"state": frame.state, "action": frame.action}
+    expected = {camera: f"{(*size, 3)} uint8" for camera, size in episode.cameras.items()}
+    expected["state"] = f"({episode.state_size},) float32"
+    expected["action"] = (
+        "None" if episode.action_size is None else f"({episode.action_size},) float32"
+    )
+    for name, values in found.items():
+        kind = "None" if values is None else f"{values.shape} {values.dtype}"
+        if kind != expected[name]:
             raise SourceError(
-                f"{episode.id}: frame {planned.indices[position]} of camera {camera} has shape "
-                f"{shape}; the source says {(*size, 3)}"
+                f"{episode.id}: {name} of frame {planned.indices[position]} is {kind}; the source "
+                f"says {expected[name]}"
             )
-    action_shape = None if frame.action is None else frame.action.shape
-    expected = None if episode.action_size is None else (episode.action_size,)
-    if frame.state.shape != (episode.state_size,) or action_shape != expected:
-        raise SourceError(
-            f"{episode.id}: frame {planned.indices[position]} has state and action of shapes "
-            f"{frame.state.shape} and {action_shape}; the source says ({episode.state_size},) "
-            f"and {expected}"
-        )
     if planned.exec_start_idx is not None and frame.is_demonstration == (
         position >= planned.exec_start_idx
     ):

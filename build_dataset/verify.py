@@ -2,19 +2,22 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from robomme_interference_data.build_dataset.finish import revision_of
 from robomme_interference_data.build_dataset.manifests import expected_rows, plan_manifests
 from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
+    IDENTITY_PATH,
+    MANIFEST_JSON,
     MANIFEST_JSONL,
     MANIFEST_PARQUET,
     MANIFESTS,
@@ -23,12 +26,16 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.digest import combine
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import InterferenceError, InvalidIdError
 from robomme_interference_data.files import LocalFiles, sha256_file
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.manifest_io import ManifestReader
 from robomme_interference_data.schema import EpisodeRecord
 
 __all__ = ["Violation", "verify_split"]
+
+Row = dict[str, Any]
+Rows = Iterator[Row]
 
 _LEROBOT_COLUMNS = (
     "episode_index",
@@ -80,10 +87,10 @@ def verify_split(
     datasets = {name: Dataset(LocalFiles(root / name)) for name in (DEMONSTRATIONS, DISTRACTORS)}
     for name, dataset in datasets.items():
         yield from _identity(name, dataset, reader)
-        for index in range(len(dataset)):
-            record = dataset.record(index)
-            if record.exec_start_idx is None and record.length != UNIT_FRAMES:
-                yield Violation(f"{name} {record.id}", f"a unit of {record.length} frames")
+        for record, tasks in zip(
+            dataset.records(), dataset.episodes["tasks"].to_pylist(), strict=True
+        ):
+            yield from _record(name, record, tasks)
             if decode:
                 yield from _episode(name, dataset, record)
                 advance(record.length)
@@ -98,18 +105,38 @@ def _identity(name: str, dataset: Dataset, reader: ManifestReader) -> Iterator[V
     ]
     if revision_of(dataset.episodes.select(own).to_pylist()) != dataset.revision:
         yield Violation(name, "the episode table is not the one that the revision was made from")
-    counts = {
-        "episodes": len(dataset),
-        "frames": pc.sum(dataset.episodes["length"]).as_py(),
-        "families": dict(Counter(dataset.episodes["family"].to_pylist())),
+    found = {
+        "counts": {
+            "episodes": len(dataset),
+            "frames": pc.sum(dataset.episodes["length"]).as_py(),
+            "families": dict(Counter(dataset.episodes["family"].to_pylist())),
+        },
+        "exact": pc.all(dataset.episodes["exact"]).as_py(),
+        "cameras": [camera.removeprefix(CAMERA_PREFIX) for camera in dataset.cameras],
+        "simulators": sorted({*dataset.episodes["simulator"].to_pylist()} - {None}),
     }
-    if dataset.identity["counts"] != counts:
-        yield Violation(name, f"counts are {dataset.identity['counts']}; there are {counts}")
-    exact = pc.all(dataset.episodes["exact"]).as_py()
-    if dataset.identity["exact"] != exact:
-        yield Violation(name, f"exact is {dataset.identity['exact']}; its episodes say {exact}")
-    if reader.header["datasets"][name]["revision"] != dataset.revision:
+    for field, value in found.items():
+        if dataset.identity.get(field) != value:
+            what = f"{field} is {dataset.identity.get(field)}; its episodes say {value}"
+            yield Violation(f"{name}/{IDENTITY_PATH}", what)
+    recorded = reader.header["datasets"][name]
+    if recorded["revision"] != dataset.revision:
         yield Violation(name, "is not the revision that the manifests were made for")
+    for field, value in recorded.items():
+        own_value = dataset.identity.get(field)
+        if field != "revision" and value != own_value:
+            what = f"{field} of the {name} is {value}; the dataset says {own_value}"
+            yield Violation(f"{MANIFESTS}/{MANIFEST_JSON}", what)
+
+
+def _record(name: str, record: EpisodeRecord, tasks: list[str]) -> Iterator[Violation]:
+    start = record.exec_start_idx
+    if (start is None) != (name == DISTRACTORS):
+        yield Violation(f"{name} {record.id}", f"exec_start_idx is {start}")
+    elif record.length != (expected := UNIT_FRAMES if start is None else start + 1):
+        yield Violation(f"{name} {record.id}", f"holds {record.length} frames, not {expected}")
+    if tasks != [record.goals[0]]:
+        yield Violation(f"{name} {record.id}", f"its task is {tasks}; its goal {record.goals[0]!r}")
 
 
 def _episode(name: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
@@ -149,40 +176,84 @@ def _rows(root: Path, reader: ManifestReader, datasets: dict[str, Dataset]) -> I
             header["seed"],
             header["position_limit"],
         )
-        with (root / MANIFESTS / MANIFEST_JSONL).open(encoding="utf-8") as lines:
-            pairs = zip_longest(reader.rows(), expected_rows(plan), lines)
-            for number, (found, expected, line) in enumerate(pairs):
-                yield from _row(number, found, expected, line)
+        counts = {"queries": 0, "buffers": 0, "sessions": 0}
+        for expected, found in _aligned(expected_rows(plan), reader.rows()):
+            yield from _row(expected, found)
+            if expected is not None:
+                counts["queries"] += expected["k"] == plan.k[0]
+                counts["buffers"] += 1
+                counts["sessions"] += len(expected["sessions"])
+        if header["counts"] != counts:
+            what = f"counts are {header['counts']}; there are {counts}"
+            yield Violation(f"{MANIFESTS}/{MANIFEST_JSON}", what)
+        yield from _lines(root / MANIFESTS / MANIFEST_JSONL, reader)
     except InterferenceError as error:
         yield Violation(MANIFESTS, error.message)
-    except OSError as error:
-        yield Violation(f"{MANIFESTS}/{MANIFEST_JSONL}", f"cannot be read: {error}")
+    except (pa.ArrowException, OSError) as error:
+        yield Violation(f"{MANIFESTS}/{MANIFEST_PARQUET}", f"cannot be read: {error}")
 
 
-def _row(
-    number: int,
-    found: dict[str, Any] | None,
-    expected: dict[str, Any] | None,
-    line: str | None,
-) -> Iterator[Violation]:
-    if found is None or expected is None:
-        what = "is missing" if found is None else "should not be there"
-        row = found or expected or {}
-        yield Violation(_name(row), f"the row {what} in {MANIFEST_PARQUET}")
+def _aligned(expected: Rows, found: Rows) -> Iterator[tuple[Row | None, Row | None]]:
+    """Pair the rows of two streams in canonical order; None where one has no such row."""
+    other = next(found, None)
+    for row in expected:
+        while other is not None and _key(other) < _key(row):
+            yield None, other
+            other = next(found, None)
+        if other is not None and _key(other) == _key(row):
+            yield row, other
+            other = next(found, None)
+        else:
+            yield row, None
+    while other is not None:
+        yield None, other
+        other = next(found, None)
+
+
+def _key(row: Row) -> tuple[tuple[int | str, ...], int]:
+    try:
+        return EpisodeId.parse(row["episode_id"]).sort_key, int(row["k"])
+    except (InvalidIdError, AttributeError, KeyError, TypeError, ValueError):
+        return (-1,), -1  # before all others
+
+
+def _row(expected: Row | None, found: Row | None) -> Iterator[Violation]:
+    if expected is None or found is None:
+        what = "should not be there" if expected is None else "is missing"
+        row = expected or found or {}
+        yield Violation(_name(row), f"the row {what} in {MANIFEST_PARQUET}, or not in its place")
         return
     for field, value in expected.items():
         if found[field] != value:
             given, wanted = _difference(found[field], value)
             yield Violation(_name(expected), f"{field} is {given}; the rules give {wanted}")
-    try:
-        same = line is not None and json.loads(line) == found
-    except ValueError:
-        same = False
-    if not same:
-        yield Violation(
-            f"{MANIFESTS}/{MANIFEST_JSONL}",
-            f"line {number + 1} is not the row of {MANIFEST_PARQUET}",
-        )
+
+
+def _lines(path: Path, reader: ManifestReader) -> Iterator[Violation]:
+    """Check that the JSON lines are the rows of the parquet file."""
+    broken: list[int] = []
+    if not path.is_file():
+        return
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for row, line in _aligned(reader.rows(), _parsed(lines, broken)):
+            if row != line:
+                name = _name(row or line or {})
+                what = f"{name} is not the same row as in {MANIFEST_PARQUET}"
+                yield Violation(f"{MANIFESTS}/{MANIFEST_JSONL}", what)
+    for number in broken:
+        yield Violation(f"{MANIFESTS}/{MANIFEST_JSONL}", f"line {number} is not a JSON object")
+
+
+def _parsed(lines: Iterable[str], broken: list[int]) -> Rows:
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+        except ValueError:
+            row = None
+        if isinstance(row, dict):
+            yield row
+        else:
+            broken.append(number)
 
 
 def _difference(found: Any, expected: Any) -> tuple[str, str]:

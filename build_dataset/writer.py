@@ -182,3 +182,5 @@ def _quiet() -> Iterator[None]:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
         av.logging.set_libav_level(av.logging.INFO)  # FFmpeg's own default
+        # LeRobot leaves FFmpeg's callback behind, which prints; this puts PyAV's own back.
+        av.logging.set_level(av.logging.get_level())

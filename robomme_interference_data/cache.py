@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +54,9 @@ class DecodedCache:
         """
         path = self._path(sha256)
         try:
-            frames = np.load(path, mmap_mode="r")
+            frames = np.lib.format.open_memmap(path, mode="r")  # type: ignore[no-untyped-call]
             os.utime(path)
-        except (OSError, ValueError):
+        except (OSError, ValueError, TokenError):  # what numpy raises for damaged files
             return None
         return frames if frames.shape == shape and frames.dtype == np.uint8 else None
 

@@ -3,6 +3,7 @@
 Only pyarrow and PyAV are used; tests hold the result against lerobot's own reader.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data import video
+from robomme_interference_data import parquet, video
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
@@ -32,7 +33,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.files import Files, read_json
+from robomme_interference_data.files import Files, check_names, read_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema import EpisodeRecord
 
@@ -41,6 +42,27 @@ __all__ = ["Dataset"]
 _SHA = "sha256/"
 _LESSON_SHA = "lesson_sha256/"
 _ROWS_KEPT = 1024
+
+# What is read of each file; one that lacks any of it is refused at once.
+_INFO_KEYS = ("features", "fps", "total_episodes", "data_path", "video_path")
+_IDENTITY_KEYS = ("kind", "revision")
+_EPISODE_COLUMNS = (
+    "episode_index",
+    "length",
+    "data/chunk_index",
+    "data/file_index",
+    "episode_id",
+    "goals",
+    "seed",
+    "difficulty",
+    "simulator",
+    "raw_length",
+    "exec_start_idx",
+    "exact",
+    "sha256",
+    "lesson_sha256",
+)
+_VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")
 
 
 @dataclass(frozen=True)
@@ -65,15 +87,17 @@ class Dataset:
     def __init__(self, files: Files):
         self.files = files
         self._rows: dict[int, dict[str, Any]] = {}
-        self.info = read_json(files.path(INFO_PATH))
+        path = files.path(INFO_PATH)
+        self.info = read_json(path)
         version = self.info.get("codebase_version")
         if version != "v3.0":
             raise FormatError(
                 f"{files.describe()} is a LeRobot dataset of version {version!r}; this package "
                 "reads v3.0"
             )
+        check_names(path, self.info, _INFO_KEYS)
         try:
-            self.identity: dict[str, Any] = read_json(files.path(IDENTITY_PATH))
+            path = files.path(IDENTITY_PATH)
         except MissingFileError:
             raise MissingFileError(
                 f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
@@ -81,6 +105,7 @@ class Dataset:
                 f"Build one from it: robomme-interference build distractors "
                 f"--source lerobot:{files.describe()} --out DIR",
             ) from None
+        self.identity = read_json(path)
         if self.identity.get("format_version") != FORMAT_VERSION:
             raise FormatError(
                 f"{files.describe()} has format version "
@@ -88,6 +113,7 @@ class Dataset:
                 "Install the version of robomme-interference-data that wrote it, or build it "
                 "again.",
             )
+        check_names(path, self.identity, _IDENTITY_KEYS)
 
     @property
     def kind(self) -> str:
@@ -122,12 +148,18 @@ class Dataset:
                 f"{EPISODES_DIR} holds no parquet file in {self.files.describe()}",
                 "The dataset is not complete: download or build it again.",
             )
+        expected = [*_EPISODE_COLUMNS, *(_SHA + name for name in self.features)]
+        for camera in self.cameras:
+            expected += [f"videos/{camera}/{name}" for name in _VIDEO_COLUMNS]
         tables = []
-        for path in paths:
-            file = pq.ParquetFile(self.files.path(path))
-            names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-            tables.append(file.read(columns=names))
-        table = pa.concat_tables(tables)
+        for path in map(self.files.path, paths):
+            with parquet.reading(path):
+                file = pq.ParquetFile(path)
+                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+                check_names(path, names, expected)
+                tables.append(file.read(columns=names))
+        with parquet.reading(self.files.path(paths[0])):  # files with columns of different types
+            table = pa.concat_tables(tables)
         indices = table["episode_index"].to_numpy()
         if not np.array_equal(indices, np.arange(self.info["total_episodes"])):
             raise FormatError(
@@ -202,10 +234,14 @@ class Dataset:
         Raises:
             MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
         """
-        place = self._video(episode_index, camera, stop)
+        place = self._video(episode_index, camera, start, stop)
         first = place.first_frame
         return video.iter_frames(
-            self.files.path(place.path), first + start, first + stop, self.info["fps"]
+            self.files.path(place.path),
+            first + start,
+            first + stop,
+            self.info["fps"],
+            self.features[camera],
         )
 
     def read_frames(
@@ -216,7 +252,7 @@ class Dataset:
         Raises:
             MissingFileError, FormatError, TruncatedVideoError: See `video.decode_into`.
         """
-        place = self._video(episode_index, camera, start + len(out))
+        place = self._video(episode_index, camera, start, start + len(out))
         video.decode_into(
             out, self.files.path(place.path), place.first_frame + start, self.info["fps"]
         )
@@ -228,24 +264,24 @@ class Dataset:
 
         Raises:
             MissingFileError: The data file is missing.
-            TruncatedVideoError: It holds fewer frames of the episode than recorded.
+            FormatError: It cannot be read, or holds other columns or sizes than it should.
+            TruncatedVideoError: It holds fewer frames of the episode than recorded, or the
+                episode has no such frames.
         """
         row = self._row(episode_index)
+        self._check_span(row, start, stop)
         path = self.files.path(
             self.info["data_path"].format(
                 chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
             )
         )
-        try:
-            table = pq.read_table(
-                path,
-                columns=["frame_index", feature],
-                filters=[("episode_index", "==", episode_index)],
-            )
-        except (pa.ArrowException, OSError) as error:
-            raise FormatError(
-                f"{path} cannot be read: {error}", "Download or build the dataset again."
-            ) from None
+        with parquet.reading(path), pq.ParquetFile(path) as file:
+            columns = ["frame_index", feature]
+            check_names(path, file.schema_arrow.names, ["episode_index", *columns])
+            owners = file.read(columns=["episode_index"])
+            keep = parquet.matching(owners, {"episode_index": episode_index})
+            rows = list(parquet.read_rows(file, columns, keep))
+            table = pa.concat_tables(rows or [file.schema_arrow.empty_table()])
         if not np.array_equal(table["frame_index"].to_numpy(), np.arange(row["length"])):
             raise TruncatedVideoError(
                 f"{path}: episode {episode_index} has {len(table)} frames in the data file; "
@@ -253,8 +289,14 @@ class Dataset:
                 "The dataset is damaged: download or build it again.",
             )
         values = table[feature].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        shaped = values.reshape(row["length"], *self.features[feature])
-        return np.ascontiguousarray(shaped[start:stop], dtype=np.float32)
+        shape = (row["length"], *self.features[feature])
+        if values.size != math.prod(shape):
+            raise FormatError(
+                f"{path}: {feature} of episode {episode_index} has {values.size} values; expected "
+                f"{' × '.join(map(str, shape))}",
+                "The dataset is damaged: download or build it again.",
+            )
+        return np.ascontiguousarray(values.reshape(shape)[start:stop], dtype=np.float32)
 
     def span_digests(self, episode_index: int, start: int, stop: int) -> dict[str, str]:
         """Decode a span and return the digests of all its features; one frame in memory."""
@@ -293,18 +335,21 @@ class Dataset:
             self._rows[episode_index] = row
         return row
 
-    def _video(self, episode_index: int, camera: str, stop: int) -> _Place:
+    def _check_span(self, row: dict[str, Any], start: int, stop: int) -> None:
+        if not 0 <= start <= stop <= row["length"]:
+            raise TruncatedVideoError(
+                f"{row['episode_id']} has {row['length']} stored frames in "
+                f"{self.files.describe()}; frames {start} to {stop - 1} were asked for"
+            )
+
+    def _video(self, episode_index: int, camera: str, start: int, stop: int) -> _Place:
         if camera not in self.cameras:
             raise UnknownNameError(
                 f"camera {camera!r} is not in {self.files.describe()}",
                 nearest(camera, self.cameras),
             )
         row = self._row(episode_index)
-        if stop > row["length"]:
-            raise TruncatedVideoError(
-                f"{row['episode_id']} has {row['length']} stored frames in "
-                f"{self.files.describe()}; frames up to {stop - 1} were asked for"
-            )
+        self._check_span(row, start, stop)
         key = f"videos/{camera}/"
         return _Place(
             self.info["video_path"].format(

@@ -51,4 +51,4 @@ def _bytes(values: NDArray[Any]) -> memoryview:
         values = values.astype("<f4", copy=False)
     elif values.dtype != np.uint8:
         raise TypeError(f"digests are over uint8 or float32 values, not {values.dtype}")
-    return memoryview(np.ascontiguousarray(values)).cast("B")
+    return np.ascontiguousarray(values).data

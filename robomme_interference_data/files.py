@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ __all__ = [
     "LocalFiles",
     "atomic_path",
     "canonical_json",
+    "check_names",
     "read_json",
     "sha256_file",
     "write_json",
@@ -80,16 +81,34 @@ def canonical_json(value: Any) -> str:
     )
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
+_DAMAGED = "The file is damaged: download or build it again."
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
 
     Raises:
-        FormatError: The file is not JSON.
+        FormatError: The file is not JSON or holds something else.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise FormatError(f"{path} is not JSON: {error}") from None
+        raise FormatError(f"{path} is not JSON: {error}", _DAMAGED) from None
+    if not isinstance(value, dict):
+        raise FormatError(f"{path} holds no JSON object", _DAMAGED)
+    return value
+
+
+def check_names(path: Path, found: Iterable[str], expected: Iterable[str]) -> None:
+    """Check that a file has all expected columns or keys.
+
+    Raises:
+        FormatError: It lacks some.
+    """
+    present = set(found)
+    missing = [name for name in expected if name not in present]
+    if missing:
+        raise FormatError(f"{path} lacks {', '.join(missing)}", _DAMAGED)
 
 
 def write_json(path: Path, value: Any) -> None:

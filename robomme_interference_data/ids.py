@@ -10,8 +10,8 @@ from robomme_interference_data.errors import InvalidIdError, nearest
 __all__ = ["EpisodeId", "condition_name", "parse_condition"]
 
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
-_INDEX = re.compile(r"0|[1-9][0-9]*")
-_CONDITION = re.compile(r"k(0|[1-9][0-9]*)")
+_INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
+_CONDITION = re.compile(r"k(0|[1-9][0-9]?)")
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 
 
@@ -47,8 +47,10 @@ class EpisodeId:
                 f"{self.split!r} is not a split; expected one of {', '.join(SPLITS)}",
                 nearest(self.split, SPLITS),
             )
-        if self.index < 0:
-            raise InvalidIdError(f"episode index {self.index} is negative; indices start at 0")
+        if not 0 <= self.index < 10**18:
+            raise InvalidIdError(
+                f"episode index {self.index} is out of range", "Indices count from 0."
+            )
 
     @classmethod
     def parse(cls, text: str) -> Self:

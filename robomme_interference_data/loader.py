@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.cache import DecodedCache, default_cache_folder
@@ -15,7 +16,12 @@ from robomme_interference_data.constants import (
     MANIFESTS,
 )
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.errors import HashMismatchError, MissingFileError
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    MissingFileError,
+    UnknownNameError,
+    nearest,
+)
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.manifest_io import ManifestReader
@@ -92,11 +98,23 @@ class Split:
         k: int | None = None,
         difficulty: str | None = None,
     ) -> Iterator[BufferManifest]:
-        """Yield the manifests of all buffers, or of those that have all given properties."""
-        wanted = {"family": family, "k": k, "difficulty": difficulty}
-        return self.reader.select(
-            [(name, "==", value) for name, value in wanted.items() if value is not None]
-        )
+        """Yield the manifests of all buffers, or of those that have all given properties.
+
+        Raises:
+            UnknownNameError: No buffer has this family, k or difficulty.
+        """
+        equal: dict[str, Any] = {}
+        for name, value in (("family", family), ("k", k), ("difficulty", difficulty)):
+            if value is None:
+                continue
+            known = self.reader.values(name)
+            if value not in known:
+                raise UnknownNameError(
+                    f"{name} {value!r} is not in {self.reader.files.describe()}",
+                    nearest(str(value), (str(one) for one in known if one is not None)),
+                )
+            equal[name] = value
+        return self.reader.select(equal)
 
     def load(self, episode_id: EpisodeId | str, k: int, *, verify: bool = False) -> Buffer:
         """Load one buffer; see `load_buffer` for arguments and errors."""

@@ -1,15 +1,18 @@
 """The manifest files: their columns, and how rows are found again by episode id."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robomme_interference_data import parquet
 from robomme_interference_data.constants import FORMAT_VERSION, MANIFEST_JSON, MANIFEST_PARQUET
 from robomme_interference_data.errors import FormatError, UnknownNameError, nearest
-from robomme_interference_data.files import Files, read_json
+from robomme_interference_data.files import Files, check_names, read_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema import BufferManifest, QueryFrame, SessionEntry
 
@@ -61,6 +64,10 @@ SCHEMA = pa.schema(
 )
 
 
+_KEYS = ("episode_id", "k")
+_HEADER_KEYS = ("rule_version", "seed", "k", "position_limit", "datasets", "counts", "files")
+
+
 class ManifestReader:
     """The buffers of a split.
 
@@ -74,7 +81,9 @@ class ManifestReader:
 
     def __init__(self, files: Files):
         self.files = files
-        self.header: dict[str, Any] = read_json(files.path(MANIFEST_JSON))
+        self._metadata: pq.FileMetaData | None = None
+        path = files.path(MANIFEST_JSON)
+        self.header = read_json(path)
         if self.header.get("format_version") != FORMAT_VERSION:
             raise FormatError(
                 f"{files.describe()} has format version {self.header.get('format_version')!r}; "
@@ -82,17 +91,22 @@ class ManifestReader:
                 "Install the version of robomme-interference-data that wrote it, or build the "
                 "manifests again.",
             )
+        check_names(path, self.header, _HEADER_KEYS)
 
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
         """Ids of all query episodes, in canonical order."""
-        column = self._parquet.read(columns=["episode_id"])["episode_id"]
-        return tuple(sorted(map(EpisodeId.parse, column.unique().to_pylist())))
+        return tuple(sorted(map(EpisodeId.parse, self.values("episode_id"))))
 
     @property
     def k_values(self) -> tuple[int, ...]:
         """Numbers of distractor sessions that were planned, ascending."""
         return tuple(self.header["k"])
+
+    def values(self, column: str) -> list[Any]:
+        """Return the distinct values of a column."""
+        with self._opened() as file:
+            return list(file.read(columns=[column])[column].unique().to_pylist())
 
     def get(self, episode: EpisodeId, k: int) -> BufferManifest:
         """Return the manifest of one buffer.
@@ -100,9 +114,9 @@ class ManifestReader:
         Raises:
             UnknownNameError: The split does not have this episode or this k.
         """
-        found = list(self.select([("episode_id", "==", str(episode)), ("k", "==", k)]))
-        if found:
-            return found[0]
+        if k in self.k_values:
+            for manifest in self.select({"episode_id": str(episode), "k": int(k)}):
+                return manifest
         where = self.files.describe()
         families = {known.family for known in self.episode_ids}
         if episode.family not in families:
@@ -114,49 +128,54 @@ class ManifestReader:
                 f"{episode} is not in {where}", nearest(str(episode), map(str, self.episode_ids))
             )
         raise UnknownNameError(
-            f"k={k} is not in {where}",
+            f"k={k!r} is not in {where}",
             f"Planned there: {', '.join(map(str, self.k_values))}. For another k, run "
             f"robomme-interference build manifests … --k {k}",
         )
 
-    def select(self, filters: list[tuple[str, str, Any]]) -> Iterator[BufferManifest]:
-        """Yield the manifests that pass all filters, in file order.
+    def select(self, equal: Mapping[str, Any]) -> Iterator[BufferManifest]:
+        """Yield the manifests with the given values, in file order.
 
         Args:
-            filters: Conditions `(column, operator, value)` as of `pyarrow.parquet.read_table`;
-                an empty list selects all.
+            equal: Column name to value; an empty mapping selects all.
         """
-        return map(_manifest, self.rows(filters))
+        return map(_manifest, self.rows(equal))
 
-    def rows(self, filters: list[tuple[str, str, Any]] | None = None) -> Iterator[dict[str, Any]]:
-        """Yield the rows that pass all filters as plain values, in file order; see `select`."""
-        for batch in self._batches(filters or []):
-            yield from batch.to_pylist()
+    def rows(self, equal: Mapping[str, Any] | None = None) -> Iterator[dict[str, Any]]:
+        """Yield the rows with the given values as plain values, in file order; see `select`."""
+        with self._opened() as file:
+            keep = None
+            if equal:
+                known = equal.keys() <= set(_KEYS)
+                columns = self._keys if known else file.read(columns=list(equal))
+                keep = parquet.matching(columns, equal)
+            for table in parquet.read_rows(file, None, keep):
+                yield from table.to_pylist()
 
     @cached_property
-    def _parquet(self) -> pq.ParquetFile:
-        path = self.files.path(MANIFEST_PARQUET)
-        try:
-            file = pq.ParquetFile(path)
-        except (pa.ArrowException, OSError) as error:
-            raise FormatError(
-                f"{path} is not a parquet file: {error}", "Build the manifests again."
-            ) from None
-        if not file.schema_arrow.equals(SCHEMA):
-            missing = [name for name in SCHEMA.names if name not in file.schema_arrow.names]
-            raise FormatError(
-                f"{path} does not have the columns of format version {FORMAT_VERSION}"
-                + (f": {', '.join(missing)} missing" if missing else ""),
-                "Build the manifests again.",
-            )
-        return file
+    def _keys(self) -> pa.Table:
+        """The columns by which single buffers are found; kept, as many may be asked for."""
+        with self._opened() as file:
+            return file.read(columns=list(_KEYS))
 
-    def _batches(self, filters: list[tuple[str, str, Any]]) -> Iterable[pa.RecordBatch]:
-        if not filters:
-            return self._parquet.iter_batches(batch_size=1024)
-        self._parquet  # noqa: B018 - checks the file first
-        table = pq.read_table(self.files.path(MANIFEST_PARQUET), filters=filters)
-        return table.to_batches(max_chunksize=1024)
+    @contextmanager
+    def _opened(self) -> Iterator[pq.ParquetFile]:
+        path = self.files.path(MANIFEST_PARQUET)
+        with parquet.reading(path), pq.ParquetFile(path, metadata=self._metadata) as file:
+            if self._metadata is None:
+                self._check_columns(path, file.schema_arrow)
+                self._metadata = file.metadata
+            yield file
+
+    def _check_columns(self, path: Path, schema: pa.Schema) -> None:
+        if schema.equals(SCHEMA):
+            return
+        missing = [name for name in SCHEMA.names if name not in schema.names]
+        raise FormatError(
+            f"{path} does not have the columns of format version {FORMAT_VERSION}"
+            + (f": {', '.join(missing)} missing" if missing else ""),
+            "Build the manifests again.",
+        )
 
 
 def _manifest(row: dict[str, Any]) -> BufferManifest:

@@ -18,7 +18,11 @@ __all__ = ["decode_into", "iter_frames"]
 
 
 def iter_frames(
-    path: Path, start: int, stop: int | None, fps: float
+    path: Path,
+    start: int,
+    stop: int | None,
+    fps: float,
+    shape: tuple[int, ...] | None = None,
 ) -> Generator[NDArray[np.uint8]]:
     """Decode the frames `start` (included) to `stop` (excluded) of a video file, in order.
 
@@ -30,13 +34,15 @@ def iter_frames(
         start: Number of the first frame in the file.
         stop: Number after the last frame; None for all that there are.
         fps: Constant frame rate of the file, in Hz.
+        shape: Shape that every frame must have, `(H, W, 3)`; None for any.
 
     Yields:
         Frames, `(H, W, 3) uint8` RGB. The array is the caller's.
 
     Raises:
         MissingFileError: There is no such file.
-        FormatError: The file is not a video, or its frames are not evenly spaced at `fps`.
+        FormatError: The file is not a video, its frames are not evenly spaced at `fps`, or they
+            are of another shape.
         TruncatedVideoError: The file ends before `stop`, or a frame is missing.
     """
     expected = start
@@ -49,14 +55,20 @@ def iter_frames(
                     f"{path}: frame {expected} is missing (the next one found is {number})",
                     "The file is damaged: download or build it again.",
                 )
-            yield _to_rgb(frame)
+            image = _to_rgb(frame)
+            if shape is not None and image.shape != shape:
+                raise FormatError(
+                    f"{path}: frames are {image.shape[1]}×{image.shape[0]} pixels; the dataset's "
+                    f"info.json says {shape[1]}×{shape[0]}"
+                )
+            yield image
             expected += 1
             if expected == stop:
                 return
     if stop is not None or expected == start:
         wanted = "at least one frame" if stop is None else f"frames {start} to {stop - 1}"
         raise TruncatedVideoError(
-            f"{path}: the video ends after frame {expected - 1}; expected {wanted}",
+            f"{path}: the video ends before frame {expected}; expected {wanted}",
             "The file is damaged or incomplete: download or build it again.",
         )
 
@@ -71,12 +83,8 @@ def decode_into(out: NDArray[np.uint8], path: Path, start: int, fps: float) -> N
         FormatError: The frames are of another size than `out`, or as for `iter_frames`.
         MissingFileError, TruncatedVideoError: As for `iter_frames`.
     """
-    for position, image in enumerate(iter_frames(path, start, start + len(out), fps)):
-        if image.shape != out.shape[1:]:
-            raise FormatError(
-                f"{path}: frames are {image.shape[1]}×{image.shape[0]} pixels; the dataset's "
-                f"info.json says {out.shape[2]}×{out.shape[1]}"
-            )
+    images = iter_frames(path, start, start + len(out), fps, out.shape[1:])
+    for position, image in enumerate(images):
         out[position] = image
     return out
 
@@ -92,17 +100,19 @@ def _indexed_frames(path: Path, start: int, fps: float) -> Generator[tuple[int, 
         container = av.open(str(path))
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
-    except (av.error.FFmpegError, OSError) as error:
+    except (av.error.FFmpegError, OSError, ValueError) as error:  # ValueError: a damaged header
         raise FormatError(f"{path} is not a readable video: {error}") from error
     with container:
         if not container.streams.video:
             raise FormatError(f"{path} holds no video stream")
         stream = container.streams.video[0]
+        if stream.codec_context is None:  # a header cut short; PyAV would crash the process
+            raise FormatError(f"{path} is not a readable video: its codec is not known")
         stream.thread_count = 1  # sessions are decoded side by side instead
         tick = float(stream.time_base) * fps
-        if start > 0:
-            container.seek(round(start / tick), stream=stream, backward=True)
         try:
+            if start > 0:
+                container.seek(round(start / tick), stream=stream, backward=True)
             first = True
             for frame in container.decode(stream):
                 number = _number(path, frame, tick, fps)

@@ -5,7 +5,9 @@ such a worker is replaced and its task tried again, then reported.
 """
 
 import multiprocessing
+import os
 import signal
+import threading
 import time
 import traceback
 from collections import deque
@@ -13,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError
@@ -145,20 +148,31 @@ def _patience(running: list[_Worker], time_limit: float | None) -> float | None:
 def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
     """Work on tasks until the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    # A parent that was killed cannot stop a task that hangs.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:
             task = pipe.recv()
         except (EOFError, OSError):
             return
         try:
-            message: tuple[Any, Exception | None] = (function(task), None)
+            message = ForkingPickler.dumps((function(task), None))
         except InterferenceError as error:
-            message = (None, error)
+            message = ForkingPickler.dumps((None, error))
         except Exception as error:
             # Foreign exceptions may not survive pickling; their text does.
             text = "".join(traceback.format_exception(error))
-            message = (None, RuntimeError(f"{type(error).__name__}: {error}\n{text}"))
+            text = f"{type(error).__name__}: {error}\n{text}"
+            message = ForkingPickler.dumps((None, RuntimeError(text)))
         try:
-            pipe.send(message)
-        except (BrokenPipeError, OSError):
+            pipe.send_bytes(message)
+        except OSError:
             return
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone, whatever it is doing."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

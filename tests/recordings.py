@@ -1,6 +1,7 @@
 """Recorded episodes made up in memory, and how to build datasets of them quickly."""
 
 import hashlib
+import os
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,12 +92,14 @@ class MemorySource:
     Attributes:
         listing: What it lists, in any order.
         breaks: Id of an episode to the raw frame before which its recording breaks off.
+        dies: Id of an episode whose reading ends the process.
         alter: Changes a frame, given its raw index; not for worker processes.
         reads: Ids of the episodes that were read, in this process.
     """
 
     listing: list[SourceEpisode]
     breaks: dict[str, int] = field(default_factory=dict)
+    dies: str | None = None
     alter: Callable[[int, Frame], Frame] | None = None
     kind: str = "memory"
     provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "memory"})
@@ -108,6 +111,8 @@ class MemorySource:
     def read(self, episode: SourceEpisode) -> Generator[Frame]:
         name = str(episode.id)
         self.reads.append(name)
+        if name == self.dies:
+            os._exit(7)
         for index, frame in enumerate(frames_of(episode)):
             if index == self.breaks.get(name):
                 raise SourceError(f"{name}: cannot read frame {index}", "Record it again.")
@@ -159,5 +164,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _random(episode: SourceEpisode, what: str) -> np.random.Generator:
-    digest = hashlib.sha256(f"{episode.id} {what}".encode()).digest()
-    return np.random.default_rng(int.from_bytes(digest[:8], "little"))
+    return np.random.default_rng(int.from_bytes(digest_of(episode, what)[:8], "little"))
+
+
+def digest_of(episode: SourceEpisode, what: str) -> bytes:
+    return hashlib.sha256(f"{episode.id} {what}".encode()).digest()

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.sources.tables import open_parquet
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
-from robomme_interference_data.files import reading_parquet
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.parquet import reading
 
 __all__ = ["TABLE", "EpisodeRows", "FramesTable", "read_frames_table"]
 
@@ -94,7 +94,7 @@ def read_frames_table(path: Path) -> FramesTable:
     if not path.is_file():
         raise SourceError(f"{path} is missing", _SEE)
     try:
-        with reading_parquet(path):
+        with reading(path):
             table = open_parquet(path).read()
     except FormatError as error:
         raise SourceError(error.message, _SEE) from None

@@ -14,7 +14,8 @@ from robomme_interference_data.constants import (
     TASKS_PATH,
 )
 from robomme_interference_data.errors import FormatError, MissingFileError, SourceError
-from robomme_interference_data.files import Files, read_json, reading_parquet
+from robomme_interference_data.files import Files, read_json
+from robomme_interference_data.parquet import reading
 
 __all__ = ["VERSIONS", "EpisodePlace", "Layout", "read_layout"]
 
@@ -254,7 +255,7 @@ def _parquet_rows(path: Path, keep: list[str] | None = None) -> Iterator[dict[st
         for name in file.schema_arrow.names
         if not name.startswith("stats/") or name in (keep or ())
     ]
-    with reading_parquet(path):
+    with reading(path):
         yield from file.read(columns=names).to_pylist()
 
 

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.files import reading_parquet
+from robomme_interference_data.parquet import reading
 
 __all__ = ["RowSpan", "open_parquet", "scalars", "vectors"]
 
@@ -23,7 +23,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
     Raises:
         FormatError: It is not a parquet file.
     """
-    with reading_parquet(path):
+    with reading(path):
         return pq.ParquetFile(path, buffer_size=1 << 20)
 
 
@@ -113,7 +113,7 @@ class RowSpan:
             )
         groups, row = self._row_groups()
         batches = self._file.iter_batches(_IMAGES_AT_ONCE, row_groups=groups, columns=[name])
-        with reading_parquet(self.path):
+        with reading(self.path):
             for batch in batches:
                 for cell in batch.column(name):
                     if self.start <= row < self.stop:
@@ -130,7 +130,7 @@ class RowSpan:
     def _column(self, name: str) -> pa.ChunkedArray:
         self._type(name)
         groups, first = self._row_groups()
-        with reading_parquet(self.path):
+        with reading(self.path):
             table = self._file.read_row_groups(groups, columns=[name])
         return table[name].slice(self.start - first, len(self))
 
