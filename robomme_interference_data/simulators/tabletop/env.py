@@ -63,8 +63,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=(0.56, 0.0, 0.58), target=(-0.15, 0.0, 0.10))
-        return [CameraConfig("front", pose, 256, 256, fov=math.radians(46), near=0.01, far=10)]
+        pose = sapien_utils.look_at(eye=(0.54, 0.0, 0.60), target=(-0.13, 0.0, 0.07))
+        return [CameraConfig("front", pose, 256, 256, fov=math.radians(43), near=0.01, far=10)]
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE))
@@ -82,7 +82,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.scene.add_directional_light([0.4, -0.7, -0.6], [0.25, 0.25, 0.28])
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
-        self.arm = Arm(self.agent.robot._objs[0], self.episode.stick)
+        self.arm = Arm(self.agent.robot._objs[0], self.episode.pace, self.episode.stick)
         self.status = Status.ONGOING
         self._scripts: dict[str, Script] = {}
         self._rest()

@@ -34,6 +34,9 @@ class Family(ABC):
     stick: ClassVar[float] = 0.0
     """Length in m of the stick that the gripper holds; 0 for none."""
 
+    pace: ClassVar[float] = 0.6
+    """Speed of the scripted motion: 1 is 0.25 m/s at the middle of a move."""
+
     answers: Sequence[Any]
 
     def __init__(self, difficulty: str, rng: RandomState):

@@ -44,19 +44,21 @@ class Arm:
 
     Args:
         articulation: sapien's articulation of the Panda.
+        pace: Factor to the speed of all moves.
         stick: Length of the stick in the gripper, in m; positions are those of its tip.
 
     Attributes:
         action: The commanded action, `(8,) float32`.
     """
 
-    def __init__(self, articulation: Any, stick: float = 0.0):
+    def __init__(self, articulation: Any, pace: float, stick: float):
         self._robot = articulation
         self._model = articulation.create_pinocchio_model()
         names = [link.name for link in articulation.links]
         self._tcp = next(i for i, name in enumerate(names) if name.endswith("panda_hand_tcp"))
         self._limits = np.array(articulation.qlimits[:7], dtype=np.float64)
         self._mask = np.array([1] * 7 + [0] * (articulation.dof - 7), dtype=np.int32)
+        self._pace = pace
         self._stick = stick
         rest = np.zeros(articulation.dof)
         rest[:7] = REST_QPOS
@@ -108,9 +110,8 @@ class Arm:
         start, turn = self._goal, 0.0 if yaw is None else yaw - self._yaw
         way = np.asarray(to, dtype=np.float64) - start
         first_yaw = self._yaw
-        steps = math.ceil(
-            1.5 * FPS * max(float(np.linalg.norm(way)) / speed, abs(turn) / TURN, 0.05)
-        )
+        seconds = 1.5 * max(float(np.linalg.norm(way)) / speed, abs(turn) / TURN) / self._pace
+        steps = max(1, math.ceil(FPS * seconds))
         for step in range(1, steps + 1):
             part = step / steps
             part = part * part * (3 - 2 * part)

@@ -5,6 +5,7 @@ from itertools import product
 
 import numpy as np
 from numpy.random import RandomState
+from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
@@ -32,7 +33,7 @@ class InsertPeg(Family):
 
     def draw(self, rng: RandomState) -> None:
         count = self.pegs_at[self.level]
-        self.box_at = np.array([0.0, 0.0]) + rng.uniform(-0.01, 0.01, 2)
+        self.box_at = rng.uniform(-0.01, 0.01, 2)
         self.spots = row(rng, count, -0.20, 0.12)
         self.tails = [str(n) for n in rng.permutation(["red", "green", "blue", "purple"])][:count]
         self.answers = list(product(range(count), (HEAD, TAIL), (LEFT, RIGHT)))
@@ -78,14 +79,15 @@ class InsertPeg(Family):
             held = min(ends, key=lambda e: math.dist(ends[e], arm.tip))
             if other != number or held != end:
                 return Status.FAIL
-            inside = self.inserted(ends[-end])
-            if inside > 0.01 and (peg.p[1] - self.box.p[1]) * side < 0:
+            from_side = LEFT if peg.p[1] > self.box.p[1] else RIGHT
+            depth = self.inserted(ends[-end], from_side)
+            if depth > 0.01 and from_side != side:
                 return Status.FAIL
-            if inside > 0.04:
+            if depth > 0.04:
                 return Status.SUCCESS
         return Status.ONGOING
 
-    def inserted(self, point: np.ndarray) -> float:
-        """How deep a point is in the hole, in m from its nearer mouth; below 0 if outside."""
-        x, y, z = np.abs(point - self.box.p - (0, 0, self.box.size))
-        return DEPTH / 2 - y if max(x, z) < HOLE / 2 else -1.0
+    def inserted(self, point: NDArray[np.float64], side: int) -> float:
+        """How deep a point is in the hole, in m from its mouth at a side; below 0 if outside."""
+        x, y, z = point - self.box.p - (0, 0, self.box.size)
+        return DEPTH / 2 - side * y if max(abs(x), abs(z)) < HOLE / 2 else -1.0

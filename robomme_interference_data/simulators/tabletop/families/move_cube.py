@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.random import RandomState
+from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
@@ -12,6 +13,8 @@ from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Scri
 from robomme_interference_data.simulators.tabletop.stage import is_near
 
 __all__ = ["MoveCube"]
+
+Point = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
 BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
@@ -27,11 +30,14 @@ class MoveCube(Family):
         wide = self.spread[self.level]
         self.cube_at = np.array([0.045, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
         self.target_at = np.array([-0.11, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
+        way = self.target_at - self.cube_at
+        self.way = np.append(way / np.linalg.norm(way), 0.0)
+        self.turn = math.atan2(-way[1], -way[0])  # of a gripper whose x points back along the way
         self.answers = ["push", "grasp", "hook"]
         self.seen: set[str] = set()
 
     def build(self, kit: Kit) -> None:
-        self.cube = kit.cube(self.cube_at, "orange")
+        self.cube = kit.cube(self.cube_at, "orange", self.turn)
         self.target = kit.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
         self.hook = kit.hook((-0.20, -0.20), (0.25, 0.55, 0.50), HANDLE, CROSS)
         self.last = self.cube.p
@@ -47,14 +53,11 @@ class MoveCube(Family):
 
     def solve(self, arm: Arm, answer: str) -> Script:
         start, end = self.cube.p, self.target.p
-        self.way = (end - start) * (1, 1, 0)
-        self.way /= np.linalg.norm(self.way)
-        self.turn = math.atan2(-self.way[1], -self.way[0])  # the gripper's x points away from it
         return {"push": self.push, "grasp": self.grasp, "hook": self.use_hook}[answer](
             arm, start, end
         )
 
-    def push(self, arm: Arm, start: np.ndarray, end: np.ndarray) -> Script:
+    def push(self, arm: Arm, start: Point, end: Point) -> Script:
         behind = start - 0.055 * self.way
         yield from arm.move(behind + (0, 0, 0.12), self.turn)
         yield from arm.grip(close=True)
@@ -62,11 +65,11 @@ class MoveCube(Family):
         yield from arm.move(end - 0.031 * self.way + (0, 0, CUBE / 2), speed=SLOW)
         yield from arm.wait(6)
 
-    def grasp(self, arm: Arm, start: np.ndarray, end: np.ndarray) -> Script:
-        yield from arm.pick(start)
+    def grasp(self, arm: Arm, start: Point, end: Point) -> Script:
+        yield from arm.pick(start, self.turn)
         yield from arm.put((end[0], end[1], CUBE / 2 + 0.002))
 
-    def use_hook(self, arm: Arm, start: np.ndarray, end: np.ndarray) -> Script:
+    def use_hook(self, arm: Arm, start: Point, end: Point) -> Script:
         grip = 0.025  # m from the handle's end
         at = self.hook.point(grip, 0, 0.004)
         yield from arm.pick(at)
@@ -92,6 +95,14 @@ class MoveCube(Family):
 
     def manner(self, arm: Arm) -> str:
         """How the cube is being moved now."""
-        if min(math.dist(self.cube.p, self.hook.point(HANDLE, y, 0)) for y in (0, CROSS)) < 0.07:
+        end, corner, tip = (self.hook.point(*at, 0) for at in ((0, 0), (HANDLE, 0), (HANDLE, CROSS)))
+        if min(_distance(self.cube.p, end, corner), _distance(self.cube.p, corner, tip)) < 0.045:
             return "hook"
         return "grasp" if arm.opening > 0.01 else "push"
+
+
+def _distance(point: Point, one: Point, other: Point) -> float:
+    """Distance of a point from the straight line between two points, in m."""
+    way = other - one
+    part = float(np.clip((point - one) @ way / (way @ way), 0, 1))
+    return float(np.linalg.norm(point - one - part * way))

@@ -25,6 +25,7 @@ class PlaceFamily(Family):
     When hard, two pairs of targets change places after the demonstration.
     """
 
+    pace = 1.4
     targets_at = (3, 4, 5)
     colours_at = (1, 2, 3)
     row_of_targets = 0.04  # m, their x
@@ -98,13 +99,13 @@ class VideoPlaceButton(PlaceFamily):
         others = [self.targets[number] for number in self.order if number != answer]
         places = [self.targets[answer], others[0]]
         before, after = places if self.when == "before" else places[::-1]
-        # Each further cube starts on a target of its own and moves to the one just left.
         starts = [before, *others[1:]]
         yield from arm.wait(5)
         for cube, target in zip(self.cubes, starts, strict=False):
             yield from self.place(arm, cube, target)
         yield from arm.press(self.button)
-        for cube, target in zip(self.cubes, [after, *starts], strict=False):
+        # The second cube moves to the target that the first one has just left; a third one stays.
+        for cube, target in zip(self.cubes[:2], [after, before], strict=False):
             yield from self.place(arm, cube, target)
         yield from self.exchange_targets(arm)
 

@@ -57,13 +57,13 @@ class VideoUnmask(Family):
             body.hold(True)
         for shell in self.shells:
             shell.put(Place((*shell.home.p[:2], HIGH)))
-        yield from arm.wait(20)
-        ways = [along(shell, shell.home, 30) for shell in self.shells]
+        yield from arm.wait(30)
+        ways = [along(shell, shell.home, 40) for shell in self.shells]
         for places in zip(*ways, strict=True):
             for shell, place in zip(self.shells, places, strict=True):
                 shell.put(place)
             yield
-        yield from arm.wait(15)
+        yield from arm.wait(30)
 
     def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
         for number in answer:

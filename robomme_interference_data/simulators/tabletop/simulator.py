@@ -1,0 +1,113 @@
+"""The embedded suite as a simulator: nine families in one environment, an episode at a time."""
+
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    NoRendererError,
+    SimulatorCrashError,
+    UnknownNameError,
+    nearest,
+)
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import (
+    Demonstration,
+    EpisodeInfo,
+    Observation,
+    Status,
+)
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
+from robomme_interference_data.simulators.tabletop.env import TabletopEnv
+
+__all__ = ["TabletopSimulator"]
+
+POLICIES = ("oracle", "guess")
+
+
+class TabletopSimulator:
+    """See `Simulator`. Only one may live in a process: use `worker.RemoteSimulator` for more.
+
+    Args:
+        render: Whether to draw. Without, observations hold no images, no Vulkan is needed, and
+            episodes run several times as fast: for policies that do not look.
+
+    Raises:
+        NoRendererError: No Vulkan device of this machine can render.
+    """
+
+    name = "tabletop"
+
+    def __init__(self, render: bool = True):
+        try:
+            self._env = TabletopEnv(render=render)
+        except RuntimeError as error:
+            if not render or "vulkan" not in str(error).lower() + "device":
+                raise
+            raise NoRendererError(
+                f"no Vulkan device on this machine can render ({error})",
+                "Software rendering works: install Debian's libvulkan1, and mesa-vulkan-drivers "
+                "24.3 or newer (in Debian 12: from bookworm-backports). `make system` does it.",
+            ) from error
+        self._steps: int | None = None
+
+    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+        """Start an episode; see `Simulator.reset`."""
+        episode = EpisodeId.parse(str(episode_id))
+        seed = seed_of(episode)
+        self._steps = None
+        self._env.family = episode.family
+        _, info = self._env.reset(seed=seed)
+        self._steps = 0
+        about = EpisodeInfo(info["goal"], info["goals"], info["difficulty"], seed, self.name)
+        return info["demonstration"], self._env.observe(), about
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, Status]:
+        """Execute one action; see `Simulator.step`."""
+        steps = self._running()
+        action = np.asarray(action, dtype=np.float32)
+        if action.shape != (8,) or not np.isfinite(action).all():
+            raise InvalidOptionError(
+                f"an action is 8 finite numbers, not {action.shape} {action.tolist()}",
+                "Expected 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
+            )
+        self._env._step_action(action)
+        self._steps = steps + 1
+        status = self._env.status
+        if status is Status.ONGOING and self._steps >= MAX_STEPS:
+            status = self._env.status = Status.TIMEOUT
+        return self._env.observe(), status
+
+    def act(self, policy: str) -> NDArray[np.float32]:
+        """Return the next action of `oracle` or `guess`; see `Simulator.act`."""
+        self._running()
+        if policy not in POLICIES:
+            raise UnknownNameError(f"no built-in policy {policy!r}", nearest(policy, POLICIES))
+        return self._env.act(policy)
+
+    @property
+    def chance(self) -> float:
+        """Probability that a guess at the hidden answer of the present episode is right."""
+        self._running()
+        return self._env.chance
+
+    def close(self) -> None:
+        """Release the scene."""
+        self._steps = None
+        self._env.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def _running(self) -> int:
+        if self._steps is None:
+            raise SimulatorCrashError(
+                "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
+            )
+        return self._steps
