@@ -42,16 +42,9 @@ class TabletopSimulator:
     name = "tabletop"
 
     def __init__(self, render: bool = True):
-        try:
-            self._env = TabletopEnv(render=render)
-        except RuntimeError as error:
-            if not render or "vulkan" not in str(error).lower() + "device":
-                raise
-            raise NoRendererError(
-                f"no Vulkan device on this machine can render ({error})",
-                "Software rendering works: install Debian's libvulkan1, and mesa-vulkan-drivers "
-                "24.3 or newer (in Debian 12: from bookworm-backports). `make system` does it.",
-            ) from error
+        if render:
+            _find_renderer()
+        self._env = TabletopEnv(render=render)
         self._steps: int | None = None
 
     def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
@@ -111,3 +104,17 @@ class TabletopSimulator:
                 "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
             )
         return self._steps
+
+
+def _find_renderer() -> None:
+    import sapien
+
+    try:
+        sapien.render.RenderSystem(sapien.Device("cpu"))
+    except RuntimeError as error:
+        raise NoRendererError(
+            f"no Vulkan device on this machine can render: {error}",
+            "Rendering on the processor needs libvulkan1 and Mesa's lavapipe 24.3 or newer: "
+            "apt-get install libvulkan1 mesa-vulkan-drivers (on Debian 12 with "
+            "-t bookworm-backports). render=False works without.",
+        ) from error
