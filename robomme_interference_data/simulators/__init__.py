@@ -1,10 +1,11 @@
 """Simulators of the benchmark's task families.
 
-    from robomme_interference_data.simulators import make_simulator
+from robomme_interference_data.simulators import make_simulator
 
-    with make_simulator("tabletop") as simulator:
-        lesson, first, info = simulator.reset("MoveCube/test/3")
-        observation, status = simulator.step(action)
+simulator = make_simulator("tabletop")
+lesson, first, info = simulator.reset("MoveCube/test/3")
+observation, status = simulator.step(action)
+simulator.close()
 """
 
 from robomme_interference_data.simulators.base import (

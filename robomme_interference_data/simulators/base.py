@@ -81,7 +81,7 @@ class EpisodeInfo:
 
 
 class Simulator(Protocol):
-    """One episode at a time of the benchmark's task families. Used as a context manager too."""
+    """One episode at a time of the benchmark's task families."""
 
     def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
         """Start an episode: play its demonstration, then set the scene for execution.

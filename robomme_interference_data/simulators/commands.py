@@ -1,6 +1,7 @@
 """The commands `simulate` and `simulate-score`."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
-from robomme_interference_data.errors import UnknownNameError, nearest
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Observation, Status
 
 __all__ = ["app"]
@@ -44,9 +45,13 @@ def simulate(
     from robomme_interference_data.simulators.registry import make_simulator
 
     _check(policy)
+    if video is not None and video.suffix != ".mp4":
+        raise InvalidOptionError(
+            f"cannot write {video}: only .mp4 is written", "Give a path that ends in .mp4."
+        )
     name = EpisodeId(family, split, episode)
     options = {"render": video is not None} if simulator == "tabletop" else {}
-    with make_simulator(simulator, **options) as running:
+    with closing(make_simulator(simulator, **options)) as running:
         lesson, first, info = running.reset(str(name))
         live, status = [first], Status.ONGOING
         while status is Status.ONGOING:

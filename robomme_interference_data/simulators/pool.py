@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
-from typing import Any, TypeVar
+from typing import Any
 
 from robomme_interference_data.errors import SimulatorCrashError
 from robomme_interference_data.ids import EpisodeId
@@ -11,10 +11,8 @@ from robomme_interference_data.simulators.worker import RemoteSimulator
 
 __all__ = ["map_episodes"]
 
-Result = TypeVar("Result")
 
-
-def map_episodes(
+def map_episodes[Result](
     play: Callable[[RemoteSimulator, EpisodeId], Result],
     episodes: Sequence[EpisodeId],
     simulator: str = "tabletop",

@@ -1,6 +1,7 @@
 """Simulators by name; the libraries behind them are imported when one is made."""
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
@@ -28,7 +29,7 @@ def make_simulator(name: str, **options: Any) -> Simulator:
     """Make a simulator in this process. At most one may live in a process at a time.
 
     Args:
-        name: `tabletop`.
+        name: `tabletop`, or `module:function` for a simulator of your own.
         **options: For the simulator; `tabletop` takes `render`, see `TabletopSimulator`.
 
     Raises:
@@ -36,6 +37,16 @@ def make_simulator(name: str, **options: Any) -> Simulator:
         MissingExtraError: Its libraries are not installed.
         NoRendererError: This machine cannot draw its cameras' pictures.
     """
-    if name not in SIMULATORS:
+    if name in SIMULATORS:
+        return SIMULATORS[name](**options)
+    module, _, function = name.partition(":")
+    if not function:
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
-    return SIMULATORS[name](**options)
+    try:
+        simulator: Simulator = getattr(import_module(module), function)(**options)
+    except (ModuleNotFoundError, AttributeError) as error:
+        raise UnknownNameError(
+            f"there is no simulator {name!r}: {error}",
+            "Expected <module>:<function>, which can be imported and returns a simulator.",
+        ) from error
+    return simulator

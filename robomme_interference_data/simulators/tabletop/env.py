@@ -38,7 +38,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     Args:
         family: Task family to start with; `family` may be set before a reset.
-        render: Whether to draw; without, observations hold no images and no Vulkan is needed.
+        render: Whether to draw; without, observations hold no images.
         **options: As for any ManiSkill environment.
     """
 
@@ -49,6 +49,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.drawing = render
         self._demonstrating = False
         options.setdefault("obs_mode", "rgb" if render else "state_dict")
+        options.setdefault("reward_mode", "sparse")
         options.setdefault("render_backend", "cpu" if render else "none")
         super().__init__(
             robot_uids=PANDA, control_mode="pd_joint_pos", sim_backend="physx_cpu", **options
@@ -63,7 +64,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=(0.54, 0.0, 0.60), target=(-0.13, 0.0, 0.07))
+        pose = sapien_utils.look_at(eye=(0.54, 0.0, 0.60), target=(-0.18, 0.0, 0.11))
         return [CameraConfig("front", pose, 256, 256, fov=math.radians(43), near=0.01, far=10)]
 
     def _load_agent(self, options: dict[str, Any]) -> None:
@@ -91,6 +92,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.episode.react(self.arm)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
+        """Return `success` and `fail`, as ManiSkill wants them."""
         return {
             "success": torch.tensor([self.status is Status.SUCCESS]),
             "fail": torch.tensor([self.status is Status.FAIL]),
@@ -162,7 +164,6 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
         self.kit.restore()
-        self.episode.restore()
         self._rest()
         return Demonstration(
             {name: np.stack([one.images[name] for one in seen]) for name in seen[0].images},

@@ -59,10 +59,7 @@ class Family(ABC):
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
         """Show the answer."""
 
-    def restore(self) -> None:
-        """Set the live scene, when all bodies have been brought home."""
-
-    def react(self, arm: Arm) -> None:
+    def react(self, arm: Arm) -> None:  # noqa: B027, most scenes do nothing
         """Let the scene answer to the arm after a step: lamps, the cap of a button."""
 
     @abstractmethod

@@ -108,23 +108,41 @@ class Kit:
 
     def room(self, table: Colour, floor: Colour) -> None:
         """A table with the arm on it, and a floor that fills the picture behind."""
-        self._body([((0, 0, -0.45), (0.55, 0.75, 0.45), table)], Place((-0.25, 0, 0)), "table",
-                   moves="never")
-        self._body([((0, 0, -0.05), (8, 8, 0.05), floor)], Place((0, 0, -0.9)), "floor",
-                   moves="never", solid=False)
+        self._body(
+            [((0, 0, -0.45), (0.55, 0.75, 0.45), table)],
+            Place((-0.25, 0, 0)),
+            "table",
+            moves="never",
+        )
+        self._body(
+            [((0, 0, -0.05), (8, 8, 0.05), floor)],
+            Place((0, 0, -0.9)),
+            "floor",
+            moves="never",
+            solid=False,
+        )
 
     def panel(self, xy: Sequence[float], half: Sequence[float], colour: Colour) -> Body:
         """A thin plate on the table, to set things apart by its colour."""
-        return self._body([((0, 0, 0.0005), (half[0], half[1], 0.0005), colour)],
-                          Place((xy[0], xy[1], 0)), "panel", moves="by hand", solid=False)
+        return self._body(
+            [((0, 0, 0.0005), (half[0], half[1], 0.0005), colour)],
+            Place((xy[0], xy[1], 0)),
+            "panel",
+            moves="by hand",
+            solid=False,
+        )
 
     # --- things to move ------------------------------------------------------------------------
 
     def cube(self, xy: Sequence[float], colour: str, yaw: float = 0.0) -> Body:
         """A cube of 4 cm on the table."""
         half = CUBE / 2
-        return self._body([((0, 0, 0), (half, half, half), COLOURS[colour])],
-                          Place((xy[0], xy[1], half), yaw), f"{colour} cube", size=CUBE)
+        return self._body(
+            [((0, 0, 0), (half, half, half), COLOURS[colour])],
+            Place((xy[0], xy[1], half), yaw),
+            f"{colour} cube",
+            size=CUBE,
+        )
 
     def container(self, xy: Sequence[float], colour: Colour) -> Body:
         """An opaque box without bottom, 7 cm wide and high, with a knob to grasp it by."""
@@ -176,8 +194,12 @@ class Kit:
 
     def button(self, xy: Sequence[float]) -> Body:
         """A red push button of 4 cm height on a dark base; `home.p` is the middle of its top."""
-        self._body([((0, 0, 0.01), (0.035, 0.035, 0.01), (0.12, 0.12, 0.13))],
-                   Place((xy[0], xy[1], 0)), "button base", moves="by hand")
+        self._body(
+            [((0, 0, 0.01), (0.035, 0.035, 0.01), (0.12, 0.12, 0.13))],
+            Place((xy[0], xy[1], 0)),
+            "button base",
+            moves="by hand",
+        )
         builder = self._builder()
         self._disc(builder, 0.022, 0.024, (0.9, 0.1, 0.1), top=0.0)
         return self._finish(builder, Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand")
@@ -213,8 +235,9 @@ class Kit:
         return self._scene.create_actor_builder()
 
     @staticmethod
-    def _disc(builder: Any, radius: float, height: float, colour: Colour,
-              top: float | None = None) -> None:
+    def _disc(
+        builder: Any, radius: float, height: float, colour: Colour, top: float | None = None
+    ) -> None:
         # sapien's cylinders lie along x; this quaternion stands them up.
         z = height / 2 if top is None else top - height / 2
         upright = sapien.Pose([0, 0, z], [math.sqrt(0.5), 0, math.sqrt(0.5), 0])
@@ -241,8 +264,11 @@ class Kit:
 
     def _finish(self, builder: Any, home: Place, name: str, size: float, moves: str) -> Body:
         builder.set_initial_pose(home.pose)
-        build = {"freely": builder.build, "by hand": builder.build_kinematic,
-                 "never": builder.build_static}[moves]
+        build = {
+            "freely": builder.build,
+            "by hand": builder.build_kinematic,
+            "never": builder.build_static,
+        }[moves]
         actor = build(name=f"{len(self.bodies)} {name}")
         body = Body(actor._objs[0], home, size)
         self.bodies.append(body)

@@ -62,13 +62,13 @@ class Arm:
         self._stick = stick
         rest = np.zeros(articulation.dof)
         rest[:7] = REST_QPOS
-        self.home_qpos = self._solve(np.array(HOME) + (0, 0, stick), 0.0, rest)
+        self.home_qpos = self._solve(np.array(HOME), 0.0, rest)
         self.reset()
 
     def reset(self) -> None:
         """Command the home pose: gripper open, or closed around its stick."""
         self._qpos = self.home_qpos
-        self._goal = np.array(HOME) + (0.0, 0.0, 0.0)
+        self._goal = np.array(HOME)
         self._yaw = 0.0
         self._gripper = -1.0 if self._stick else 1.0
         self._command()
@@ -99,9 +99,7 @@ class Arm:
         for _ in range(steps):
             yield
 
-    def move(
-        self, to: Sequence[float], yaw: float | None = None, speed: float = SPEED
-    ) -> Script:
+    def move(self, to: Sequence[float], yaw: float | None = None, speed: float = SPEED) -> Script:
         """Move in a straight line, slower at both ends, `speed` in m/s at the middle.
 
         Raises:
@@ -117,7 +115,7 @@ class Arm:
             part = part * part * (3 - 2 * part)
             self._goal = start + part * way
             self._yaw = first_yaw + part * turn
-            self._qpos = self._solve(self._goal + (0, 0, self._stick), self._yaw, self._qpos)
+            self._qpos = self._solve(self._goal, self._yaw, self._qpos)
             self._command()
             yield
 
@@ -176,10 +174,11 @@ class Arm:
         self.action = np.append(self._qpos[:7], self._gripper).astype(np.float32)
 
     def _solve(
-        self, tcp: NDArray[np.float64], yaw: float, start: NDArray[np.float64]
+        self, tip: NDArray[np.float64], yaw: float, start: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         import sapien
 
+        tcp = tip + np.array([0.0, 0.0, self._stick])
         down = [0.0, math.cos(yaw / 2), math.sin(yaw / 2), 0.0]
         pose = sapien.Pose(tcp - np.array(BASE), down)
         qpos, found, _ = self._model.compute_inverse_kinematics(
@@ -188,7 +187,9 @@ class Arm:
         arm = np.asarray(qpos[:7])
         inside = (self._limits[:, 0] <= arm) & (arm <= self._limits[:, 1])
         if not found or not inside.all():
-            reason = "no solution" if not found else f"joint {int(np.argmin(inside)) + 1} at its limit"
+            reason = (
+                "no solution" if not found else f"joint {int(np.argmin(inside)) + 1} at its limit"
+            )
             raise MotionError(
                 f"the arm cannot bring its gripper to {np.round(tcp, 3).tolist()} m, turned by "
                 f"{math.degrees(yaw):.0f}°: {reason}",

@@ -27,7 +27,9 @@ _JOINT = (0.72, 0.75, 0.78)
 _DARK = (0.16, 0.17, 0.19)
 _PAINT = {
     **{f"link{number}": _WHITE for number in range(8)},
-    "link2": _JOINT, "link4": _JOINT, "link6": _JOINT,
+    "link2": _JOINT,
+    "link4": _JOINT,
+    "link6": _JOINT,
     "hand": _WHITE,
     "leftfinger": _DARK,
     "rightfinger": _DARK,

@@ -20,8 +20,8 @@ from robomme_interference_data.simulators.base import (
     Observation,
     Status,
 )
-from robomme_interference_data.simulators.tabletop.episodes import seed_of
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
 
 __all__ = ["TabletopSimulator"]
 
@@ -32,8 +32,8 @@ class TabletopSimulator:
     """See `Simulator`. Only one may live in a process: use `worker.RemoteSimulator` for more.
 
     Args:
-        render: Whether to draw. Without, observations hold no images, no Vulkan is needed, and
-            episodes run several times as fast: for policies that do not look.
+        render: Whether to draw. Without, observations hold no images, and episodes run several
+            times as fast: for policies that do not look.
 
     Raises:
         NoRendererError: No Vulkan device of this machine can render.
@@ -42,8 +42,7 @@ class TabletopSimulator:
     name = "tabletop"
 
     def __init__(self, render: bool = True):
-        if render:
-            _find_renderer()
+        _find_renderer()  # sapien wants one even where nothing is drawn
         self._env = TabletopEnv(render=render)
         self._steps: int | None = None
 
@@ -114,7 +113,6 @@ def _find_renderer() -> None:
     except RuntimeError as error:
         raise NoRendererError(
             f"no Vulkan device on this machine can render: {error}",
-            "Rendering on the processor needs libvulkan1 and Mesa's lavapipe 24.3 or newer: "
-            "apt-get install libvulkan1 mesa-vulkan-drivers (on Debian 12 with "
-            "-t bookworm-backports). render=False works without.",
+            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
+            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
         ) from error

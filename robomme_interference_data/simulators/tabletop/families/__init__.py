@@ -5,7 +5,9 @@ from robomme_interference_data.simulators.tabletop.families.insert_peg import In
 from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
 from robomme_interference_data.simulators.tabletop.families.pattern_lock import PatternLock
 from robomme_interference_data.simulators.tabletop.families.route_stick import RouteStick
-from robomme_interference_data.simulators.tabletop.families.video_place_button import VideoPlaceButton
+from robomme_interference_data.simulators.tabletop.families.video_place_button import (
+    VideoPlaceButton,
+)
 from robomme_interference_data.simulators.tabletop.families.video_place_order import VideoPlaceOrder
 from robomme_interference_data.simulators.tabletop.families.video_repick import VideoRepick
 from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask

@@ -28,7 +28,7 @@ class InsertPeg(Family):
     An answer is `(peg, end, side)`: its number, the end that is held, the side of the box.
     """
 
-    table = (0.80, 0.80, 0.84)
+    table = (0.40, 0.28, 0.56)
     pegs_at = (2, 3, 4)
 
     def draw(self, rng: RandomState) -> None:

@@ -59,7 +59,7 @@ class MoveCube(Family):
 
     def push(self, arm: Arm, start: Point, end: Point) -> Script:
         behind = start - 0.055 * self.way
-        yield from arm.move(behind + (0, 0, 0.12), self.turn)
+        yield from arm.move((behind[0], behind[1], 0.12), self.turn)
         yield from arm.grip(close=True)
         yield from arm.move(behind, speed=SLOW)
         yield from arm.move(end - 0.031 * self.way + (0, 0, CUBE / 2), speed=SLOW)
@@ -77,7 +77,7 @@ class MoveCube(Family):
         reach = HANDLE - 0.018 - grip - CUBE / 2  # from the grip to the cube's middle
         hold = (BESIDE * left) + (0, 0, at[2] + 0.003)
         behind = start * (1, 1, 0) + hold + (reach - 0.025) * self.way
-        yield from arm.move(behind + (0, 0, 0.10), self.turn)
+        yield from arm.move((behind[0], behind[1], 0.12), self.turn)
         yield from arm.move(behind, speed=SLOW)
         yield from arm.move(end + hold + (reach + 0.003) * self.way, speed=SLOW)
         yield from arm.wait(6)
@@ -95,7 +95,9 @@ class MoveCube(Family):
 
     def manner(self, arm: Arm) -> str:
         """How the cube is being moved now."""
-        end, corner, tip = (self.hook.point(*at, 0) for at in ((0, 0), (HANDLE, 0), (HANDLE, CROSS)))
+        end, corner, tip = (
+            self.hook.point(*at, 0) for at in ((0, 0), (HANDLE, 0), (HANDLE, CROSS))
+        )
         if min(_distance(self.cube.p, end, corner), _distance(self.cube.p, corner, tip)) < 0.045:
             return "hook"
         return "grasp" if arm.opening > 0.01 else "push"

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from numpy.random import RandomState
 
 from robomme_interference_data.simulators.base import Status
@@ -27,7 +28,7 @@ class PatternLock(Family):
     length = (4, 5, 6)
 
     def draw(self, rng: RandomState) -> None:
-        x, y = rng.uniform(-0.02, 0.02, 2) + (-0.08, 0.0)
+        x, y = np.array([-0.08, 0.0]) + rng.uniform(-0.02, 0.02, 2)
         half = (SIDE - 1) / 2
         self.middle = (x, y)
         self.spots = [

@@ -2,6 +2,7 @@
 
 from itertools import pairwise, product
 
+import numpy as np
 from numpy.random import RandomState
 
 from robomme_interference_data.simulators.base import Status
@@ -30,7 +31,7 @@ class RouteStick(Family):
     turns = (2, 3, 4)
 
     def draw(self, rng: RandomState) -> None:
-        x, y = rng.uniform(-0.02, 0.02, 2) + (-0.08, 0.0)
+        x, y = np.array([-0.08, 0.0]) + rng.uniform(-0.02, 0.02, 2)
         self.spots = [(x, y + (n - (COUNT - 1) / 2) * SPACING) for n in range(COUNT)]
         self.posts = [(x, y + (n - (COUNT - 2) / 2) * SPACING) for n in range(COUNT - 1)]
         self.answers = routes(self.turns[self.level])

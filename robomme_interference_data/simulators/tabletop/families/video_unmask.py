@@ -67,7 +67,7 @@ class VideoUnmask(Family):
 
     def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
         for number in answer:
-            knob = self.shells[number].p + (0, 0, self.shells[number].size)
+            knob = self.shells[number].point(0, 0, self.shells[number].size)
             yield from arm.pick(knob)
             yield from arm.wait(5)
             yield from arm.lower(knob)
