@@ -32,7 +32,16 @@ def _pick_cube() -> Callable[[], None]:
     """Make ManiSkill's own PickCube, its cameras like ours, and return its step."""
     import gymnasium
     import mani_skill.envs  # noqa: F401, registers the environment
+    from mani_skill.utils.sapien_utils import look_at
 
+    from robomme_interference_data.simulators.tabletop.env import (
+        FRONT_EYE,
+        FRONT_TARGET,
+        FRONT_VIEW,
+    )
+
+    size = {"width": 256, "height": 256}
+    front = {"pose": look_at(FRONT_EYE, FRONT_TARGET), "fov": FRONT_VIEW}
     env = gymnasium.make(
         "PickCube-v1",
         robot_uids="panda_wristcam",
@@ -40,7 +49,7 @@ def _pick_cube() -> Callable[[], None]:
         control_mode="pd_joint_pos",
         sim_backend="physx_cpu",
         render_backend="cpu",
-        sensor_configs={"width": 256, "height": 256},
+        sensor_configs={"base_camera": {**size, **front}, "hand_camera": size},
     )
     env.reset(seed=0)
     rest = env.unwrapped.agent.keyframes["rest"].qpos[:7]
@@ -116,14 +125,20 @@ def workers(episodes: int = 12) -> None:
 
 
 def leaks(episodes: int = 100) -> None:
-    """Memory and open files of a process over many episodes of all families."""
-    from robomme_interference_data.simulators import make_simulator
+    """Memory and open files of a process over many episodes of all families.
 
-    simulator = make_simulator("tabletop")
+    Demonstrations are played without drawing them, to be through in minutes; the first live
+    observation and ten steps are drawn.
+    """
+    from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+    simulator = TabletopSimulator()
     print("| episodes | resident MiB | open files |\n| --- | --- | --- |")
     for number in range(episodes + 1):
+        simulator._env.drawing = False
         simulator.reset(f"{FAMILIES[number % len(FAMILIES)]}/train/{number // 9 % 100}")
-        for _ in range(5):
+        simulator._env.drawing = True
+        for _ in range(10):
             simulator.step(simulator.act("oracle"))
         if number % max(episodes // 10, 1) == 0:
             gc.collect()

@@ -23,7 +23,11 @@ from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
 from robomme_interference_data.simulators.tabletop.panda import PANDA, draw_low_polygon
 
-__all__ = ["TabletopEnv"]
+__all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
+
+FRONT_EYE = (0.54, 0.0, 0.60)  # m
+FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
+FRONT_VIEW = math.radians(43)
 
 # The answer and the guess have random streams of their own: a scene is the same whatever they are.
 _ANSWER_STREAM = 1_000_003
@@ -64,8 +68,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=(0.54, 0.0, 0.60), target=(-0.18, 0.0, 0.11))
-        return [CameraConfig("front", pose, 256, 256, fov=math.radians(43), near=0.01, far=10)]
+        pose = sapien_utils.look_at(eye=FRONT_EYE, target=FRONT_TARGET)
+        return [CameraConfig("front", pose, 256, 256, fov=FRONT_VIEW, near=0.01, far=10)]
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE))
