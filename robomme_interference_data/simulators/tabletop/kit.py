@@ -13,6 +13,8 @@ import numpy as np
 import sapien
 from numpy.typing import NDArray
 
+from robomme_interference_data.simulators.tabletop.motion import Point
+
 __all__ = ["COLOURS", "CUBE", "Body", "Colour", "Kit", "Place"]
 
 Colour = tuple[float, float, float]
@@ -122,7 +124,7 @@ class Kit:
             solid=False,
         )
 
-    def panel(self, xy: Sequence[float], half: Sequence[float], colour: Colour) -> Body:
+    def panel(self, xy: Point, half: Sequence[float], colour: Colour) -> Body:
         """A thin plate on the table, to set things apart by its colour."""
         return self._body(
             [((0, 0, 0.0005), (half[0], half[1], 0.0005), colour)],
@@ -134,7 +136,7 @@ class Kit:
 
     # --- things to move ------------------------------------------------------------------------
 
-    def cube(self, xy: Sequence[float], colour: str, yaw: float = 0.0) -> Body:
+    def cube(self, xy: Point, colour: str, yaw: float = 0.0) -> Body:
         """A cube of 4 cm on the table."""
         half = CUBE / 2
         return self._body(
@@ -144,7 +146,7 @@ class Kit:
             size=CUBE,
         )
 
-    def container(self, xy: Sequence[float], colour: Colour) -> Body:
+    def container(self, xy: Point, colour: Colour) -> Body:
         """An opaque box without bottom, 7 cm wide and high, with a knob to grasp it by."""
         outer, wall, height = 0.036, 0.003, 0.065
         dark = (colour[0] * 0.45, colour[1] * 0.45, colour[2] * 0.45)
@@ -159,7 +161,7 @@ class Kit:
         ]
         return self._body(boxes, Place((xy[0], xy[1], 0)), "container", size=height + 0.014)
 
-    def peg(self, xy: Sequence[float], head: Colour, tail: Colour, length: float = 0.14) -> Body:
+    def peg(self, xy: Point, head: Colour, tail: Colour, length: float = 0.14) -> Body:
         """A peg of 2.4 cm across that lies along x: its head towards +x, its tail towards −x."""
         half, thick = length / 4, 0.012
         boxes = [
@@ -168,7 +170,7 @@ class Kit:
         ]
         return self._body(boxes, Place((xy[0], xy[1], thick)), "peg", size=length, density=300)
 
-    def hook(self, xy: Sequence[float], colour: Colour, length: float, reach: float) -> Body:
+    def hook(self, xy: Point, colour: Colour, length: float, reach: float) -> Body:
         """A peg with a crosspiece: the handle lies along x, the crosspiece at its +x end, to +y."""
         thick = 0.009
         boxes = [
@@ -179,20 +181,20 @@ class Kit:
 
     # --- things that stay ----------------------------------------------------------------------
 
-    def target(self, xy: Sequence[float], colour: Colour, radius: float) -> Body:
+    def target(self, xy: Point, colour: Colour, radius: float) -> Body:
         """A flat disc on the table: a ring of the colour around a white middle."""
         builder = self._builder()
         for size, height, tint in ((radius, 0.002, colour), (0.55 * radius, 0.003, (0.95,) * 3)):
             self._disc(builder, size, height, tint)
         return self._finish(builder, Place((xy[0], xy[1], 0)), "target", radius, "by hand")
 
-    def lamp(self, xy: Sequence[float], colour: Colour, radius: float, height: float) -> Body:
+    def lamp(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
         """A disc that covers a target or grid button when it is lit; see `light`."""
         builder = self._builder()
         self._disc(builder, radius, height, colour)
         return self._finish(builder, Place((xy[0], xy[1], _LOW)), "lamp", height, "by hand")
 
-    def button(self, xy: Sequence[float]) -> Body:
+    def button(self, xy: Point) -> Body:
         """A red push button of 4 cm height on a dark base; `home.p` is the middle of its top."""
         self._body(
             [((0, 0, 0.01), (0.035, 0.035, 0.01), (0.12, 0.12, 0.13))],
@@ -204,13 +206,13 @@ class Kit:
         self._disc(builder, 0.022, 0.024, (0.9, 0.1, 0.1), top=0.0)
         return self._finish(builder, Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand")
 
-    def post(self, xy: Sequence[float], colour: Colour, radius: float, height: float) -> Body:
+    def post(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
         """An upright post that does not give way."""
         builder = self._builder()
         self._disc(builder, radius, height, colour)
         return self._finish(builder, Place((xy[0], xy[1], 0)), "post", radius, "by hand")
 
-    def socket(self, xy: Sequence[float], colour: Colour, hole: float, depth: float) -> Body:
+    def socket(self, xy: Point, colour: Colour, hole: float, depth: float) -> Body:
         """A box with a square hole along y, open at both sides; z 0 of the body is the table."""
         half, wall, middle = hole / 2, 0.02, 0.05
         dark = (colour[0] * 0.6, colour[1] * 0.6, colour[2] * 0.6)

@@ -18,9 +18,12 @@ from robomme_interference_data.errors import MotionError
 if TYPE_CHECKING:
     from robomme_interference_data.simulators.tabletop.kit import Body
 
-__all__ = ["BASE", "HOME", "REST_QPOS", "Arm", "Script"]
+__all__ = ["BASE", "HOME", "REST_QPOS", "Arm", "Point", "Script"]
 
 Script = Iterator[None]
+
+Point = Sequence[float] | NDArray[np.float64]
+"""Three coordinates, or two on the table, in m."""
 
 BASE = (-0.615, 0.0, 0.0)
 """Where the arm stands, in m; the table's top is the plane z = 0."""
@@ -99,7 +102,7 @@ class Arm:
         for _ in range(steps):
             yield
 
-    def move(self, to: Sequence[float], yaw: float | None = None, speed: float = SPEED) -> Script:
+    def move(self, to: Point, yaw: float | None = None, speed: float = SPEED) -> Script:
         """Move in a straight line, slower at both ends, `speed` in m/s at the middle.
 
         Raises:
@@ -125,7 +128,7 @@ class Arm:
         self._command()
         yield from self.wait(GRIP)
 
-    def pick(self, at: Sequence[float], yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
+    def pick(self, at: Point, yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
         """Grasp what is at a point, from above, and lift it by `lift`, in m."""
         x, y, z = at
         yield from self.move((x, y, max(z + CLEARANCE, self._goal[2])), yaw)
@@ -137,14 +140,14 @@ class Arm:
         yield from self.grip(close=True)
         yield from self.move((x, y, z + lift), yaw, SLOW)
 
-    def put(self, at: Sequence[float], yaw: float | None = None) -> Script:
+    def put(self, at: Point, yaw: float | None = None) -> Script:
         """Bring what is held to a point, let go of it there, and withdraw upwards."""
         x, y, z = at
         yield from self.move((x, y, z + CLEARANCE), yaw)
         yield from self.lower(at)
         yield from self.move((x, y, z + CLEARANCE))
 
-    def lower(self, at: Sequence[float]) -> Script:
+    def lower(self, at: Point) -> Script:
         """Go down to a point with what is held and let go of it."""
         yield from self.move(at, speed=SLOW)
         yield from self.wait(SETTLE)

@@ -14,7 +14,7 @@ from robomme_interference_data.simulators.tabletop.stage import is_near
 
 __all__ = ["MoveCube"]
 
-Point = NDArray[np.float64]
+Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
 BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
@@ -57,7 +57,7 @@ class MoveCube(Family):
             arm, start, end
         )
 
-    def push(self, arm: Arm, start: Point, end: Point) -> Script:
+    def push(self, arm: Arm, start: Vector, end: Vector) -> Script:
         behind = start - 0.055 * self.way
         yield from arm.move((behind[0], behind[1], 0.12), self.turn)
         yield from arm.grip(close=True)
@@ -65,11 +65,11 @@ class MoveCube(Family):
         yield from arm.move(end - 0.031 * self.way + (0, 0, CUBE / 2), speed=SLOW)
         yield from arm.wait(6)
 
-    def grasp(self, arm: Arm, start: Point, end: Point) -> Script:
+    def grasp(self, arm: Arm, start: Vector, end: Vector) -> Script:
         yield from arm.pick(start, self.turn)
         yield from arm.put((end[0], end[1], CUBE / 2 + 0.002))
 
-    def use_hook(self, arm: Arm, start: Point, end: Point) -> Script:
+    def use_hook(self, arm: Arm, start: Vector, end: Vector) -> Script:
         grip = 0.025  # m from the handle's end
         at = self.hook.point(grip, 0, 0.004)
         yield from arm.pick(at)
@@ -95,15 +95,14 @@ class MoveCube(Family):
 
     def manner(self, arm: Arm) -> str:
         """How the cube is being moved now."""
-        end, corner, tip = (
-            self.hook.point(*at, 0) for at in ((0, 0), (HANDLE, 0), (HANDLE, CROSS))
-        )
+        ends = ((0.0, 0.0), (HANDLE, 0.0), (HANDLE, CROSS))
+        end, corner, tip = (self.hook.point(x, y, 0) for x, y in ends)
         if min(_distance(self.cube.p, end, corner), _distance(self.cube.p, corner, tip)) < 0.045:
             return "hook"
         return "grasp" if arm.opening > 0.01 else "push"
 
 
-def _distance(point: Point, one: Point, other: Point) -> float:
+def _distance(point: Vector, one: Vector, other: Vector) -> float:
     """Distance of a point from the straight line between two points, in m."""
     way = other - one
     part = float(np.clip((point - one) @ way / (way @ way), 0, 1))

@@ -74,7 +74,7 @@ class PatternLock(Family):
 
 def paths(length: int) -> list[tuple[int, ...]]:
     """All paths of `length` different buttons, each beside the one before it."""
-    found = [(start,) for start in range(SIDE * SIDE)]
+    found: list[tuple[int, ...]] = [(start,) for start in range(SIDE * SIDE)]
     for _ in range(length - 1):
         found = [
             (*path, to)

@@ -4,6 +4,7 @@ from itertools import pairwise, product
 
 import numpy as np
 from numpy.random import RandomState
+from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
@@ -12,6 +13,8 @@ from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import touched
 
 __all__ = ["RouteStick"]
+
+Route = tuple[tuple[int, ...], tuple[int, ...]]
 
 COUNT, SPACING = 5, 0.12  # targets; m from one to the next, with a post in the middle
 RADIUS, POST, TALL = 0.024, 0.010, 0.07  # m
@@ -35,8 +38,9 @@ class RouteStick(Family):
         self.spots = [(x, y + (n - (COUNT - 1) / 2) * SPACING) for n in range(COUNT)]
         self.posts = [(x, y + (n - (COUNT - 2) / 2) * SPACING) for n in range(COUNT - 1)]
         self.answers = routes(self.turns[self.level])
-        self.reached, self.passed = [], []
-        self.before = None
+        self.reached: list[int] = []
+        self.passed: list[int] = []
+        self.before: NDArray[np.float64] | None = None
 
     def build(self, kit: Kit) -> None:
         for spot in self.spots:
@@ -48,12 +52,12 @@ class RouteStick(Family):
     def goals(self) -> tuple[str, ...]:
         return ("follow the same path round the posts with the stick as in the video",)
 
-    def demonstrate(self, arm: Arm, answer: tuple) -> Script:
+    def demonstrate(self, arm: Arm, answer: Route) -> Script:
         yield from arm.wait(3)
         yield from self.solve(arm, answer)
         yield from arm.go_home()
 
-    def solve(self, arm: Arm, answer: tuple) -> Script:
+    def solve(self, arm: Arm, answer: Route) -> Script:
         targets, sides = answer
         yield from arm.move((*self.spots[targets[0]], HIGH))
         yield from arm.move((*self.spots[targets[0]], LOW), speed=0.15)
@@ -70,7 +74,7 @@ class RouteStick(Family):
         for number, lamp in enumerate(self.lamps):
             Kit.light(lamp, number == self.now)
 
-    def judge(self, arm: Arm, answer: tuple) -> Status:
+    def judge(self, arm: Arm, answer: Route) -> Status:
         targets, sides = answer
         self.follow(arm)
         if self.now is not None and (not self.reached or self.now != self.reached[-1]):
@@ -96,9 +100,9 @@ class RouteStick(Family):
                 self.passed.append(0 if abs(off) < POST else 1 if off > 0 else -1)
 
 
-def routes(turns: int) -> list[tuple]:
+def routes(turns: int) -> list[Route]:
     """All routes with a number of turns: targets, and the sides on which posts are passed."""
-    walks = [(start,) for start in range(COUNT)]
+    walks: list[tuple[int, ...]] = [(start,) for start in range(COUNT)]
     for _ in range(turns):
         walks = [(*w, to) for w in walks for to in (w[-1] - 1, w[-1] + 1) if 0 <= to < COUNT]
     return list(product(walks, product((1, -1), repeat=turns)))

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from numpy.random import RandomState
 
 from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
+from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import swap
 
@@ -27,7 +28,7 @@ class VideoUnmaskSwap(VideoUnmask):
             yield from arm.wait(5)
         yield from arm.wait(10)
 
-    def group(self, number: int) -> list:
+    def group(self, number: int) -> list[Body]:
         """A container, and the cube under it if there is one."""
         hidden = [self.under[number]] if number in self.under else []
         return [self.shells[number], *hidden]
