@@ -26,7 +26,7 @@ SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop}
 
 
 def make_simulator(name: str, **options: Any) -> Simulator:
-    """Make a simulator in this process. At most one may live in a process at a time.
+    """Make a simulator in this process; keep to one, and use `RemoteSimulator` for more.
 
     Args:
         name: `tabletop`, or `module:function` for a simulator of your own.

@@ -52,7 +52,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.family = family
         self.drawing = render
         self._demonstrating = False
-        options.setdefault("obs_mode", "rgb" if render else "state_dict")
+        options.setdefault("obs_mode", "rgb" if render else "none")
         options.setdefault("reward_mode", "sparse")
         options.setdefault("render_backend", "cpu" if render else "none")
         super().__init__(

@@ -29,7 +29,7 @@ POLICIES = ("oracle", "guess")
 
 
 class TabletopSimulator:
-    """See `Simulator`. Only one may live in a process: use `worker.RemoteSimulator` for more.
+    """See `Simulator`. Keep to one in a process: `worker.RemoteSimulator` is for more.
 
     Args:
         render: Whether to draw. Without, observations hold no images, and episodes run several
@@ -43,7 +43,9 @@ class TabletopSimulator:
 
     def __init__(self, render: bool = True):
         _find_renderer()  # sapien wants one even where nothing is drawn
-        self._env = TabletopEnv(render=render)
+        # Pictures come straight from the cameras, so ManiSkill need not make observations too.
+        self._env = TabletopEnv(render=render, obs_mode="none")
+        self._env.observe()  # the first picture is slow: shaders are compiled
         self._steps: int | None = None
 
     def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
