@@ -188,11 +188,11 @@ class Kit:
             self._disc(builder, size, height, tint)
         return self._finish(builder, Place((xy[0], xy[1], 0)), "target", radius, "by hand")
 
-    def lamp(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
-        """A disc that covers a target or grid button when it is lit; see `light`."""
+    def lamp(self, colour: Colour, radius: float, height: float) -> Body:
+        """A disc that covers the target or grid button that is lit; see `light`."""
         builder = self._builder()
         self._disc(builder, radius, height, colour)
-        return self._finish(builder, Place((xy[0], xy[1], _LOW)), "lamp", height, "by hand")
+        return self._finish(builder, Place((0, 0, _LOW)), "lamp", height, "by hand")
 
     def button(self, xy: Point) -> Body:
         """A red push button of 4 cm height on a dark base; `home.p` is the middle of its top."""
@@ -226,10 +226,9 @@ class Kit:
         return self._body(boxes, Place((xy[0], xy[1], 0)), "socket", size=middle, moves="by hand")
 
     @staticmethod
-    def light(lamp: Body, on: bool) -> None:
-        """Show a lamp or hide it."""
-        x, y, _ = lamp.home.p
-        lamp.put(Place((x, y, 0.0 if on else _LOW)))
+    def light(lamp: Body, at: Point | None) -> None:
+        """Show a lamp at a place on the table, or hide it."""
+        lamp.put(lamp.home if at is None else Place((at[0], at[1], 0.0)))
 
     # --- how bodies are built --------------------------------------------------------------------
 

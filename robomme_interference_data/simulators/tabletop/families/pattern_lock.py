@@ -42,7 +42,7 @@ class PatternLock(Family):
     def build(self, kit: Kit) -> None:
         kit.panel(self.middle, (0.16, 0.16), (0.08, 0.14, 0.15))
         self.buttons = [kit.post(spot, (0.85, 0.85, 0.80), RADIUS, 0.010) for spot in self.spots]
-        self.lamps = [kit.lamp(spot, (1.0, 0.55, 0.10), RADIUS, 0.012) for spot in self.spots]
+        self.lamp = kit.lamp((1.0, 0.55, 0.10), RADIUS, 0.012)
 
     def goals(self) -> tuple[str, ...]:
         return ("retrace the pattern with the stick, button by button in the same order",)
@@ -61,8 +61,7 @@ class PatternLock(Family):
 
     def react(self, arm: Arm) -> None:
         self.now = touched(arm, self.spots, RADIUS)
-        for number, lamp in enumerate(self.lamps):
-            Kit.light(lamp, number == self.now)
+        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
 
     def judge(self, arm: Arm, answer: tuple[int, ...]) -> Status:
         if self.now is not None and self.now != self.last:

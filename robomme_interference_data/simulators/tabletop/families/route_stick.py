@@ -47,7 +47,7 @@ class RouteStick(Family):
             kit.target(spot, (0.95, 0.92, 0.85), RADIUS)
         for spot in self.posts:
             kit.post(spot, (0.12, 0.12, 0.14), POST, TALL)
-        self.lamps = [kit.lamp(spot, (0.35, 0.90, 0.45), RADIUS, 0.005) for spot in self.spots]
+        self.lamp = kit.lamp((0.35, 0.90, 0.45), RADIUS, 0.005)
 
     def goals(self) -> tuple[str, ...]:
         return ("follow the same path round the posts with the stick as in the video",)
@@ -71,8 +71,7 @@ class RouteStick(Family):
 
     def react(self, arm: Arm) -> None:
         self.now = touched(arm, self.spots, RADIUS)
-        for number, lamp in enumerate(self.lamps):
-            Kit.light(lamp, number == self.now)
+        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
 
     def judge(self, arm: Arm, answer: Route) -> Status:
         targets, sides = answer

@@ -25,7 +25,7 @@ class PlaceFamily(Family):
     When hard, two pairs of targets change places after the demonstration.
     """
 
-    pace = 1.4
+    pace = 1.6
     targets_at = (3, 4, 5)
     colours_at = (1, 2, 3)
     row_of_targets = 0.04  # m, their x
