@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from robomme_interference_data import commands
 from robomme_interference_data.build_dataset import commands as build_commands
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.simulators import commands as simulator_commands
 
 __all__ = ["app", "main"]
 
@@ -61,6 +62,8 @@ app.command()(build_commands.audit)
 app.command(name="list")(commands.list_buffers)
 app.command()(commands.show)
 app.command()(commands.doctor)
+app.command()(simulator_commands.simulate)
+app.command(name="simulate-score")(simulator_commands.simulate_score)
 
 
 def main() -> None:

@@ -61,6 +61,7 @@ CAMERA_PREFIX = "observation.images."
 
 INFO_PATH = "meta/info.json"
 TASKS_PATH = "meta/tasks.parquet"
+STATS_PATH = "meta/stats.json"
 EPISODES_DIR = "meta/episodes"
 IDENTITY_PATH = "meta/interference.json"
 REPORT_PATH = "meta/build_report.json"

@@ -26,6 +26,10 @@ __all__ = [
     "BuildError",
     "PoolTooSmallError",
     "HistoryTooLongError",
+    # simulators
+    "NoRendererError",
+    "MotionError",
+    "SimulatorCrashError",
     # helpers
     "nearest",
 ]
@@ -98,6 +102,18 @@ class PoolTooSmallError(InterferenceError, ValueError):
 
 class HistoryTooLongError(InterferenceError, ValueError):
     """A buffer that exceeds the position limit of the systems it is planned for."""
+
+
+class NoRendererError(InterferenceError, RuntimeError):
+    """No Vulkan device on this machine can render the simulator's cameras."""
+
+
+class MotionError(InterferenceError, RuntimeError):
+    """A scripted motion asks for a pose that the arm cannot take."""
+
+
+class SimulatorCrashError(InterferenceError, RuntimeError):
+    """A simulator's worker process died, or did not answer in time."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:

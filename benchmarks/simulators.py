@@ -1,0 +1,179 @@
+"""Measure the embedded simulator: speed, start of episodes, workers, leaks.
+
+    python benchmarks/simulators.py            # some minutes
+    python benchmarks/simulators.py --episodes 500 --only leaks
+
+Every part runs in a process of its own, one after the other, and prints a Markdown table. The
+comparison with ManiSkill's PickCube uses the same cameras, picture sizes and loop, in turns.
+"""
+
+import argparse
+import gc
+import multiprocessing
+import os
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.pool import map_episodes
+from robomme_interference_data.simulators.worker import RemoteSimulator
+
+EPISODE = "MoveCube/test/0"
+
+
+def _pick_cube() -> Callable[[], None]:
+    """Make ManiSkill's own PickCube, its cameras like ours, and return its step."""
+    import gymnasium
+    import mani_skill.envs  # noqa: F401, registers the environment
+    from mani_skill.utils.sapien_utils import look_at
+
+    from robomme_interference_data.simulators.tabletop.env import (
+        FRONT_EYE,
+        FRONT_TARGET,
+        FRONT_VIEW,
+    )
+
+    size = {"width": 256, "height": 256}
+    front = {"pose": look_at(FRONT_EYE, FRONT_TARGET), "fov": FRONT_VIEW}
+    env = gymnasium.make(
+        "PickCube-v1",
+        robot_uids="panda_wristcam",
+        obs_mode="rgb",
+        control_mode="pd_joint_pos",
+        sim_backend="physx_cpu",
+        render_backend="cpu",
+        sensor_configs={"base_camera": {**size, **front}, "hand_camera": size},
+    )
+    env.reset(seed=0)
+    rest = env.unwrapped.agent.keyframes["rest"].qpos[:7]
+    action = np.append(rest, 1).astype(np.float32)
+    return lambda: env.step(action) and None
+
+
+def _tabletop() -> Callable[[], None]:
+    from robomme_interference_data.simulators import make_simulator
+
+    simulator = make_simulator("tabletop")
+    _, first, _ = simulator.reset(EPISODE)
+    action = np.append(first.state[:7], 1).astype(np.float32)
+    return lambda: simulator.step(action) and None
+
+
+def _rate(step: Callable[[], None], steps: int) -> float:
+    started = time.perf_counter()
+    for _ in range(steps):
+        step()
+    return steps / (time.perf_counter() - started)
+
+
+def speed(rounds: int = 5) -> None:
+    """Steps per second with front and wrist camera at 256×256, against PickCube, in turns."""
+    ours, theirs = _tabletop(), _pick_cube()
+    _rate(ours, 5), _rate(theirs, 2)
+    pairs = [(_rate(ours, 40), _rate(theirs, 6)) for _ in range(rounds)]
+    mine, stock = (statistics.median(column) for column in zip(*pairs, strict=True))
+    print("| scene | steps/s |\n| --- | --- |")
+    print(f"| tabletop | {mine:.1f} |\n| PickCube-v1, same cameras | {stock:.1f} |")
+    print(
+        f"| ratio (median of {rounds} rounds) | {statistics.median(a / b for a, b in pairs):.1f} |"
+    )
+
+
+def resets() -> None:
+    """Seconds from an episode id to the first live observation, demonstration included."""
+    from robomme_interference_data.simulators import make_simulator
+
+    simulator = make_simulator("tabletop")
+    simulator.reset(EPISODE)
+    print("| family | easy | medium | hard | frames |\n| --- | --- | --- | --- | --- |")
+    for family in FAMILIES:
+        seconds, frames = [], []
+        for index in range(3):
+            started = time.perf_counter()
+            lesson, _, _ = simulator.reset(f"{family}/test/{index}")
+            seconds.append(f"{time.perf_counter() - started:.1f} s")
+            frames.append(str(len(lesson)))
+        print(f"| {family} | {' | '.join(seconds)} | {', '.join(frames)} |", flush=True)
+
+
+def _play(remote: RemoteSimulator, episode: EpisodeId) -> int:
+    remote.reset(str(episode))
+    for _ in range(100):
+        remote.step(remote.act("oracle"))
+    return 100
+
+
+def workers(episodes: int = 12) -> None:
+    """Wall seconds of the same episodes with one worker and with two."""
+    taken = []
+    todo = [EpisodeId("MoveCube", "train", index) for index in range(episodes)]
+    for count in (1, 2):
+        started = 0.0
+        for number, _ in enumerate(map_episodes(_play, todo, workers=count)):
+            if number == count - 1:  # by then every worker has started
+                started = time.perf_counter()
+        taken.append((time.perf_counter() - started) / (episodes - count))
+    print("| workers | seconds per episode |\n| --- | --- |")
+    print(f"| 1 | {taken[0]:.2f} |\n| 2 | {taken[1]:.2f} |\n| ratio | {taken[0] / taken[1]:.2f} |")
+
+
+def leaks(episodes: int = 100) -> None:
+    """Memory and open files of a process over many episodes of all families.
+
+    Demonstrations are played without drawing them, to be through in minutes; the first live
+    observation and ten steps are drawn.
+    """
+    from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+    simulator = TabletopSimulator()
+    print("| episodes | resident MiB | open files |\n| --- | --- | --- |")
+    for number in range(episodes + 1):
+        simulator._env.drawing = False
+        simulator.reset(f"{FAMILIES[number % len(FAMILIES)]}/train/{number // 9 % 100}")
+        simulator._env.drawing = True
+        for _ in range(10):
+            simulator.step(simulator.act("oracle"))
+        if number % max(episodes // 10, 1) == 0:
+            gc.collect()
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            resident = pages * resource.getpagesize() / 2**20
+            print(f"| {number} | {resident:.0f} | {len(os.listdir('/proc/self/fd'))} |", flush=True)  # noqa: PTH208
+
+
+PARTS: dict[str, Callable[..., None]] = {
+    "speed": speed,
+    "resets": resets,
+    "workers": workers,
+    "leaks": leaks,
+}
+
+
+def main() -> None:
+    """Run the parts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=PARTS, help="run one part")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes of the leak check")
+    given = parser.parse_args()
+    for name, part in PARTS.items():
+        if given.only in (None, name):
+            print(f"\n## {name}: {(part.__doc__ or '').splitlines()[0]}", flush=True)
+            options: tuple[Any, ...] = (given.episodes,) if part is leaks else ()
+            if part is workers:  # starts processes of its own
+                part()
+                continue
+            process = multiprocessing.get_context("spawn").Process(target=part, args=options)
+            process.start()
+            process.join()
+            if process.exitcode:
+                raise SystemExit(f"{name} failed, exit code {process.exitcode}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""Simulators of the benchmark's task families.
+
+from robomme_interference_data.simulators import make_simulator
+
+simulator = make_simulator("tabletop")
+lesson, first, info = simulator.reset("MoveCube/test/3")
+observation, status = simulator.step(action)
+simulator.close()
+"""
+
+from robomme_interference_data.simulators.base import (
+    Demonstration,
+    EpisodeInfo,
+    Observation,
+    Simulator,
+    Status,
+)
+from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
+
+__all__ = [
+    # make one
+    "make_simulator",
+    "SIMULATORS",
+    # what it serves
+    "Simulator",
+    "Demonstration",
+    "EpisodeInfo",
+    "Observation",
+    "Status",
+]

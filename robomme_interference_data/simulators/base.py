@@ -1,0 +1,126 @@
+"""What every simulator serves, whatever engine is behind it."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Demonstration", "EpisodeInfo", "Observation", "Simulator", "Status"]
+
+
+class Status(StrEnum):
+    """How an episode stands after a step.
+
+    `error` means that the simulator itself broke: such a rollout is no failure of the policy.
+    """
+
+    ONGOING = "ongoing"
+    SUCCESS = "success"
+    FAIL = "fail"
+    TIMEOUT = "timeout"
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy sees at one time step.
+
+    Attributes:
+        images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB. Empty if the
+            simulator was made with `render=False`.
+        state: `(8,) float32`: 7 joint positions in rad, then the gripper's opening, which is the
+            way of one finger, 0 closed to 0.04 m open.
+    """
+
+    images: dict[str, NDArray[np.uint8]]
+    state: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """The lesson of an episode: T time steps, the first live observation not among them.
+
+    Attributes:
+        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; empty with `render=False`.
+        states: `(T, 8) float32`, as `Observation.state`; `states[t]` belongs to frame t.
+        actions: `(T, 8) float32`: the action taken at time step t, after frame t was seen: 7
+            absolute joint targets in rad, then the gripper, −1 closed to 1 open.
+    """
+
+    images: dict[str, NDArray[np.uint8]]
+    states: NDArray[np.float32]
+    actions: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __repr__(self) -> str:
+        cameras = {name: frames.shape for name, frames in self.images.items()}
+        return f"Demonstration(frames={len(self)}, images={cameras})"
+
+
+@dataclass(frozen=True)
+class EpisodeInfo:
+    """What may be known of an episode besides its frames. The hidden answer is not in it.
+
+    Attributes:
+        goal: The goal in words: the first of `goals`.
+        goals: All wordings of the goal; at least one.
+        difficulty: `easy`, `medium` or `hard`.
+        seed: Seed of the scene.
+        simulator: Name under which the simulator is registered.
+    """
+
+    goal: str
+    goals: tuple[str, ...]
+    difficulty: str
+    seed: int
+    simulator: str
+
+
+class Simulator(Protocol):
+    """One episode at a time of the benchmark's task families."""
+
+    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+        """Start an episode: play its demonstration, then set the scene for execution.
+
+        The same id gives the same frames, states and first observation, bit for bit.
+
+        Args:
+            episode_id: `<Family>/<split>/<index>`, such as `MoveCube/test/3`.
+
+        Raises:
+            InvalidIdError: The text is not an episode id.
+            UnknownNameError: There is no such family or episode.
+        """
+        ...
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, Status]:
+        """Execute one action for a tenth of a second.
+
+        Args:
+            action: `(8,) float32`: 7 absolute joint targets in rad, gripper −1 closed to 1 open.
+
+        Raises:
+            InvalidOptionError: The action has another shape, or is not finite.
+            SimulatorCrashError: There is no episode to step: reset first.
+        """
+        ...
+
+    def act(self, policy: str) -> NDArray[np.float32]:
+        """Return the next action, `(8,) float32`, of a built-in policy.
+
+        Args:
+            policy: `oracle`, which reads the hidden answer, or `guess`, which draws one at random
+                from the episode's seed. Keep to one of them throughout an episode.
+
+        Raises:
+            UnknownNameError: The simulator has no such policy.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release everything. Further calls but `close` are errors."""
+        ...

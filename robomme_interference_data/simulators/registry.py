@@ -1,0 +1,52 @@
+"""Simulators by name; the libraries behind them are imported when one is made."""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
+from robomme_interference_data.simulators.base import Simulator
+
+__all__ = ["SIMULATORS", "make_simulator"]
+
+
+def _tabletop(**options: Any) -> Simulator:
+    try:
+        from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+    except ImportError as error:
+        raise MissingExtraError(
+            f"the tabletop simulator needs {error.name or 'a library'}, which is not installed",
+            "pip install 'robomme-interference-data[sim]'",
+        ) from error
+    return TabletopSimulator(**options)
+
+
+SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop}
+"""Name to a function that makes the simulator; another backend adds itself here."""
+
+
+def make_simulator(name: str, **options: Any) -> Simulator:
+    """Make a simulator in this process; keep to one, and use `RemoteSimulator` for more.
+
+    Args:
+        name: `tabletop`, or `module:function` for a simulator of your own.
+        **options: For the simulator; `tabletop` takes `render`, see `TabletopSimulator`.
+
+    Raises:
+        UnknownNameError: There is no such simulator.
+        MissingExtraError: Its libraries are not installed.
+        NoRendererError: This machine cannot draw its cameras' pictures.
+    """
+    if name in SIMULATORS:
+        return SIMULATORS[name](**options)
+    module, _, function = name.partition(":")
+    if not function:
+        raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
+    try:
+        simulator: Simulator = getattr(import_module(module), function)(**options)
+    except (ModuleNotFoundError, AttributeError) as error:
+        raise UnknownNameError(
+            f"there is no simulator {name!r}: {error}",
+            "Expected <module>:<function>, which can be imported and returns a simulator.",
+        ) from error
+    return simulator

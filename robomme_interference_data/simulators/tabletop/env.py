@@ -1,0 +1,187 @@
+"""The ManiSkill environment behind all nine families."""
+
+import math
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.structs.types import SimConfig
+from numpy.random import RandomState
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FAMILIES, FPS
+from robomme_interference_data.errors import UnknownNameError, nearest
+from robomme_interference_data.simulators.base import Demonstration, Observation, Status
+from robomme_interference_data.simulators.tabletop.episodes import DIFFICULTIES, difficulty_of
+from robomme_interference_data.simulators.tabletop.families import family_class
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import Kit
+from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
+from robomme_interference_data.simulators.tabletop.panda import PANDA, draw_low_polygon
+
+__all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
+
+FRONT_EYE = (0.54, 0.0, 0.60)  # m
+FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
+FRONT_VIEW = math.radians(43)
+
+# The answer and the guess have random streams of their own: a scene is the same whatever they are.
+_ANSWER_STREAM = 1_000_003
+_GUESS_STREAM = 2_000_003
+
+
+class TabletopEnv(BaseEnv):  # type: ignore[misc]
+    """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
+
+    `reset` takes the options `difficulty`, and `answer`, the index of the hidden answer to use
+    instead of the seed's own. Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
+
+    Args:
+        family: Task family to start with; `family` may be set before a reset.
+        render: Whether to draw; without, observations hold no images.
+        **options: As for any ManiSkill environment.
+    """
+
+    SUPPORTED_ROBOTS = [PANDA]  # noqa: RUF012, ManiSkill's name and type
+
+    def __init__(self, family: str = FAMILIES[0], render: bool = True, **options: Any):
+        self.family = family
+        self.drawing = render
+        self._demonstrating = False
+        options.setdefault("obs_mode", "rgb" if render else "none")
+        options.setdefault("reward_mode", "sparse")
+        options.setdefault("render_backend", "cpu" if render else "none")
+        super().__init__(
+            robot_uids=PANDA, control_mode="pd_joint_pos", sim_backend="physx_cpu", **options
+        )
+        self._demonstrating = True
+
+    # --- what ManiSkill asks for ---------------------------------------------------------------
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(sim_freq=10 * FPS, control_freq=FPS)
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        pose = sapien_utils.look_at(eye=FRONT_EYE, target=FRONT_TARGET)
+        return [CameraConfig("front", pose, 256, 256, fov=FRONT_VIEW, near=0.01, far=10)]
+
+    def _load_agent(self, options: dict[str, Any]) -> None:
+        super()._load_agent(options, sapien.Pose(BASE))
+        if self.scene.can_render():
+            draw_low_polygon(self.agent.robot._objs[0], self.episode.stick)
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        self.kit = Kit(self.scene)
+        self.kit.room(self.episode.table, self.episode.floor)
+        self.episode.build(self.kit)
+
+    def _load_lighting(self, options: dict[str, Any]) -> None:
+        self.scene.set_ambient_light([0.45, 0.45, 0.45])
+        self.scene.add_directional_light([-0.5, 0.4, -1], [0.75, 0.75, 0.72])
+        self.scene.add_directional_light([0.4, -0.7, -0.6], [0.25, 0.25, 0.28])
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        self.arm = Arm(self.agent.robot._objs[0], self.episode.pace, self.episode.stick)
+        self.status = Status.ONGOING
+        self._scripts: dict[str, Script] = {}
+        self._rest()
+
+    def _after_control_step(self) -> None:
+        self.episode.react(self.arm)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Return `success` and `fail`, as ManiSkill wants them."""
+        return {
+            "success": torch.tensor([self.status is Status.SUCCESS]),
+            "fail": torch.tensor([self.status is Status.FAIL]),
+        }
+
+    # --- an episode ------------------------------------------------------------------------------
+
+    def reset(
+        self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start the episode of a seed: play its demonstration, then set the live scene."""
+        options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
+        if seed is None:
+            seed = int(self._main_rng.randint(2**31))
+        number = int(np.ravel(seed)[0])
+        difficulty = options.get("difficulty", difficulty_of(number))
+        if difficulty not in DIFFICULTIES:
+            raise UnknownNameError(
+                f"{difficulty!r} is not a difficulty", nearest(difficulty, DIFFICULTIES)
+            )
+        self.episode: Family = family_class(self.family)(difficulty, RandomState(number))
+        answers = self.episode.answers
+        drawn = RandomState(number + _ANSWER_STREAM).randint(len(answers))
+        self._answer = answers[options.get("answer", drawn)]
+        self._guess = answers[RandomState(number + _GUESS_STREAM).randint(len(answers))]
+        observed, info = super().reset(seed=number, options=options)
+        if self._demonstrating:
+            info["demonstration"] = self._demonstrate()
+            observed = self.get_obs(self.get_info())
+        goals = self.episode.goals()
+        info.update(goal=goals[0], goals=goals, difficulty=difficulty)
+        return observed, info
+
+    def _step_action(self, action: Any) -> Any:
+        done = super()._step_action(action)
+        if self.status is Status.ONGOING:
+            self.status = self.episode.judge(self.arm, self._answer)
+        return done
+
+    def act(self, policy: str) -> NDArray[np.float32]:
+        """Return the next action of the policy `oracle` or `guess`, `(8,) float32`."""
+        if policy not in self._scripts:
+            answer = self._answer if policy == "oracle" else self._guess
+            self.arm.reset()
+            self._scripts[policy] = self.episode.solve(self.arm, answer)
+        next(self._scripts[policy], None)  # a script that is through holds its last pose
+        return self.arm.action.copy()
+
+    def observe(self) -> Observation:
+        """Return what a policy sees now."""
+        images = {}
+        if self.drawing:
+            self.scene.sub_scenes[0].update_render()
+            for name, sensor in self._sensors.items():
+                camera = sensor.camera._render_cameras[0]
+                camera.take_picture()
+                images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
+        return Observation(images, self.arm.state)
+
+    @property
+    def chance(self) -> float:
+        """Probability that a guess is right."""
+        return 1 / len(self.episode.answers)
+
+    def _demonstrate(self) -> Demonstration:
+        seen, actions = [], []
+        for _ in self.episode.demonstrate(self.arm, self._answer):
+            seen.append(self.observe())
+            actions.append(self.arm.action.copy())
+            super()._step_action(actions[-1])
+        self.kit.restore()
+        self._rest()
+        return Demonstration(
+            {name: np.stack([one.images[name] for one in seen]) for name in seen[0].images},
+            np.stack([one.state for one in seen]),
+            np.stack(actions),
+        )
+
+    def _rest(self) -> None:
+        """Bring the arm to its home pose, at rest."""
+        self.arm.reset()
+        robot = self.agent.robot._objs[0]
+        qpos = np.array(self.arm.home_qpos, dtype=np.float32)
+        qpos[7:] = 0.0 if self.episode.stick else 0.04
+        robot.set_qpos(qpos)
+        robot.set_qvel(np.zeros_like(qpos))
+        self.agent.controller.reset()
+        self.agent.set_action(torch.from_numpy(self.arm.action)[None])

@@ -1,0 +1,45 @@
+"""The nine task families: a file each."""
+
+from robomme_interference_data.errors import UnknownNameError, nearest
+from robomme_interference_data.simulators.tabletop.families.insert_peg import InsertPeg
+from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
+from robomme_interference_data.simulators.tabletop.families.pattern_lock import PatternLock
+from robomme_interference_data.simulators.tabletop.families.route_stick import RouteStick
+from robomme_interference_data.simulators.tabletop.families.video_place_button import (
+    VideoPlaceButton,
+)
+from robomme_interference_data.simulators.tabletop.families.video_place_order import VideoPlaceOrder
+from robomme_interference_data.simulators.tabletop.families.video_repick import VideoRepick
+from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
+from robomme_interference_data.simulators.tabletop.families.video_unmask_swap import VideoUnmaskSwap
+from robomme_interference_data.simulators.tabletop.family import Family
+
+__all__ = ["family_class"]
+
+_FAMILIES: dict[str, type[Family]] = {
+    each.__name__: each
+    for each in (
+        VideoRepick,
+        VideoPlaceOrder,
+        VideoPlaceButton,
+        VideoUnmask,
+        VideoUnmaskSwap,
+        MoveCube,
+        InsertPeg,
+        PatternLock,
+        RouteStick,
+    )
+}
+
+
+def family_class(name: str) -> type[Family]:
+    """Return the class of a task family.
+
+    Raises:
+        UnknownNameError: There is no such family.
+    """
+    if name not in _FAMILIES:
+        raise UnknownNameError(
+            f"the tabletop simulator has no family {name!r}", nearest(name, _FAMILIES)
+        )
+    return _FAMILIES[name]

@@ -1,0 +1,93 @@
+"""InsertPeg: remember which peg was inserted, held at which end, into which side."""
+
+import math
+from itertools import product
+
+import numpy as np
+from numpy.random import RandomState
+from numpy.typing import NDArray
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import COLOURS, Kit
+from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import row
+
+__all__ = ["InsertPeg"]
+
+LENGTH, GRIP = 0.14, 0.04  # m: a peg, and from its middle to where it is held
+HOLE, DEPTH = 0.036, 0.08  # m, of the box
+LIFTED = 0.03  # m, height of the peg's middle
+HEAD, TAIL = 1, -1
+LEFT, RIGHT = 1, -1
+
+
+class InsertPeg(Family):
+    """One of several pegs is grasped at one end and inserted into one side of a box.
+
+    An answer is `(peg, end, side)`: its number, the end that is held, the side of the box.
+    """
+
+    table = (0.40, 0.28, 0.56)
+    pegs_at = (2, 3, 4)
+
+    def draw(self, rng: RandomState) -> None:
+        count = self.pegs_at[self.level]
+        self.box_at = rng.uniform(-0.01, 0.01, 2)
+        self.spots = row(rng, count, -0.20, 0.12)
+        self.tails = [str(n) for n in rng.permutation(["red", "green", "blue", "purple"])][:count]
+        self.answers = list(product(range(count), (HEAD, TAIL), (LEFT, RIGHT)))
+
+    def build(self, kit: Kit) -> None:
+        self.box = kit.socket(self.box_at, (0.55, 0.40, 0.25), HOLE, DEPTH)
+        self.pegs = [
+            kit.peg(spot, COLOURS["yellow"], COLOURS[tail], LENGTH)
+            for spot, tail in zip(self.spots, self.tails, strict=True)
+        ]
+
+    def goals(self) -> tuple[str, ...]:
+        return (
+            "insert the same peg as in the video, held at the same end, into the same side of the "
+            "box",
+        )
+
+    def demonstrate(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
+        yield from arm.wait(5)
+        yield from self.solve(arm, answer)
+        yield from arm.grip(close=False)
+        yield from arm.go_home()
+
+    def solve(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
+        number, end, side = answer
+        yield from arm.pick(self.pegs[number].point(end * GRIP, 0, 0), lift=0.15)
+        x, y, _ = self.box.p
+        free = GRIP + LENGTH / 2  # from the grip to the end that goes in
+        yaw = math.copysign(math.pi / 2, end * side)
+        ready = y + side * (DEPTH / 2 + 0.03 + free)
+        yield from arm.move((x, ready, 0.16), yaw)
+        yield from arm.move((x, ready, self.box.size), speed=SLOW)
+        yield from arm.wait(3)
+        yield from arm.move((x, y + side * (DEPTH / 2 - 0.05 + free), self.box.size), speed=0.06)
+        yield from arm.wait(5)
+
+    def judge(self, arm: Arm, answer: tuple[int, int, int]) -> Status:
+        number, end, side = answer
+        for other, peg in enumerate(self.pegs):
+            if peg.p[2] < LIFTED:
+                continue
+            ends = {e: peg.point(e * LENGTH / 2, 0, 0) for e in (HEAD, TAIL)}
+            held = min(ends, key=lambda e: math.dist(ends[e], arm.tip))
+            if other != number or held != end:
+                return Status.FAIL
+            from_side = LEFT if peg.p[1] > self.box.p[1] else RIGHT
+            depth = self.inserted(ends[-end], from_side)
+            if depth > 0.01 and from_side != side:
+                return Status.FAIL
+            if depth > 0.04:
+                return Status.SUCCESS
+        return Status.ONGOING
+
+    def inserted(self, point: NDArray[np.float64], side: int) -> float:
+        """How deep a point is in the hole, in m from its mouth at a side; below 0 if outside."""
+        x, y, z = point - self.box.p - (0, 0, self.box.size)
+        return DEPTH / 2 - side * y if max(abs(x), abs(z)) < HOLE / 2 else -1.0

@@ -1,0 +1,109 @@
+"""MoveCube: remember in which manner a cube was moved."""
+
+import math
+
+import numpy as np
+from numpy.random import RandomState
+from numpy.typing import NDArray
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
+from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import is_near
+
+__all__ = ["MoveCube"]
+
+Vector = NDArray[np.float64]
+
+HANDLE, CROSS = 0.17, 0.065  # m, of the hook
+BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
+
+
+class MoveCube(Family):
+    """A cube goes to the target: pushed with the closed gripper, grasped and placed, or hooked."""
+
+    table = (0.86, 0.83, 0.76)
+    spread = (0.02, 0.05, 0.08)  # m, how far cube and target may lie off the middle
+
+    def draw(self, rng: RandomState) -> None:
+        wide = self.spread[self.level]
+        self.cube_at = np.array([0.045, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
+        self.target_at = np.array([-0.11, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
+        way = self.target_at - self.cube_at
+        self.way = np.append(way / np.linalg.norm(way), 0.0)
+        self.turn = math.atan2(-way[1], -way[0])  # of a gripper whose x points back along the way
+        self.answers = ["push", "grasp", "hook"]
+        self.seen: set[str] = set()
+
+    def build(self, kit: Kit) -> None:
+        self.cube = kit.cube(self.cube_at, "orange", self.turn)
+        self.target = kit.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
+        self.hook = kit.hook((-0.20, -0.20), (0.25, 0.55, 0.50), HANDLE, CROSS)
+        self.last = self.cube.p
+
+    def goals(self) -> tuple[str, ...]:
+        return ("move the cube to the target in the same manner as in the video",)
+
+    def demonstrate(self, arm: Arm, answer: str) -> Script:
+        yield from self.solve(arm, answer)
+        if answer == "hook":
+            yield from arm.grip(close=False)  # leaves it on the table
+        yield from arm.go_home()
+
+    def solve(self, arm: Arm, answer: str) -> Script:
+        start, end = self.cube.p, self.target.p
+        return {"push": self.push, "grasp": self.grasp, "hook": self.use_hook}[answer](
+            arm, start, end
+        )
+
+    def push(self, arm: Arm, start: Vector, end: Vector) -> Script:
+        behind = start - 0.055 * self.way
+        yield from arm.move((behind[0], behind[1], 0.12), self.turn)
+        yield from arm.grip(close=True)
+        yield from arm.move(behind, speed=SLOW)
+        yield from arm.move(end - 0.031 * self.way + (0, 0, CUBE / 2), speed=SLOW)
+        yield from arm.wait(6)
+
+    def grasp(self, arm: Arm, start: Vector, end: Vector) -> Script:
+        yield from arm.pick(start, self.turn)
+        yield from arm.put((end[0], end[1], CUBE / 2 + 0.002))
+
+    def use_hook(self, arm: Arm, start: Vector, end: Vector) -> Script:
+        grip = 0.025  # m from the handle's end
+        at = self.hook.point(grip, 0, 0.004)
+        yield from arm.pick(at)
+        left = np.array([math.sin(self.turn), -math.cos(self.turn), 0.0])
+        reach = HANDLE - 0.018 - grip - CUBE / 2  # from the grip to the cube's middle
+        hold = (BESIDE * left) + (0, 0, at[2] + 0.003)
+        behind = start * (1, 1, 0) + hold + (reach - 0.025) * self.way
+        yield from arm.move((behind[0], behind[1], 0.12), self.turn)
+        yield from arm.move(behind, speed=SLOW)
+        yield from arm.move(end + hold + (reach + 0.003) * self.way, speed=SLOW)
+        yield from arm.wait(6)
+
+    def judge(self, arm: Arm, answer: str) -> Status:
+        now = self.cube.p
+        if np.linalg.norm(now - self.last) > 0.002:
+            self.seen.add(self.manner(arm))
+        self.last = now
+        if self.seen - {answer}:
+            return Status.FAIL
+        released = answer != "grasp" or (arm.opening > 0.025 and now[2] < CUBE)
+        there = is_near(self.cube, self.target, 0.03)
+        return Status.SUCCESS if there and released and self.seen else Status.ONGOING
+
+    def manner(self, arm: Arm) -> str:
+        """How the cube is being moved now."""
+        ends = ((0.0, 0.0), (HANDLE, 0.0), (HANDLE, CROSS))
+        end, corner, tip = (self.hook.point(x, y, 0) for x, y in ends)
+        if min(_distance(self.cube.p, end, corner), _distance(self.cube.p, corner, tip)) < 0.045:
+            return "hook"
+        return "grasp" if arm.opening > 0.01 else "push"
+
+
+def _distance(point: Vector, one: Vector, other: Vector) -> float:
+    """Distance of a point from the straight line between two points, in m."""
+    way = other - one
+    part = float(np.clip((point - one) @ way / (way @ way), 0, 1))
+    return float(np.linalg.norm(point - one - part * way))

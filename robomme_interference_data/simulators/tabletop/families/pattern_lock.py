@@ -1,0 +1,84 @@
+"""PatternLock: remember a path over a grid of buttons."""
+
+import math
+
+import numpy as np
+from numpy.random import RandomState
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import Kit
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import touched
+
+__all__ = ["PatternLock"]
+
+SIDE, SPACING, RADIUS = 4, 0.075, 0.02  # buttons in a row; m; m
+LOW, HIGH = 0.020, 0.10  # m, the stick's tip on the buttons and above them
+
+
+class PatternLock(Family):
+    """A stick on the arm traces a path over a grid of buttons; retrace it.
+
+    An answer is the path: numbers of buttons, each beside the one before it, straight or diagonal.
+    """
+
+    table = (0.16, 0.34, 0.34)
+    stick = 0.10
+    length = (4, 5, 6)
+
+    def draw(self, rng: RandomState) -> None:
+        x, y = np.array([-0.08, 0.0]) + rng.uniform(-0.02, 0.02, 2)
+        half = (SIDE - 1) / 2
+        self.middle = (x, y)
+        self.spots = [
+            (x + (row - half) * SPACING, y + (column - half) * SPACING)
+            for row in range(SIDE)
+            for column in range(SIDE)
+        ]
+        self.answers = paths(self.length[self.level])
+        self.done, self.last = 0, -1
+
+    def build(self, kit: Kit) -> None:
+        kit.panel(self.middle, (0.16, 0.16), (0.08, 0.14, 0.15))
+        self.buttons = [kit.post(spot, (0.85, 0.85, 0.80), RADIUS, 0.010) for spot in self.spots]
+        self.lamp = kit.lamp((1.0, 0.55, 0.10), RADIUS, 0.012)
+
+    def goals(self) -> tuple[str, ...]:
+        return ("retrace the pattern with the stick, button by button in the same order",)
+
+    def demonstrate(self, arm: Arm, answer: tuple[int, ...]) -> Script:
+        yield from arm.wait(3)
+        yield from self.solve(arm, answer)
+        yield from arm.go_home()
+
+    def solve(self, arm: Arm, answer: tuple[int, ...]) -> Script:
+        yield from arm.move((*self.spots[answer[0]], HIGH))
+        for number in answer:
+            yield from arm.move((*self.spots[number], LOW), speed=0.15)
+            yield from arm.wait(5)
+        yield from arm.move((*self.spots[answer[-1]], HIGH))
+
+    def react(self, arm: Arm) -> None:
+        self.now = touched(arm, self.spots, RADIUS)
+        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
+
+    def judge(self, arm: Arm, answer: tuple[int, ...]) -> Status:
+        if self.now is not None and self.now != self.last:
+            if self.now != answer[self.done]:
+                return Status.FAIL
+            self.done, self.last = self.done + 1, self.now
+        return Status.SUCCESS if self.done == len(answer) else Status.ONGOING
+
+
+def paths(length: int) -> list[tuple[int, ...]]:
+    """All paths of `length` different buttons, each beside the one before it."""
+    found: list[tuple[int, ...]] = [(start,) for start in range(SIDE * SIDE)]
+    for _ in range(length - 1):
+        found = [
+            (*path, to)
+            for path in found
+            for to in range(SIDE * SIDE)
+            if to not in path and math.dist(divmod(to, SIDE), divmod(path[-1], SIDE)) < 1.5
+        ]
+    return found

@@ -1,0 +1,107 @@
+"""RouteStick: remember a route round posts."""
+
+from itertools import pairwise, product
+
+import numpy as np
+from numpy.random import RandomState
+from numpy.typing import NDArray
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import Kit
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import touched
+
+__all__ = ["RouteStick"]
+
+Route = tuple[tuple[int, ...], tuple[int, ...]]
+
+COUNT, SPACING = 5, 0.12  # targets; m from one to the next, with a post in the middle
+RADIUS, POST, TALL = 0.024, 0.010, 0.07  # m
+ASIDE = 0.06  # m, how far from a post the stick goes round it
+LOW, HIGH = 0.020, 0.13  # m, the stick's tip on the table and above the posts
+
+
+class RouteStick(Family):
+    """The stick goes from target to target, round the post between them on one side or the other.
+
+    An answer is the targets' numbers, and for each post that is passed the side: 1 away from the
+    arm, −1 towards it. Seen from above, that is clockwise or counter-clockwise round the post.
+    """
+
+    table = (0.48, 0.30, 0.30)
+    stick = 0.12
+    turns = (2, 3, 4)
+
+    def draw(self, rng: RandomState) -> None:
+        x, y = np.array([-0.08, 0.0]) + rng.uniform(-0.02, 0.02, 2)
+        self.spots = [(x, y + (n - (COUNT - 1) / 2) * SPACING) for n in range(COUNT)]
+        self.posts = [(x, y + (n - (COUNT - 2) / 2) * SPACING) for n in range(COUNT - 1)]
+        self.answers = routes(self.turns[self.level])
+        self.reached: list[int] = []
+        self.passed: list[int] = []
+        self.before: NDArray[np.float64] | None = None
+
+    def build(self, kit: Kit) -> None:
+        for spot in self.spots:
+            kit.target(spot, (0.95, 0.92, 0.85), RADIUS)
+        for spot in self.posts:
+            kit.post(spot, (0.12, 0.12, 0.14), POST, TALL)
+        self.lamp = kit.lamp((0.35, 0.90, 0.45), RADIUS, 0.005)
+
+    def goals(self) -> tuple[str, ...]:
+        return ("follow the same path round the posts with the stick as in the video",)
+
+    def demonstrate(self, arm: Arm, answer: Route) -> Script:
+        yield from arm.wait(3)
+        yield from self.solve(arm, answer)
+        yield from arm.go_home()
+
+    def solve(self, arm: Arm, answer: Route) -> Script:
+        targets, sides = answer
+        yield from arm.move((*self.spots[targets[0]], HIGH))
+        yield from arm.move((*self.spots[targets[0]], LOW), speed=0.15)
+        yield from arm.wait(3)
+        for (one, other), side in zip(pairwise(targets), sides, strict=True):
+            x, y = self.posts[min(one, other)]
+            yield from arm.move((x + side * ASIDE, y, LOW), speed=0.15)
+            yield from arm.move((*self.spots[other], LOW), speed=0.15)
+            yield from arm.wait(3)
+        yield from arm.move((*self.spots[targets[-1]], HIGH))
+
+    def react(self, arm: Arm) -> None:
+        self.now = touched(arm, self.spots, RADIUS)
+        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
+
+    def judge(self, arm: Arm, answer: Route) -> Status:
+        targets, sides = answer
+        self.follow(arm)
+        if self.now is not None and (not self.reached or self.now != self.reached[-1]):
+            self.reached.append(self.now)
+            if len(self.passed) != len(self.reached) - 1:
+                return Status.FAIL  # came over the posts, or went round one more
+        if tuple(self.reached) != targets[: len(self.reached)]:
+            return Status.FAIL
+        if tuple(self.passed) != sides[: len(self.passed)]:
+            return Status.FAIL
+        return Status.SUCCESS if len(self.reached) == len(targets) else Status.ONGOING
+
+    def follow(self, arm: Arm) -> None:
+        """Note on which side the tip has passed a post since the last step; 0 is into the post."""
+        before, tip = self.before, arm.tip
+        self.before = tip
+        if before is None or tip[2] > TALL or not self.reached:
+            return
+        for x, y in self.posts:
+            if (before[1] - y) * (tip[1] - y) < 0:
+                part = (y - before[1]) / (tip[1] - before[1])
+                off = before[0] + part * (tip[0] - before[0]) - x
+                self.passed.append(0 if abs(off) < POST else 1 if off > 0 else -1)
+
+
+def routes(turns: int) -> list[Route]:
+    """All routes with a number of turns: targets, and the sides on which posts are passed."""
+    walks: list[tuple[int, ...]] = [(start,) for start in range(COUNT)]
+    for _ in range(turns):
+        walks = [(*w, to) for w in walks for to in (w[-1] - 1, w[-1] + 1) if 0 <= to < COUNT]
+    return list(product(walks, product((1, -1), repeat=turns)))

@@ -1,0 +1,86 @@
+"""VideoRepick: remember which of several cubes was picked."""
+
+from numpy.random import RandomState
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import push_down, row, shuffled, swap
+
+__all__ = ["VideoRepick"]
+
+LIFTED = 0.06  # m, height of the cube's middle
+TIMES = ("once", "twice", "three times")
+
+
+class VideoRepick(Family):
+    """The arm picks one of several cubes; pick the same one again, n times, then press the button.
+
+    Easy: three cubes, each of its own colour. Medium: five of the same colour. Hard: two pairs of
+    them change places after the demonstration.
+    """
+
+    table = (0.26, 0.30, 0.34)
+    cubes_at = (3, 5, 5)
+
+    def draw(self, rng: RandomState) -> None:
+        count = self.cubes_at[self.level]
+        self.spots = row(rng, count, -0.10, 0.09, zigzag=0.025)
+        names = [str(name) for name in rng.permutation(["red", "green", "blue", "yellow"])]
+        self.colours = names[:count] if self.level == 0 else [names[0]] * count
+        self.times = int(rng.randint(1, 4))
+        self.swaps = [shuffled(rng, count)[:2] for _ in range(2)] if self.level == 2 else []
+        self.answers = list(range(count))
+        self.lifts, self.raised = 0, False
+
+    def build(self, kit: Kit) -> None:
+        self.cubes = [kit.cube(s, c) for s, c in zip(self.spots, self.colours, strict=True)]
+        self.button = kit.button((0.06, 0.0))
+
+    def goals(self) -> tuple[str, ...]:
+        times = TIMES[self.times - 1]
+        return (
+            f"pick up the cube that was picked up in the video {times}, putting it down in between,"
+            " then press the button",
+        )
+
+    def demonstrate(self, arm: Arm, answer: int) -> Script:
+        yield from arm.wait(5)
+        yield from self.lift(arm, answer)
+        yield from arm.go_home()
+        for cube in self.cubes:
+            cube.restore()
+            cube.hold(True)
+        for one, other in self.swaps:
+            yield from swap([self.cubes[one]], [self.cubes[other]])
+            yield from arm.wait(5)
+
+    def lift(self, arm: Arm, number: int) -> Script:
+        """Pick a cube up and put it down where it was."""
+        at = self.cubes[number].p
+        yield from arm.pick(at)
+        yield from arm.wait(5)
+        yield from arm.put((at[0], at[1], CUBE / 2 + 0.002))
+
+    def react(self, arm: Arm) -> None:
+        self.pressed = push_down(self.button, arm)
+
+    def solve(self, arm: Arm, answer: int) -> Script:
+        for _ in range(self.times):
+            yield from self.lift(arm, answer)
+        yield from arm.press(self.button)
+
+    def judge(self, arm: Arm, answer: int) -> Status:
+        heights = [cube.p[2] for cube in self.cubes]
+        if any(z > LIFTED for number, z in enumerate(heights) if number != answer):
+            return Status.FAIL
+        if heights[answer] > LIFTED and not self.raised:
+            self.lifts, self.raised = self.lifts + 1, True
+        elif heights[answer] < CUBE:
+            self.raised = False
+        if self.lifts > self.times:
+            return Status.FAIL
+        if self.pressed:
+            return Status.SUCCESS if self.lifts == self.times else Status.FAIL
+        return Status.ONGOING

@@ -1,0 +1,84 @@
+"""VideoUnmask: remember which container hides a cube."""
+
+from collections.abc import Sequence
+from itertools import permutations
+
+from numpy.random import RandomState
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit, Place
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import along, row
+
+__all__ = ["VideoUnmask"]
+
+HIGH = 0.60  # m, above what the cameras see
+LIFTED = 0.05  # m
+
+
+class VideoUnmask(Family):
+    """Cubes lie in the open; opaque containers come down over them; lift the right one.
+
+    An answer names the container of each colour that is asked for, in that order.
+    """
+
+    table = (0.60, 0.44, 0.28)
+    shell = (0.30, 0.34, 0.42)
+    containers = (3, 4, 5)
+
+    def draw(self, rng: RandomState) -> None:
+        count = self.containers[self.level]
+        colours = [str(colour) for colour in rng.permutation(["red", "green", "blue"])]
+        self.asked = colours[: 2 if self.level == 2 else 1]
+        self.colours = colours
+        self.spots = row(rng, count, -0.04, 0.105, zigzag=0.02)
+        self.answers = list(permutations(range(count), len(self.asked)))
+        self.found = 0
+
+    def build(self, kit: Kit) -> None:
+        self.shells = [kit.container(spot, self.shell) for spot in self.spots]
+        self.cubes = [kit.cube(spot, c) for spot, c in zip(self.spots, self.colours, strict=False)]
+
+    def goals(self) -> tuple[str, ...]:
+        first, *then = self.asked
+        text = f"pick up the container that hides the {first} cube"
+        for colour in then:
+            text += f", put it down, then pick up the container that hides the {colour} cube"
+        return (text,)
+
+    def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
+        empty = [number for number in range(len(self.shells)) if number not in answer]
+        self.under = dict(zip((*answer, *empty), self.cubes, strict=False))
+        for number, cube in self.under.items():
+            cube.home = Place((*self.spots[number], CUBE / 2))
+            cube.restore()
+        for body in (*self.shells, *self.cubes):
+            body.hold(True)
+        for shell in self.shells:
+            shell.put(Place((*shell.home.p[:2], HIGH)))
+        yield from arm.wait(30)
+        ways = [along(shell, shell.home, 40) for shell in self.shells]
+        for places in zip(*ways, strict=True):
+            for shell, place in zip(self.shells, places, strict=True):
+                shell.put(place)
+            yield
+        yield from arm.wait(30)
+
+    def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
+        for number in answer:
+            knob = self.shells[number].point(0, 0, self.shells[number].size)
+            yield from arm.pick(knob)
+            yield from arm.wait(5)
+            yield from arm.lower(knob)
+            yield from arm.move((knob[0], knob[1], 0.25))
+
+    def judge(self, arm: Arm, answer: Sequence[int]) -> Status:
+        for number, shell in enumerate(self.shells):
+            if shell.p[2] > LIFTED and number not in answer[: self.found]:
+                if number != answer[self.found]:
+                    return Status.FAIL
+                self.found += 1
+                if self.found == len(answer):
+                    return Status.SUCCESS
+        return Status.ONGOING

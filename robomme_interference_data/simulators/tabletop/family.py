@@ -1,0 +1,71 @@
+"""What a task family is: a scene, a hidden answer, a script that shows it, and a judge."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from numpy.random import RandomState
+
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.tabletop.episodes import DIFFICULTIES
+from robomme_interference_data.simulators.tabletop.kit import Colour, Kit
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+
+__all__ = ["Family"]
+
+
+class Family(ABC):
+    """One episode of a task family.
+
+    The answer is handed only to what may know it: the demonstration, the solution and the judge.
+    Goal and first live scene are made without it, so they cannot give it away.
+
+    Args:
+        difficulty: `easy`, `medium` or `hard`.
+        rng: Source of everything in the scene but the answer. `RandomState`, because its numbers
+            are the same in every version of NumPy.
+
+    Attributes:
+        answers: All answers that the scene allows; one is the hidden one.
+    """
+
+    table: ClassVar[Colour]
+    floor: ClassVar[Colour] = (0.55, 0.57, 0.60)
+    stick: ClassVar[float] = 0.0
+    """Length in m of the stick that the gripper holds; 0 for none."""
+
+    pace: ClassVar[float] = 0.6
+    """Speed of the scripted motion: 1 is 0.25 m/s at the middle of a move."""
+
+    answers: Sequence[Any]
+
+    def __init__(self, difficulty: str, rng: RandomState):
+        self.level = DIFFICULTIES.index(difficulty)
+        self.draw(rng)
+
+    @abstractmethod
+    def draw(self, rng: RandomState) -> None:
+        """Choose the scene, and set `answers`."""
+
+    @abstractmethod
+    def build(self, kit: Kit) -> None:
+        """Build the scene's bodies at their places."""
+
+    @abstractmethod
+    def goals(self) -> tuple[str, ...]:
+        """The goal in words, in one wording or more."""
+
+    @abstractmethod
+    def demonstrate(self, arm: Arm, answer: Any) -> Script:
+        """Show the answer."""
+
+    def react(self, arm: Arm) -> None:  # noqa: B027, most scenes do nothing
+        """Let the scene answer to the arm after a step: lamps, the cap of a button."""
+
+    @abstractmethod
+    def solve(self, arm: Arm, answer: Any) -> Script:
+        """Do the task as the answer says."""
+
+    @abstractmethod
+    def judge(self, arm: Arm, answer: Any) -> Status:
+        """Say how the episode stands after a live step."""

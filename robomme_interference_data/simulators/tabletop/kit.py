@@ -1,0 +1,280 @@
+"""The scene kit: the bodies that the families are made of, built once here.
+
+Lengths are in m. The table's top is z = 0, the arm stands at x = −0.615 and faces +x; the front
+camera looks back at it. Colours are RGB from 0 to 1.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+
+from robomme_interference_data.simulators.tabletop.motion import Point
+
+__all__ = ["COLOURS", "CUBE", "Body", "Colour", "Kit", "Place"]
+
+Colour = tuple[float, float, float]
+
+COLOURS: dict[str, Colour] = {
+    "red": (0.85, 0.08, 0.08),
+    "green": (0.10, 0.62, 0.16),
+    "blue": (0.10, 0.22, 0.85),
+    "yellow": (0.95, 0.78, 0.08),
+    "purple": (0.52, 0.16, 0.66),
+    "orange": (0.95, 0.45, 0.05),
+}
+
+CUBE = 0.04
+"""Edge of a cube."""
+
+_LOW = -0.5  # z where things wait that are not to be seen, inside the table's block
+
+
+@dataclass(frozen=True)
+class Place:
+    """A position, `(3,)` in m, and a turn about the vertical in rad."""
+
+    p: tuple[float, float, float]
+    yaw: float = 0.0
+
+    @property
+    def pose(self) -> sapien.Pose:
+        """The same for sapien."""
+        return sapien.Pose(self.p, [math.cos(self.yaw / 2), 0, 0, math.sin(self.yaw / 2)])
+
+
+class Body:
+    """A thing on the table.
+
+    Args:
+        entity: sapien's entity.
+        home: Where it is when the episode starts, and again when execution starts.
+        size: Whatever its family wants to know of it, e.g. a height.
+    """
+
+    def __init__(self, entity: Any, home: Place, size: float = 0.0):
+        self.home = home
+        self.size = size
+        self._entity = entity
+        self._rigid = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
+        self._movable = self._rigid is not None and not self._rigid.kinematic
+
+    @property
+    def p(self) -> NDArray[np.float64]:
+        """Position, `(3,) float64`."""
+        return np.asarray(self._entity.pose.p, dtype=np.float64)
+
+    def point(self, x: float, y: float, z: float) -> NDArray[np.float64]:
+        """Where a point of the body, given in its own axes, is on the table: `(3,) float64`."""
+        return np.asarray((self._entity.pose * sapien.Pose([x, y, z])).p, dtype=np.float64)
+
+    def put(self, place: Place) -> None:
+        """Set the body somewhere, at rest."""
+        self._entity.set_pose(place.pose)
+        if self._rigid is not None and not self._rigid.kinematic:
+            self._rigid.set_linear_velocity([0, 0, 0])
+            self._rigid.set_angular_velocity([0, 0, 0])
+
+    def hold(self, held: bool) -> None:
+        """Take the body out of the physics, so that the scene can play with it, or let it go."""
+        if self._movable:
+            self._rigid.set_kinematic(held)
+
+    def restore(self) -> None:
+        """Bring the body home, free and at rest."""
+        self.hold(False)
+        self.put(self.home)
+
+
+class Kit:
+    """Builds bodies in a scene and keeps all of them.
+
+    Args:
+        scene: ManiSkill's scene.
+    """
+
+    def __init__(self, scene: Any):
+        self._scene = scene
+        self.bodies: list[Body] = []
+
+    def restore(self) -> None:
+        """Bring all bodies home."""
+        for body in self.bodies:
+            body.restore()
+
+    # --- the room ----------------------------------------------------------------------------
+
+    def room(self, table: Colour, floor: Colour) -> None:
+        """A table with the arm on it, and a floor that fills the picture behind."""
+        self._body(
+            [((0, 0, -0.45), (0.55, 0.75, 0.45), table)],
+            Place((-0.25, 0, 0)),
+            "table",
+            moves="never",
+        )
+        self._body(
+            [((0, 0, -0.05), (8, 8, 0.05), floor)],
+            Place((0, 0, -0.9)),
+            "floor",
+            moves="never",
+            solid=False,
+        )
+
+    def panel(self, xy: Point, half: Sequence[float], colour: Colour) -> Body:
+        """A thin plate on the table, to set things apart by its colour."""
+        return self._body(
+            [((0, 0, 0.0005), (half[0], half[1], 0.0005), colour)],
+            Place((xy[0], xy[1], 0)),
+            "panel",
+            moves="by hand",
+            solid=False,
+        )
+
+    # --- things to move ------------------------------------------------------------------------
+
+    def cube(self, xy: Point, colour: str, yaw: float = 0.0) -> Body:
+        """A cube of 4 cm on the table."""
+        half = CUBE / 2
+        return self._body(
+            [((0, 0, 0), (half, half, half), COLOURS[colour])],
+            Place((xy[0], xy[1], half), yaw),
+            f"{colour} cube",
+            size=CUBE,
+        )
+
+    def container(self, xy: Point, colour: Colour) -> Body:
+        """An opaque box without bottom, 7 cm wide and high, with a knob to grasp it by."""
+        outer, wall, height = 0.036, 0.003, 0.065
+        dark = (colour[0] * 0.45, colour[1] * 0.45, colour[2] * 0.45)
+        side, mid = outer - wall, height / 2
+        boxes = [
+            ((0, side, mid), (outer, wall, mid), colour),
+            ((0, -side, mid), (outer, wall, mid), colour),
+            ((side, 0, mid), (wall, outer, mid), colour),
+            ((-side, 0, mid), (wall, outer, mid), colour),
+            ((0, 0, height - wall), (outer, outer, wall), colour),
+            ((0, 0, height + 0.014), (0.011, 0.011, 0.014), dark),
+        ]
+        return self._body(boxes, Place((xy[0], xy[1], 0)), "container", size=height + 0.014)
+
+    def peg(self, xy: Point, head: Colour, tail: Colour, length: float = 0.14) -> Body:
+        """A peg of 2.4 cm across that lies along x: its head towards +x, its tail towards −x."""
+        half, thick = length / 4, 0.012
+        boxes = [
+            ((half, 0, 0), (half, thick, thick), head),
+            ((-half, 0, 0), (half, thick, thick), tail),
+        ]
+        return self._body(boxes, Place((xy[0], xy[1], thick)), "peg", size=length, density=300)
+
+    def hook(self, xy: Point, colour: Colour, length: float, reach: float) -> Body:
+        """A peg with a crosspiece: the handle lies along x, the crosspiece at its +x end, to +y."""
+        thick = 0.009
+        boxes = [
+            ((length / 2, 0, 0), (length / 2, thick, thick), colour),
+            ((length - thick, reach / 2, 0), (thick, reach / 2, thick), colour),
+        ]
+        return self._body(boxes, Place((xy[0], xy[1], thick)), "hook", size=length, density=300)
+
+    # --- things that stay ----------------------------------------------------------------------
+
+    def target(self, xy: Point, colour: Colour, radius: float) -> Body:
+        """A flat disc on the table: a ring of the colour around a white middle."""
+        builder = self._builder()
+        for size, height, tint in ((radius, 0.002, colour), (0.55 * radius, 0.003, (0.95,) * 3)):
+            self._disc(builder, size, height, tint)
+        return self._finish(builder, Place((xy[0], xy[1], 0)), "target", radius, "by hand")
+
+    def lamp(self, colour: Colour, radius: float, height: float) -> Body:
+        """A disc that covers the target or grid button that is lit; see `light`."""
+        builder = self._builder()
+        self._disc(builder, radius, height, colour)
+        return self._finish(builder, Place((0, 0, _LOW)), "lamp", height, "by hand")
+
+    def button(self, xy: Point) -> Body:
+        """A red push button of 4 cm height on a dark base; `home.p` is the middle of its top."""
+        self._body(
+            [((0, 0, 0.01), (0.035, 0.035, 0.01), (0.12, 0.12, 0.13))],
+            Place((xy[0], xy[1], 0)),
+            "button base",
+            moves="by hand",
+        )
+        builder = self._builder()
+        self._disc(builder, 0.022, 0.024, (0.9, 0.1, 0.1), top=0.0)
+        return self._finish(builder, Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand")
+
+    def post(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
+        """An upright post that does not give way."""
+        builder = self._builder()
+        self._disc(builder, radius, height, colour)
+        return self._finish(builder, Place((xy[0], xy[1], 0)), "post", radius, "by hand")
+
+    def socket(self, xy: Point, colour: Colour, hole: float, depth: float) -> Body:
+        """A box with a square hole along y, open at both sides; z 0 of the body is the table."""
+        half, wall, middle = hole / 2, 0.02, 0.05
+        dark = (colour[0] * 0.6, colour[1] * 0.6, colour[2] * 0.6)
+        low = middle - half
+        boxes = [
+            ((0, 0, low / 2), (half + wall, depth / 2, low / 2), colour),
+            ((0, 0, middle + half + wall / 2), (half + wall, depth / 2, wall / 2), colour),
+            ((half + wall / 2, 0, middle), (wall / 2, depth / 2, half), dark),
+            ((-half - wall / 2, 0, middle), (wall / 2, depth / 2, half), dark),
+        ]
+        return self._body(boxes, Place((xy[0], xy[1], 0)), "socket", size=middle, moves="by hand")
+
+    @staticmethod
+    def light(lamp: Body, at: Point | None) -> None:
+        """Show a lamp at a place on the table, or hide it."""
+        lamp.put(lamp.home if at is None else Place((at[0], at[1], 0.0)))
+
+    # --- how bodies are built --------------------------------------------------------------------
+
+    def _builder(self) -> Any:
+        return self._scene.create_actor_builder()
+
+    @staticmethod
+    def _disc(
+        builder: Any, radius: float, height: float, colour: Colour, top: float | None = None
+    ) -> None:
+        # sapien's cylinders lie along x; this quaternion stands them up.
+        z = height / 2 if top is None else top - height / 2
+        upright = sapien.Pose([0, 0, z], [math.sqrt(0.5), 0, math.sqrt(0.5), 0])
+        builder.add_cylinder_visual(upright, radius, height / 2, _material(colour))
+
+    def _body(
+        self,
+        boxes: Iterable[tuple[Sequence[float], Sequence[float], Colour]],
+        home: Place,
+        name: str,
+        size: float = 0.0,
+        moves: str = "freely",
+        density: float = 500.0,
+        solid: bool = True,
+    ) -> Body:
+        """Build a body of boxes, each `(middle, half size, colour)`."""
+        builder = self._builder()
+        for middle, half, colour in boxes:
+            pose = sapien.Pose(middle)
+            if solid:
+                builder.add_box_collision(pose, half, density=density)
+            builder.add_box_visual(pose, half, _material(colour))
+        return self._finish(builder, home, name, size, moves)
+
+    def _finish(self, builder: Any, home: Place, name: str, size: float, moves: str) -> Body:
+        builder.set_initial_pose(home.pose)
+        build = {
+            "freely": builder.build,
+            "by hand": builder.build_kinematic,
+            "never": builder.build_static,
+        }[moves]
+        actor = build(name=f"{len(self.bodies)} {name}")
+        body = Body(actor._objs[0], home, size)
+        self.bodies.append(body)
+        return body
+
+
+def _material(colour: Colour) -> Any:
+    return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.9, specular=0.1)

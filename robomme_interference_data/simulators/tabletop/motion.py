@@ -1,0 +1,201 @@
+"""Scripted motion: straight lines of the gripper through sapien's own inverse kinematics.
+
+A script is a generator that yields once per time step of 0.1 s; what it commands stands in
+`Arm.action` then. The gripper always points straight down; `yaw` turns it about the vertical,
+and at yaw 0 the fingers open along y.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FPS
+from robomme_interference_data.errors import MotionError
+
+if TYPE_CHECKING:
+    from robomme_interference_data.simulators.tabletop.kit import Body
+
+__all__ = ["BASE", "HOME", "REST_QPOS", "Arm", "Point", "Script"]
+
+Script = Iterator[None]
+
+Point = Sequence[float] | NDArray[np.float64]
+"""Three coordinates, or two on the table, in m."""
+
+BASE = (-0.615, 0.0, 0.0)
+"""Where the arm stands, in m; the table's top is the plane z = 0."""
+
+HOME = (-0.30, 0.0, 0.26)
+"""Gripper's place at the start of demonstration and execution, clear of all objects, in m."""
+
+REST_QPOS = (0.0, math.pi / 8, 0.0, -math.pi * 5 / 8, 0.0, math.pi * 3 / 4, math.pi / 4)
+"""Joint positions from which the search for the home pose starts, in rad."""
+
+SPEED = 0.25  # m/s, at the middle of a move
+SLOW = 0.12  # m/s, close to objects
+TURN = 1.2  # rad/s
+CLEARANCE = 0.10  # m above an object before the gripper goes down to it
+SETTLE = 3  # time steps until the arm has caught up with its command
+GRIP = 5  # time steps until the fingers have closed or opened
+
+
+class Arm:
+    """The arm as the scripts see it.
+
+    Args:
+        articulation: sapien's articulation of the Panda.
+        pace: Factor to the speed of all moves.
+        stick: Length of the stick in the gripper, in m; positions are those of its tip.
+
+    Attributes:
+        action: The commanded action, `(8,) float32`.
+    """
+
+    def __init__(self, articulation: Any, pace: float, stick: float):
+        self._robot = articulation
+        self._model = articulation.create_pinocchio_model()
+        names = [link.name for link in articulation.links]
+        self._tcp = next(i for i, name in enumerate(names) if name.endswith("panda_hand_tcp"))
+        self._limits = np.array(articulation.qlimits[:7], dtype=np.float64)
+        self._mask = np.array([1] * 7 + [0] * (articulation.dof - 7), dtype=np.int32)
+        self._pace = pace
+        self._stick = stick
+        rest = np.zeros(articulation.dof)
+        rest[:7] = REST_QPOS
+        self.home_qpos = self._solve(np.array(HOME), 0.0, rest)
+        self.reset()
+
+    def reset(self) -> None:
+        """Command the home pose: gripper open, or closed around its stick."""
+        self._qpos = self.home_qpos
+        self._goal = np.array(HOME)
+        self._yaw = 0.0
+        self._gripper = -1.0 if self._stick else 1.0
+        self._command()
+
+    # --- what the arm does now -----------------------------------------------------------------
+
+    @property
+    def state(self) -> NDArray[np.float32]:
+        """`(8,) float32`: 7 joint positions in rad, opening of one finger in m."""
+        return np.asarray(self._robot.qpos[:8], dtype=np.float32)
+
+    @property
+    def tip(self) -> NDArray[np.float64]:
+        """Point between the fingertips, or the stick's tip: `(3,) float64`, in m."""
+        pose = self._robot.links[self._tcp].entity_pose
+        down = pose.to_transformation_matrix()[:3, 2]
+        return np.asarray(pose.p + self._stick * down, dtype=np.float64)
+
+    @property
+    def opening(self) -> float:
+        """Way of one finger, 0 closed to 0.04 m open."""
+        return float(self._robot.qpos[7])
+
+    # --- scripts ---------------------------------------------------------------------------------
+
+    def wait(self, steps: int) -> Script:
+        """Hold the commanded pose."""
+        for _ in range(steps):
+            yield
+
+    def move(self, to: Point, yaw: float | None = None, speed: float = SPEED) -> Script:
+        """Move in a straight line, slower at both ends, `speed` in m/s at the middle.
+
+        Raises:
+            MotionError: The arm cannot reach a point of the line.
+        """
+        start, turn = self._goal, 0.0 if yaw is None else yaw - self._yaw
+        way = np.asarray(to, dtype=np.float64) - start
+        first_yaw = self._yaw
+        seconds = 1.5 * max(float(np.linalg.norm(way)) / speed, abs(turn) / TURN) / self._pace
+        steps = max(1, math.ceil(FPS * seconds))
+        for step in range(1, steps + 1):
+            part = step / steps
+            part = part * part * (3 - 2 * part)
+            self._goal = start + part * way
+            self._yaw = first_yaw + part * turn
+            self._qpos = self._solve(self._goal, self._yaw, self._qpos)
+            self._command()
+            yield
+
+    def grip(self, *, close: bool) -> Script:
+        """Close or open the fingers."""
+        self._gripper = -1.0 if close else 1.0
+        self._command()
+        yield from self.wait(GRIP)
+
+    def pick(self, at: Point, yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
+        """Grasp what is at a point, from above, and lift it by `lift`, in m."""
+        x, y, z = at
+        yield from self.move((x, y, max(z + CLEARANCE, self._goal[2])), yaw)
+        yield from self.move((x, y, z + CLEARANCE), yaw)
+        if self._gripper < 0:
+            yield from self.grip(close=False)
+        yield from self.move((x, y, z), yaw, SLOW)
+        yield from self.wait(SETTLE)
+        yield from self.grip(close=True)
+        yield from self.move((x, y, z + lift), yaw, SLOW)
+
+    def put(self, at: Point, yaw: float | None = None) -> Script:
+        """Bring what is held to a point, let go of it there, and withdraw upwards."""
+        x, y, z = at
+        yield from self.move((x, y, z + CLEARANCE), yaw)
+        yield from self.lower(at)
+        yield from self.move((x, y, z + CLEARANCE))
+
+    def lower(self, at: Point) -> Script:
+        """Go down to a point with what is held and let go of it."""
+        yield from self.move(at, speed=SLOW)
+        yield from self.wait(SETTLE)
+        yield from self.grip(close=False)
+
+    def press(self, button: "Body", depth: float = 0.015) -> Script:
+        """Press a button with the closed gripper, and withdraw."""
+        x, y, z = button.home.p
+        yield from self.move((x, y, z + CLEARANCE), 0.0)
+        yield from self.grip(close=True)
+        yield from self.move((x, y, z - depth), speed=SLOW)
+        yield from self.wait(SETTLE)
+        yield from self.move((x, y, z + CLEARANCE))
+
+    def go_home(self) -> Script:
+        """Withdraw upwards, then go to the home pose with the gripper open."""
+        x, y, z = self._goal
+        yield from self.move((x, y, max(z, 0.18)))
+        yield from self.move(HOME, 0.0)
+        if not self._stick and self._gripper < 0:
+            yield from self.grip(close=False)
+        yield from self.wait(SETTLE)
+
+    # --- inverse kinematics ----------------------------------------------------------------------
+
+    def _command(self) -> None:
+        self.action = np.append(self._qpos[:7], self._gripper).astype(np.float32)
+
+    def _solve(
+        self, tip: NDArray[np.float64], yaw: float, start: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        import sapien
+
+        tcp = tip + np.array([0.0, 0.0, self._stick])
+        down = [0.0, math.cos(yaw / 2), math.sin(yaw / 2), 0.0]
+        pose = sapien.Pose(tcp - np.array(BASE), down)
+        qpos, found, _ = self._model.compute_inverse_kinematics(
+            self._tcp, pose, initial_qpos=start, active_qmask=self._mask, max_iterations=200
+        )
+        arm = np.asarray(qpos[:7])
+        inside = (self._limits[:, 0] <= arm) & (arm <= self._limits[:, 1])
+        if not found or not inside.all():
+            reason = (
+                "no solution" if not found else f"joint {int(np.argmin(inside)) + 1} at its limit"
+            )
+            raise MotionError(
+                f"the arm cannot bring its gripper to {np.round(tcp, 3).tolist()} m, turned by "
+                f"{math.degrees(yaw):.0f}°: {reason}",
+                "Keep targets within 0.3 to 0.72 m of the arm's base and clear of its limits.",
+            )
+        return np.asarray(qpos, dtype=np.float64)

@@ -1,0 +1,77 @@
+"""Simulators for the tests of worker processes: no physics, and bad behaviour on demand."""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.errors import UnknownNameError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import (
+    Demonstration,
+    EpisodeInfo,
+    Observation,
+    Status,
+)
+
+STEPS = 3
+
+
+class Double:
+    """Succeeds after three steps; what index 1 to 4 do instead is written at `reset`.
+
+    Args:
+        marks: Folder where bad behaviour is marked, so that it happens once only; None: always.
+    """
+
+    chance = 0.25
+
+    def __init__(self, marks: str | None = None, render: bool = True):
+        self.marks = Path(marks) if marks else None
+        self.left = 0
+
+    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+        episode = EpisodeId.parse(episode_id)
+        if episode.index in (1, 2) and self._first_time(episode.index):
+            if episode.index == 1:
+                os._exit(7)  # dies
+            time.sleep(60)  # hangs
+        if episode.index == 3:
+            raise UnknownNameError("no such episode", "Take another.")
+        self.left = STEPS
+        self.image = np.full((4, 4, 3), episode.index, np.uint8)
+        lesson = Demonstration(
+            {"front": np.stack([self.image] * 5)},
+            np.zeros((5, 8), np.float32),
+            np.ones((5, 8), np.float32),
+        )
+        info = EpisodeInfo("goal", ("goal",), "easy", episode.index, "double")
+        return lesson, self._observe(), info
+
+    def step(self, action: np.ndarray) -> tuple[Observation, Status]:
+        self.left -= 1
+        return self._observe(), Status.ONGOING if self.left else Status.SUCCESS
+
+    def act(self, policy: str) -> np.ndarray:
+        return np.zeros(8, np.float32)
+
+    def close(self) -> None:
+        pass
+
+    def _observe(self) -> Observation:
+        return Observation({"front": self.image}, np.full(8, self.left, np.float32))
+
+    def _first_time(self, index: int) -> bool:
+        if self.marks is None:
+            return True
+        mark = self.marks / str(index)
+        if mark.exists():
+            return False
+        mark.touch()
+        return True
+
+
+def make(**options: Any) -> Double:
+    return Double(**options)

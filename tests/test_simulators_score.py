@@ -1,0 +1,152 @@
+"""Outcomes, their table, the episodes' seeds and the command line: all without a simulator."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import (
+    InvalidIdError,
+    InvalidOptionError,
+    MissingExtraError,
+    UnknownNameError,
+)
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators import SIMULATORS, Status, make_simulator
+from robomme_interference_data.cli import app
+from robomme_interference_data.simulators.score import Outcome, markdown_table, play_all, wilson
+from robomme_interference_data.simulators.tabletop.episodes import (
+    difficulty_of,
+    episode_ids,
+    seed_of,
+)
+
+
+def test_every_episode_has_a_seed_of_its_own() -> None:
+    seeds = [seed_of(episode) for episode in episode_ids()]
+    assert len(seeds) == 9 * 200
+    assert len(set(seeds)) == len(seeds)
+
+
+@pytest.mark.parametrize(
+    ("text", "seed", "difficulty"),
+    [
+        ("VideoRepick/train/0", 3000, "easy"),
+        ("VideoRepick/train/99", 3099, "easy"),
+        ("VideoRepick/val/1", 3901, "medium"),
+        ("MoveCube/test/3", 19803, "easy"),
+        ("RouteStick/test/49", 28849, "medium"),
+    ],
+)
+def test_seeds_and_difficulties_are_fixed(text: str, seed: int, difficulty: str) -> None:
+    assert seed_of(EpisodeId.parse(text)) == seed
+    assert difficulty_of(seed) == difficulty
+
+
+def test_a_test_split_has_17_easy_17_medium_and_16_hard_episodes() -> None:
+    for family in FAMILIES:
+        counts = [len(episode_ids(family, "test", d)) for d in ("easy", "medium", "hard")]
+        assert counts == [17, 17, 16]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("MoveCub/test/3", "Did you mean 'MoveCube'"),
+        ("MoveCube/test/50", "has the episodes 0 to 49"),
+        ("MoveCube/train/100", "has the episodes 0 to 99"),
+    ],
+)
+def test_unknown_episodes_are_named(text: str, message: str) -> None:
+    with pytest.raises(UnknownNameError, match=message):
+        seed_of(EpisodeId.parse(text))
+
+
+def test_unknown_split_is_refused() -> None:
+    with pytest.raises(InvalidIdError, match="not a split"):
+        episode_ids("MoveCube", "tests")
+
+
+def test_an_unknown_simulator_is_named() -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'tabletop'"):
+        make_simulator("tabeltop")
+    with pytest.raises(UnknownNameError, match="no_such_module"):
+        make_simulator("no_such_module:make")
+
+
+def test_a_missing_extra_names_the_line_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    for name in [name for name in sys.modules if ".tabletop." in name and "episodes" not in name]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "sapien", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'robomme-interference-data\[sim\]'"):
+        SIMULATORS["tabletop"]()
+
+
+def test_wilson_interval_by_hand() -> None:
+    # 8 of 10, z = 1.96: middle (0.8 + 1.9208/10)/1.38416 = 0.7167, half 0.2266
+    low, high = wilson(8, 10, z=1.96)
+    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
+    assert wilson(0, 0) == (0.0, 1.0)
+    assert wilson(0, 50)[0] == 0.0
+    assert wilson(50, 50)[1] == pytest.approx(1.0)
+
+
+def outcome(family: str, difficulty: str, status: Status, chance: float, steps: int) -> Outcome:
+    return Outcome(EpisodeId(family, "test", 0), difficulty, status, 100, steps, chance)
+
+
+def test_the_table_counts_by_difficulty_and_leaves_errors_out() -> None:
+    table = markdown_table(
+        [
+            outcome("MoveCube", "easy", Status.SUCCESS, 0.5, 10),
+            outcome("MoveCube", "easy", Status.FAIL, 0.5, 20),
+            outcome("MoveCube", "hard", Status.TIMEOUT, 0.2, 30),
+            outcome("MoveCube", "", Status.ERROR, 0.0, 0),
+        ]
+    ).splitlines()
+    # one of three; chance (0.5 + 0.5 + 0.2)/3; mean steps 60/3
+    expected = "| MoveCube | 1/2 | 0/0 | 0/1 | 1/3 | 6.1% – 79.2% | 40.0% | 1 | 20 |"
+    assert table[2] == expected
+    assert table[3] == expected.replace("MoveCube", "all")
+    assert len(table) == 4
+
+
+def test_play_all_reports_a_broken_simulator_as_error() -> None:
+    episodes = [EpisodeId("MoveCube", "test", index) for index in (0, 1)]
+    good, bad = play_all("oracle", episodes, "simulator_doubles:make")
+    assert (good.status, good.steps, good.lesson, good.chance) == (Status.SUCCESS, 3, 5, 0.25)
+    assert (bad.status, bad.steps) == (Status.ERROR, 0)
+
+
+def test_simulate_prints_what_came_of_it_as_json() -> None:
+    given = ["simulate", "--family", "MoveCube", "--episode", "4", "--json"]
+    done = CliRunner().invoke(app, [*given, "--simulator", "simulator_doubles:make"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == {
+        "episode": "MoveCube/test/4",
+        "simulator": "double",
+        "goal": "goal",
+        "difficulty": "easy",
+        "seed": 4,
+        "policy": "oracle",
+        "status": "success",
+        "lesson_frames": 5,
+        "steps": 3,
+    }
+
+
+@pytest.mark.parametrize("command", ["simulate", "simulate-score"])
+def test_an_unknown_policy_is_refused_at_once(command: str) -> None:
+    given = [command, "--policy", "orakle", "--family", "MoveCube"]
+    done = CliRunner().invoke(app, given)
+    assert isinstance(done.exception, UnknownNameError)
+    assert "Did you mean 'oracle'" in str(done.exception)
+
+
+def test_a_video_must_be_an_mp4(tmp_path) -> None:
+    given = ["simulate", "--family", "MoveCube", "--video", str(tmp_path / "out.avi")]
+    done = CliRunner().invoke(app, given)
+    assert isinstance(done.exception, InvalidOptionError)

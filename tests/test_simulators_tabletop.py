@@ -1,0 +1,280 @@
+"""The embedded suite: the same every time, solvable, fair, and not giving its answers away."""
+
+import hashlib
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import (
+    InvalidIdError,
+    InvalidOptionError,
+    MotionError,
+    NoRendererError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators import Demonstration, Observation, Status, make_simulator
+from robomme_interference_data.simulators.worker import RemoteSimulator
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
+from robomme_interference_data.simulators.tabletop.families import family_class
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+SHORT = "VideoUnmask/test/0"
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Iterator[TabletopSimulator]:
+    try:
+        made = make_simulator("tabletop")
+    except NoRendererError as error:
+        pytest.skip(str(error))
+    assert isinstance(made, TabletopSimulator)
+    with made:
+        yield made
+
+
+@pytest.fixture
+def blind(simulator: TabletopSimulator) -> Iterator[TabletopSimulator]:
+    """The simulator without drawing, which is several times as fast."""
+    simulator._env.drawing = False
+    yield simulator
+    simulator._env.drawing = True
+
+
+def digest(lesson: Demonstration, first: Observation) -> str:
+    total = hashlib.sha256()
+    for name in sorted(lesson.images):
+        total.update(lesson.images[name].tobytes())
+        total.update(first.images[name].tobytes())
+    for array in (lesson.states, lesson.actions, first.state):
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+def test_reset_serves_what_it_says(simulator: TabletopSimulator) -> None:
+    lesson, first, info = simulator.reset(SHORT)
+    assert set(lesson.images) == set(first.images) == {"front", "wrist"}
+    for name in ("front", "wrist"):
+        assert lesson.images[name].shape == (len(lesson), 256, 256, 3)
+        assert lesson.images[name].dtype == first.images[name].dtype == np.uint8
+        assert first.images[name].shape == (256, 256, 3)
+    assert lesson.states.shape == lesson.actions.shape == (len(lesson), 8)
+    assert lesson.states.dtype == lesson.actions.dtype == first.state.dtype == np.float32
+    assert (info.simulator, info.difficulty, info.seed) == ("tabletop", "easy", 13800)
+    assert info.goals[0] == info.goal
+    assert first.state[7] == pytest.approx(0.04)
+    observation, status = simulator.step(simulator.act("oracle"))
+    assert observation.images["front"].shape == (256, 256, 3)
+    assert status is Status.ONGOING
+
+
+def test_the_same_id_gives_the_same_bits_in_any_order_and_process(
+    simulator: TabletopSimulator,
+) -> None:
+    once = digest(*simulator.reset(SHORT)[:2])
+    simulator.reset("PatternLock/test/0")
+    for _ in range(30):  # leave that episode in the middle
+        simulator.step(simulator.act("guess"))
+    assert digest(*simulator.reset(SHORT)[:2]) == once
+    with RemoteSimulator("tabletop") as remote:
+        assert digest(*remote.reset(SHORT)[:2]) == once
+
+
+def test_the_same_actions_give_the_same_outcome(blind: TabletopSimulator) -> None:
+    runs = []
+    for _ in range(2):
+        blind.reset("VideoPlaceOrder/test/0")
+        states, status = [], Status.ONGOING
+        while status is Status.ONGOING:
+            seen, status = blind.step(blind.act("oracle"))
+            states.append(seen.state)
+        runs.append((np.stack(states), status))
+    assert np.array_equal(runs[0][0], runs[1][0])
+    assert runs[0][1] is runs[1][1] is Status.SUCCESS
+
+
+def live(simulator: TabletopSimulator, episode: EpisodeId, answer: int) -> tuple[object, ...]:
+    """Goal, first live frames and state of an episode with an answer of our choice."""
+    env = simulator._env
+    env.family, env.drawing = episode.family, False
+    _, info = env.reset(seed=seed_of(episode), options={"answer": answer})
+    env.drawing = True
+    first = env.observe()
+    return info["goals"], info["demonstration"].states, first
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_answer_is_not_in_the_goal_or_the_first_live_observation(
+    simulator: TabletopSimulator, family: str
+) -> None:
+    episode = EpisodeId(family, "test", 2)  # a hard one
+    goals, shown, first = live(simulator, episode, 0)
+    other_goals, other_shown, other = live(simulator, episode, -1)
+    assert goals == other_goals
+    for name in first.images:
+        assert np.array_equal(first.images[name], other.images[name])
+    assert np.array_equal(first.state, other.state)
+    if family not in ("VideoUnmask", "VideoUnmaskSwap"):  # there the arm shows nothing
+        assert not np.array_equal(shown[: len(other_shown)], other_shown[: len(shown)])
+
+
+@pytest.mark.parametrize("family", ["VideoUnmask", "VideoUnmaskSwap"])
+def test_where_the_arm_rests_the_frames_show_the_answer(
+    simulator: TabletopSimulator, family: str
+) -> None:
+    env, seen = simulator._env, []
+    env.family = family
+    for answer in (0, -1):
+        _, info = env.reset(seed=seed_of(EpisodeId(family, "test", 0)), options={"answer": answer})
+        seen.append(info["demonstration"].images["front"][0])
+    assert not np.array_equal(*seen)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_oracle_succeeds_and_every_other_answer_fails_at_once(
+    blind: TabletopSimulator, family: str
+) -> None:
+    blind.reset(f"{family}/test/0")
+    status, steps = Status.ONGOING, 0
+    while status is Status.ONGOING:
+        _, status = blind.step(blind.act("oracle"))
+        steps += 1
+    assert status is Status.SUCCESS
+    env = blind._env
+    wrong = [answer for answer in env.episode.answers if answer != env._answer]
+    for answer in (wrong[0], wrong[-1]):
+        blind.reset(f"{family}/test/0")
+        env._guess, status, taken = answer, Status.ONGOING, 0
+        while status is Status.ONGOING:
+            _, status = blind.step(blind.act("guess"))
+            taken += 1
+        assert status is Status.FAIL
+        assert taken < 2 * steps
+
+
+def test_a_guess_does_not_depend_on_the_answer_and_is_fixed(blind: TabletopSimulator) -> None:
+    env = blind._env
+    env.family = "MoveCube"
+    guesses = set()
+    for answer in range(3):
+        env.reset(seed=19803, options={"answer": answer})
+        guesses.add(env._guess)
+    assert len(guesses) == 1
+
+
+def test_an_episode_times_out(blind: TabletopSimulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("robomme_interference_data.simulators.tabletop.simulator.MAX_STEPS", 3)
+    _, first, _ = blind.reset(SHORT)
+    hold = np.append(first.state[:7], 1).astype(np.float32)
+    assert [blind.step(hold)[1] for _ in range(3)] == ["ongoing", "ongoing", "timeout"]
+
+
+def test_bad_input_is_refused(blind: TabletopSimulator) -> None:
+    with pytest.raises(InvalidIdError, match="MoveCube-test-3"):
+        blind.reset("MoveCube-test-3")
+    with pytest.raises(UnknownNameError, match="Did you mean 'MoveCube'"):
+        blind.reset("MoveCub/test/3")
+    blind.reset(SHORT)
+    with pytest.raises(InvalidOptionError, match="8 finite numbers"):
+        blind.step(np.zeros(7, np.float32))
+    with pytest.raises(InvalidOptionError, match="8 finite numbers"):
+        blind.step(np.full(8, np.nan, np.float32))
+    with pytest.raises(UnknownNameError, match="Did you mean 'oracle'"):
+        blind.act("orakle")
+
+
+def test_a_failed_reset_leaves_no_episode_to_step(blind: TabletopSimulator) -> None:
+    blind.reset(SHORT)
+    with pytest.raises(UnknownNameError):
+        blind.reset("MoveCube/test/999")
+    blind._steps = None
+    with pytest.raises(SimulatorCrashError, match="no episode"):
+        blind.step(np.zeros(8, np.float32))
+
+
+def test_motion_out_of_reach_is_an_error(blind: TabletopSimulator) -> None:
+    blind.reset(SHORT)
+    arm = blind._env.arm
+    with pytest.raises(MotionError, match=r"gripper to .*: no solution"):
+        list(arm.move((0.6, 0.0, 0.1)))
+    arm.reset()
+    with pytest.raises(MotionError, match=r"joint \d at its limit"):
+        list(arm.move((-0.3, 0.28, 0.02), -math.pi / 2))
+
+
+def test_no_two_families_could_be_mistaken_for_one_another(simulator: TabletopSimulator) -> None:
+    views = {f: live(simulator, EpisodeId(f, "test", 0), 0)[2].images["front"] for f in FAMILIES}
+    for one in FAMILIES:
+        for other in FAMILIES:
+            if one < other and (one, other) != ("VideoUnmask", "VideoUnmaskSwap"):
+                away = np.abs(views[one].astype(int) - views[other]).max(axis=2)
+                assert (away > 12).mean() > 0.3, (one, other)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_scenes_do_not_depend_on_the_answer_and_differ_by_seed(family: str) -> None:
+    made = family_class(family)
+    one, same, other = (made("hard", np.random.RandomState(seed)) for seed in (5, 5, 6))
+    assert list(one.answers) == list(same.answers)
+    assert len(one.answers) > 2
+    assert one.goals() == same.goals()
+    places = [getattr(e, name) for e in (one, other) for name in vars(e) if "spots" in name]
+    if places:
+        assert places[0] != places[-1]
+
+
+def test_gymnasium_makes_the_environments() -> None:
+    code = """
+import gymnasium
+env = gymnasium.make("robomme_interference_data.simulators.tabletop:tabletop/MoveCube-v1")
+seen, info = env.reset(seed=19803)
+seen, reward, done, cut, info = env.step(env.action_space.sample())
+front = seen["sensor_data"]["front"]["rgb"]
+print(tuple(front.shape), bool(info["success"]), len(gymnasium.registry.keys()) > 9)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "(1, 256, 256, 3) False True"
+
+
+def test_without_a_vulkan_device_there_is_one_error() -> None:
+    code = (
+        "from robomme_interference_data.simulators import make_simulator\n"
+        "from robomme_interference_data.errors import NoRendererError\n"
+        "try: make_simulator('tabletop')\n"
+        "except NoRendererError as error: print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+        env={"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent"},
+    )
+    assert "no Vulkan device on this machine can render" in done.stdout, done.stderr
+    assert "sudo make vulkan" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_oracle_solves_the_test_split(family: str) -> None:
+    from robomme_interference_data.simulators.score import play_all
+    from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+
+    outcomes = list(play_all("oracle", episode_ids(family, "test")))
+    bad = [o for o in outcomes if o.status is not Status.SUCCESS]
+    assert len(bad) <= 1, bad
+    assert all(o.difficulty != "easy" for o in bad), bad
