@@ -1,15 +1,15 @@
-"""Commands that make and check splits: `build …`, `verify` and `audit`."""
+"""Commands that make splits: `build …`."""
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from robomme_interference_data.constants import (
     DEFAULT_K,
@@ -20,10 +20,13 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError
 
-__all__ = ["app", "audit", "verify"]
+if TYPE_CHECKING:
+    from robomme_interference_data.build_dataset.build import Filters, Settings
+    from robomme_interference_data.build_dataset.sources import Source
+
+__all__ = ["app"]
 
 _ERR = Console(stderr=True)
-_OUT = Console()
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -52,7 +55,8 @@ Sources = Annotated[
     list[str],
     typer.Option(
         "--source",
-        help="KIND:LOCATION, with kind robomme-h5, lerobot or frames; may be given several times.",
+        help="KIND:LOCATION, with kind robomme-h5, lerobot or frames, or the name of a simulator: "
+        "tabletop; may be given several times.",
     ),
 ]
 Families = Annotated[
@@ -225,79 +229,6 @@ def sample(
     _ERR.print(f"Next: robomme-interference build all --source frames:{out} --out my-split")
 
 
-def verify(
-    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
-    decode: Annotated[
-        bool, typer.Option(help="Decode all frames; without, only tables and rules are checked.")
-    ] = True,
-    as_json: AsJson = False,
-) -> None:
-    """Recompute every hash and rule of a split and name each violation; fails if there is one."""
-    from robomme_interference_data.build_dataset.progress import BuildProgress
-    from robomme_interference_data.build_dataset.verify import verify_split
-    from robomme_interference_data.loader import load_split
-
-    opened = load_split(split)
-    header = opened.reader.header["datasets"].values()
-    with BuildProgress() as progress:
-        progress.start("Verifying", sum(d["counts"]["frames"] for d in header) if decode else 0)
-        violations = list(verify_split(split, decode=decode, advance=progress.advance))
-    if as_json:
-        _print_json([{"where": v.where, "what": v.what} for v in violations])
-    else:
-        for violation in violations:
-            _OUT.print(f"{violation.where}: {violation.what}", soft_wrap=True, highlight=False)
-        what = "hashes and rules" if decode else "tables and rules (frames not decoded)"
-        _ERR.print(
-            f"{len(violations)} violations" if violations else f"All {what} of {split} hold."
-        )
-    if violations:
-        raise typer.Exit(1)
-
-
-def audit(
-    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
-    as_json: AsJson = False,
-) -> None:
-    """Print how often units are used and where families stand; fails on any leak."""
-    from robomme_interference_data.build_dataset.audit import audit_split
-    from robomme_interference_data.loader import load_split
-
-    opened = load_split(split)
-    report = audit_split(opened.manifests(), opened.datasets, opened.k_values)
-    if as_json:
-        _print_json(report.as_dict())
-    else:
-        largest = max(report.units)
-        use = Table("k", "units", "min", "mean", "max", "unused", title="Uses of a unit")
-        for k in sorted(report.units):
-            row = report.usage(k)
-            use.add_row(
-                str(k),
-                str(len(report.units[k])),
-                *(f"{row[name]:g}" if name != "mean" else f"{row[name]:.2f}" for name in row),
-            )
-        _OUT.print(use)
-        places = sorted(report.positions)
-        mix = Table(
-            "family", "units", "uses of a unit", *map(str, places), title=f"Families at k={largest}"
-        )
-        for family, row in report.family_usage(largest).items():
-            mix.add_row(
-                family,
-                f"{row['units']:g}",
-                f"{row['min']:g} to {row['max']:g}, mean {row['mean']:.2f}",
-                *(str(report.positions[place][family]) for place in places),
-            )
-        mix.caption = "Columns 1, 2, …: buffers with the family at that place after the lesson."
-        _OUT.print(mix)
-        for leak in report.leaks:
-            _OUT.print(f"LEAK, {leak.kind}: {leak.where}", soft_wrap=True, highlight=False)
-        _ERR.print(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
-    if report.leaks:
-        raise typer.Exit(1)
-
-
 def _build(
     kind: str,
     source: list[str],
@@ -313,6 +244,7 @@ def _build(
     from robomme_interference_data.build_dataset.plan import parse_ranges
     from robomme_interference_data.build_dataset.progress import BuildProgress
     from robomme_interference_data.build_dataset.sources import open_source
+    from robomme_interference_data.simulators.registry import SIMULATORS
 
     families, split, episodes = filters
     codec, cameras, version, workers, time_limit = settings
@@ -329,12 +261,23 @@ def _build(
         split=split,
         numbers=parse_ranges(episodes) if episodes is not None else None,
     )
-    opened = [
-        open_source(text, columns=_column_map(columns), families_file=families_file)
-        for text in source
-    ]
-    with _resumable(), BuildProgress() as progress:
-        result = build_dataset(kind, opened, out, wanted, chosen, progress)
+    recordings = out.parent / f".{out.name}.recordings"
+    with _resumable():
+        opened = []
+        for text in source:
+            if text in SIMULATORS:
+                played = _record(text, kind, out, recordings / text, wanted, chosen)
+                if played is None:
+                    _ERR.print(f"{out}: was built before")
+                    return
+                opened.append(played)
+            else:
+                opened.append(
+                    open_source(text, columns=_column_map(columns), families_file=families_file)
+                )
+        with BuildProgress() as progress:
+            result = build_dataset(kind, opened, out, wanted, chosen, progress)
+    shutil.rmtree(recordings, ignore_errors=True)
     if as_json:
         _print_json(
             {
@@ -352,6 +295,45 @@ def _build(
         _ERR.print(f"  left out {item.episode_id}: {item.reason}", highlight=False)
     if len(result.skipped) > 10:
         _ERR.print(f"  … {len(result.skipped)} left out in all: {out}/meta/build_report.json")
+
+
+def _record(
+    simulator: str,
+    kind: str,
+    out: Path,
+    folder: Path,
+    wanted: "Filters",
+    settings: "Settings",
+) -> "Source | None":
+    """Play the wanted episodes of a simulator; None if the dataset of them is there already."""
+    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.build_dataset.record import (
+        RecordedSource,
+        check_unbuilt,
+        record_episodes,
+    )
+    from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+
+    episodes = [
+        episode
+        for family in wanted.families or (None,)
+        for episode in episode_ids(family, wanted.split)
+        if wanted.numbers is None or episode.index in wanted.numbers
+    ]
+    if not check_unbuilt(out, kind, episodes):
+        return None
+    with BuildProgress(unit="episodes") as progress:
+        progress.start(f"Playing on {simulator}", len(episodes))
+        for _ in record_episodes(
+            simulator,
+            episodes,
+            folder,
+            live=kind == DISTRACTORS,
+            workers=settings.workers,
+            time_limit=settings.time_limit,
+        ):
+            progress.advance(1)
+    return RecordedSource(folder, simulator)
 
 
 def _manifests(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import BuildError, InvalidOptionError, nearest
 
-__all__ = ["CODECS", "Codec", "ImageStats", "VideoEncoder", "get_codec"]
+__all__ = ["CODECS", "RECORDING", "Codec", "ImageStats", "VideoEncoder", "get_codec"]
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,10 @@ CODECS = {
     )
 }
 """The codecs that a dataset can be built with, by name."""
+
+
+RECORDING = Codec(name="ffv1", vcodec="ffv1", pix_fmt="bgr0", settings={}, options={}, exact=True)
+"""How recordings are kept in a frames folder: lossless and quick, but no codec of LeRobot's."""
 
 
 def get_codec(name: str) -> Codec:

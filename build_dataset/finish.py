@@ -8,6 +8,7 @@ lossless codec.
 """
 
 import hashlib
+import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ from robomme_interference_data.constants import (
     FORMAT_VERSION,
     IDENTITY_PATH,
     REPORT_PATH,
+    STATS_PATH,
     UNIT_FRAMES,
     UNIT_STRIDE,
 )
@@ -105,6 +107,7 @@ def finish_dataset(
     """
     rows = [columns_of(planned, staged, codec) for planned, staged in episodes]
     table = _add_columns(root, rows)
+    _sort_statistics(root / STATS_PATH)
     _check_videos(root, table, episodes)
     cameras = sorted(
         key.removeprefix(CAMERA_PREFIX)
@@ -167,6 +170,12 @@ def _add_columns(root: Path, rows: Sequence[dict[str, Any]]) -> pa.Table:
         path.unlink()
     pq.write_table(table, paths[0], row_group_size=_ROW_GROUP, compression="zstd")
     return table
+
+
+def _sort_statistics(path: Path) -> None:
+    """Sort the features: LeRobot writes them in the order of a set, which differs between runs."""
+    statistics = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(statistics, indent=4, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def _check_videos(root: Path, table: pa.Table, episodes: Episodes) -> None:

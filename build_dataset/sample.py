@@ -9,12 +9,13 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.encode import RECORDING, VideoEncoder
+from robomme_interference_data.build_dataset.record import SCHEMA
 from robomme_interference_data.constants import FAMILIES, FPS
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.files import atomic_path
@@ -53,7 +54,7 @@ def write_sample(
     """
     if folder.exists() and any(folder.iterdir()):
         raise BuildError(f"{folder} is not empty", "Choose another --out, or remove it first.")
-    columns: dict[str, list[object]] = {name: [] for name in _SCHEMA.names}
+    columns: dict[str, list[object]] = {name: [] for name in SCHEMA.names}
     ids = [
         EpisodeId(family, split, index)
         for family in families
@@ -67,7 +68,10 @@ def write_sample(
         for camera, draw in (("front", scene.front), ("wrist", scene.wrist)):
             path = folder / "videos" / camera / f"{episode}.mkv"
             path.parent.mkdir(parents=True, exist_ok=True)
-            _write_video(path, (draw(step) for step in range(length)), size)
+            encoder = VideoEncoder(path, RECORDING, FPS, size, size)
+            for step in range(length):
+                encoder.add(draw(step))
+            encoder.close()
         for step in range(length):
             row = {
                 "episode_id": str(episode),
@@ -84,22 +88,7 @@ def write_sample(
                 columns[name].append(value)
         yield length
     with atomic_path(folder / "frames.parquet") as partial:
-        pq.write_table(pa.table(columns, schema=_SCHEMA), partial)
-
-
-_SCHEMA = pa.schema(
-    [
-        ("episode_id", pa.string()),
-        ("frame_index", pa.int64()),
-        ("state", pa.list_(pa.float32())),
-        ("action", pa.list_(pa.float32())),
-        ("is_demo", pa.bool_()),
-        ("goal", pa.string()),
-        ("seed", pa.int64()),
-        ("difficulty", pa.string()),
-        ("simulator", pa.string()),
-    ]
-)
+        pq.write_table(pa.table(columns, schema=SCHEMA), partial)
 
 
 class _Scene:
@@ -171,15 +160,3 @@ def _triangle(step: int, period: int, height: int) -> int:
     phase = step % period
     half = period // 2
     return height * (phase if phase <= half else period - phase) // max(1, period - half)
-
-
-def _write_video(path: Path, images: Iterator[NDArray[np.uint8]], size: int) -> None:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=FPS)
-        stream.pix_fmt = "bgr0"
-        stream.width = stream.height = size
-        for number, image in enumerate(images):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts = number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))

@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from robomme_interference_data import commands
+from robomme_interference_data.build_dataset import check_commands
 from robomme_interference_data.build_dataset import commands as build_commands
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.simulators import commands as simulator_commands
@@ -57,8 +58,8 @@ robomme-interference show MoveCube/train/0 --split my-split --k 3 --out strip.pn
 """,
 )
 app.add_typer(build_commands.app, name="build")
-app.command()(build_commands.verify)
-app.command()(build_commands.audit)
+app.command()(check_commands.verify)
+app.command()(check_commands.audit)
 app.command(name="list")(commands.list_buffers)
 app.command()(commands.show)
 app.command()(commands.doctor)

@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -89,7 +89,7 @@ def run_tasks(
     workers: int,
     time_limit: float | None = None,
     attempts: int = 2,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome]:
     """Call a function on every task in worker processes; yield outcomes as they come.
 
     An exception that the function raises is final. A worker that dies or exceeds the time limit
