@@ -122,7 +122,8 @@ class VideoEncoder:
         self._path = path
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
         with self._errors():
-            self._container = av.open(str(path), "w")
+            # Matroska would write a random number otherwise.
+            self._container = av.open(str(path), "w", container_options={"fflags": "+bitexact"})
             self._stream = self._container.add_stream(
                 codec.vcodec, rate=fps, options=dict(codec.options)
             )

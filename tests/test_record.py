@@ -1,0 +1,129 @@
+"""Episodes of a simulator become recordings, whatever its workers do."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robomme_interference_data import Dataset
+from robomme_interference_data.build_dataset.record import (
+    RecordedSource,
+    check_unbuilt,
+    record_episodes,
+)
+from robomme_interference_data.errors import BuildError
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.ids import EpisodeId
+
+DOUBLE = "simulator_doubles:make"  # a lesson of 5 frames, then success after 3 steps
+ONCE = "simulator_doubles:make_once"
+
+
+def episode(index: int) -> EpisodeId:
+    return EpisodeId("MoveCube", "train", index)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def test_lesson_and_live_part(tmp_path: Path) -> None:
+    done = list(record_episodes(DOUBLE, [episode(9), episode(0)], tmp_path, live=True, workers=2))
+    assert sorted(done) == [episode(0), episode(9)]
+    source = RecordedSource(tmp_path, "tabletop")
+    assert source.provenance == {"kind": "tabletop"}
+    first, second = source.episodes()
+    assert (first.id, second.id) == (episode(0), episode(9))
+    # 5 frames of the lesson, then one before each of the 3 steps; none after the end
+    assert (second.raw_length, second.demonstration_length) == (8, 5)
+    assert (second.goals, second.seed, second.simulator) == (("goal",), 9, "double")
+    assert second.exact
+    frames = list(source.read(second))
+    assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False] * 3
+    assert all((frame.images["front"] == 9).all() for frame in frames)
+    assert [float(frame.state[0]) for frame in frames] == [0, 0, 0, 0, 0, 3, 2, 1]
+    actions = np.stack([frame.action for frame in frames])
+    assert actions[:, 0].tolist() == [1, 1, 1, 1, 1, 0, 0, 0]
+
+
+def test_a_demonstration_ends_with_the_first_live_observation(tmp_path: Path) -> None:
+    list(record_episodes(DOUBLE, [episode(0)], tmp_path, live=False))
+    (only,) = RecordedSource(tmp_path, "tabletop").episodes()
+    assert (only.raw_length, only.demonstration_length) == (6, 5)
+
+
+def test_what_is_recorded_is_not_played_again(tmp_path: Path) -> None:
+    list(record_episodes(DOUBLE, [episode(0)], tmp_path, live=False))
+    video = tmp_path / "videos" / "front" / "MoveCube" / "train" / "0.mkv"
+    before = video.stat().st_mtime_ns
+    assert list(record_episodes(DOUBLE, [episode(0), episode(5)], tmp_path, live=False))
+    assert video.stat().st_mtime_ns == before
+    assert len(RecordedSource(tmp_path, "tabletop").episodes()) == 2
+
+
+def test_the_same_bytes_in_any_order_and_with_any_workers(tmp_path: Path) -> None:
+    ids = [episode(0), episode(4), episode(5)]
+    list(record_episodes(DOUBLE, ids, tmp_path / "a", live=True, workers=1))
+    list(record_episodes(DOUBLE, ids[::-1], tmp_path / "b", live=True, workers=2))
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_a_worker_that_dies_or_hangs_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "marks").mkdir()
+    monkeypatch.setenv("DOUBLE_MARKS", str(tmp_path / "marks"))
+    ids = [episode(index) for index in (0, 1, 2, 5)]  # 1 dies and 2 hangs, once each
+    done = list(record_episodes(ONCE, ids, tmp_path / "r", live=False, workers=2, time_limit=8))
+    assert sorted(done) == ids
+
+
+def test_failures_are_listed_and_the_others_kept(tmp_path: Path) -> None:
+    ids = [episode(0), episode(1), episode(3)]
+    with pytest.raises(BuildError) as caught:
+        list(record_episodes(DOUBLE, ids, tmp_path, live=False))
+    assert "2 of 3 episodes" in caught.value.message
+    assert "MoveCube/train/1: the worker process died (exit code 7) (started 2 times)" in str(
+        caught.value
+    )
+    assert "MoveCube/train/3: no such episode (started 1 times)" in str(caught.value)
+    assert not (tmp_path / "frames.parquet").exists()
+    assert list(record_episodes(DOUBLE, [episode(0)], tmp_path, live=False)) == [episode(0)]
+    assert len(RecordedSource(tmp_path, "tabletop").episodes()) == 1
+
+
+def test_check_unbuilt(tmp_path: Path) -> None:
+    import factories
+
+    units = factories.split() / "distractors"
+    ids = [record.id for record in Dataset(LocalFiles(units)).records()]
+    skipped = EpisodeId("VideoRepick", "train", 1)  # too short, in the build report
+    assert check_unbuilt(tmp_path / "new", "distractors", ids)
+    assert not check_unbuilt(units, "distractors", [*ids, skipped])
+    for kind, wanted in (("distractors", ids), ("demonstrations", [*ids, skipped])):
+        with pytest.raises(BuildError, match="holds something else"):
+            check_unbuilt(units, kind, wanted)
+    (tmp_path / "other").write_text("not a dataset")
+    with pytest.raises(BuildError, match="Choose another --out"):
+        check_unbuilt(tmp_path / "other", "distractors", ids)
+
+
+@pytest.mark.slow
+def test_the_tabletop_simulator_through_the_command_line(tmp_path: Path) -> None:
+    import subprocess
+    import sys
+
+    command = Path(sys.executable).parent / "robomme-interference"
+    words = ["build", "demonstrations", "--source", "tabletop", "--families", "PatternLock"]
+    words += ["--split", "test", "--episodes", "0", "--out", str(tmp_path / "d")]
+    for expected in ("built, 1 episodes", "was built before"):
+        done = subprocess.run(
+            [str(command), *words], capture_output=True, text=True, timeout=280, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert expected in " ".join(done.stderr.split())
+    (record,) = Dataset(LocalFiles(tmp_path / "d")).records()
+    assert record.simulator == "tabletop"
+    assert record.exact
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
