@@ -87,7 +87,10 @@ def speed(rounds: int = 5) -> None:
 
 
 def resets() -> None:
-    """Seconds from an episode id to the first live observation, demonstration included."""
+    """Seconds from an episode id to the first live observation, demonstration included.
+
+    In brackets: seconds of processor time, which other work on the machine does not lengthen much.
+    """
     from robomme_interference_data.simulators import make_simulator
 
     simulator = make_simulator("tabletop")
@@ -96,9 +99,10 @@ def resets() -> None:
     for family in FAMILIES:
         seconds, frames = [], []
         for index in range(3):
-            started = time.perf_counter()
+            started, used = time.perf_counter(), time.process_time()
             lesson, _, _ = simulator.reset(f"{family}/test/{index}")
-            seconds.append(f"{time.perf_counter() - started:.1f} s")
+            wall, work = time.perf_counter() - started, time.process_time() - used
+            seconds.append(f"{wall:.1f} s ({work:.1f})")
             frames.append(str(len(lesson)))
         print(f"| {family} | {' | '.join(seconds)} | {', '.join(frames)} |", flush=True)
 

@@ -70,8 +70,8 @@ def markdown_table(outcomes: Iterable[Outcome]) -> str:
     """Return a Markdown table: a row per family, one for all, successes by difficulty."""
     played = list(outcomes)
     rows = [
-        "| family | easy | medium | hard | all | 95% interval | chance | errors | mean steps |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| family | easy | medium | hard | all | 95% interval | chance | errors |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups = [(family, [o for o in played if o.episode.family == family]) for family in FAMILIES]
     for name, group in [*groups, ("all", played)]:
@@ -82,10 +82,9 @@ def markdown_table(outcomes: Iterable[Outcome]) -> str:
         won = sum(o.status is Status.SUCCESS for o in scored)
         low, high = wilson(won, len(scored))
         chance = sum(o.chance for o in scored) / max(len(scored), 1)
-        steps = sum(o.steps for o in scored) / max(len(scored), 1)
         rows.append(
             f"| {name} | {' | '.join(cells)} | {won}/{len(scored)} | {low:.1%} – {high:.1%} | "
-            f"{chance:.1%} | {len(group) - len(scored)} | {steps:.0f} |"
+            f"{chance:.1%} | {len(group) - len(scored)} |"
         )
     return "\n".join(rows)
 

@@ -56,7 +56,7 @@ class PatternLock(Family):
         yield from arm.move((*self.spots[answer[0]], HIGH))
         for number in answer:
             yield from arm.move((*self.spots[number], LOW), speed=0.15)
-            yield from arm.wait(5)
+            yield from arm.wait(7)
         yield from arm.move((*self.spots[answer[-1]], HIGH))
 
     def react(self, arm: Arm) -> None:

@@ -58,7 +58,7 @@ class PlaceFamily(Family):
         yield from arm.go_home()
         for cube in self.cubes:
             cube.restore()
-        yield from arm.wait(5)
+        yield from arm.wait(15)
         for one, other in self.swaps:
             yield from swap([self.targets[one]], [self.targets[other]])
             yield from arm.wait(5)
