@@ -20,10 +20,10 @@ __all__ = ["app", "main"]
 
 
 class _Root(TyperGroup):
-    """Lets `--k` take several numbers, as in `--k 0 1 3 7`."""
+    """Lets `--k` of the build commands take several numbers, as in `--k 0 1 3 7`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, spread(args))
+        return super().parse_args(ctx, spread(args) if args[:1] == ["build"] else args)
 
 
 def spread(args: list[str]) -> list[str]:

@@ -10,8 +10,9 @@ from rich.table import Table
 
 __all__ = ["doctor", "list_buffers", "show"]
 
-_ERR = Console(stderr=True)
-_OUT = Console()
+# Goals and paths are shown as they are, whatever brackets and colons they hold.
+_ERR = Console(stderr=True, markup=False, emoji=False)
+_OUT = Console(markup=False, emoji=False)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
 

@@ -2,8 +2,9 @@
 
 Where RoboMME's recordings lie beside the project (../shared/data), the demonstrations are the
 nine families' first test episodes and the distractors come from its training episodes, filled up
-with made-up sessions; elsewhere, all of it is a sample that the project records itself. Everything
-lands in demo/; what is there already is not made again.
+with made-up sessions; elsewhere, all of it is a sample that the project records itself. Then the
+embedded simulator plays all nine families. Everything lands in demo/; what is there already is not
+made again.
 """
 
 import shlex
@@ -27,7 +28,7 @@ FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour
 
 
 def main() -> None:
-    """Build, load, verify, audit and draw."""
+    """Build, load, verify, audit and draw; then build from the simulator."""
     began = time.monotonic()
     DEMO.mkdir(exist_ok=True)
     queries, units = recorded_here() if (ROOT / SHARED).is_dir() else self_recorded()
@@ -41,7 +42,22 @@ def main() -> None:
     run(f"show VideoRepick/test/0 --split {SPLIT} --k 7 --out {DEMO}/strip.png")
     run(f"audit {SPLIT}")
     run(f"verify {SPLIT}")
-    say(f"\nDone in {time.monotonic() - began:.0f} s. Look at {DEMO}/strip.png")
+    simulate()
+    say(f"\nDone in {time.monotonic() - began:.0f} s. Look at the pictures in {DEMO}/")
+
+
+def simulate() -> None:
+    """Build a small split of all nine families from the embedded simulator."""
+    out = DEMO / "tabletop"
+    # Index 2 is a hard episode in every family: those are long enough for a distractor unit.
+    played = "--source tabletop --split test --episodes 0"
+    run(f"build demonstrations {played} --out {out}/demonstrations")
+    run(f"build distractors --source tabletop --episodes 2 --out {out}/distractors")
+    run(
+        f"build manifests --demonstrations {out}/demonstrations --distractors {out}/distractors",
+        f"--out {out}/manifests",
+    )
+    run(f"show PatternLock/test/0 --split {out} --k 7 --out {DEMO}/tabletop.png")
 
 
 def recorded_here() -> tuple[list[str], list[str]]:

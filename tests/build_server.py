@@ -5,11 +5,14 @@ every command runs in a fork. Only for tests; used through `BuildServer`.
 """
 
 import json
+import multiprocessing.util
 import os
 import subprocess
 import sys
 import time
 import uuid
+import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,20 +109,35 @@ def _serve(log: str) -> None:
     from robomme_interference_data.build_dataset.writer import load_lerobot
 
     load_lerobot()
-    print(json.dumps("ready"), flush=True)
+    # The one other thread is pyarrow's allocator, which is made to be forked.
+    warnings.filterwarnings("ignore", message=".*multi-threaded", category=DeprecationWarning)
+    _say("ready")
     for line in sys.stdin:
         action, *rest = json.loads(line)
         if action == "wait":
             answer = os.waitstatus_to_exitcode(os.waitpid(rest[0], 0)[1])
         elif (answer := os.fork()) == 0:
-            os.setsid()
+            os.setpgid(0, 0)
             file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
                 os.dup2(file, stream)
             sys.argv = ["robomme-interference", *rest]
-            cli.main()
-            os._exit(0)
-        print(json.dumps(answer), flush=True)
+            try:
+                cli.main()
+            except SystemExit as end:
+                sys.stderr.flush()
+                multiprocessing.util._exit_function()  # as at the end of any interpreter
+                os._exit(end.code if isinstance(end.code, int) else 1)
+        if action == "start":
+            with suppress(OSError):  # whoever of the two comes first
+                os.setpgid(answer, answer)
+        _say(answer)
+    os._exit(0)  # taking the libraries down takes seconds
+
+
+def _say(answer: Any) -> None:
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import atexit
 import json
+import re
 import shutil
 import tempfile
 from collections import Counter
@@ -20,10 +21,15 @@ from robomme_interference_data.build_dataset import build as build_module
 from robomme_interference_data.build_dataset.encode import get_codec
 from robomme_interference_data.build_dataset.features import features_of
 from robomme_interference_data.build_dataset.finish import columns_of, revision_of
-from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    ManifestPlan,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.plan import plan_dataset
 from robomme_interference_data.build_dataset.sources.base import SourceEpisode
 from robomme_interference_data.build_dataset.stage import StagedEpisode
+from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
@@ -47,8 +53,7 @@ def split() -> Path:
     Queries MoveCube/test/0, MoveCube/test/1 and Drawer/test/0, with lessons of 5, 20 and 5 frames;
     two train units each of MoveCube, PatternLock and Drawer.
     """
-    folder = Path(tempfile.mkdtemp(prefix="interference-tests-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = _temporary()
     queries = [
         listed("MoveCube/test/0"),
         listed("MoveCube/test/1", lesson=20),
@@ -83,6 +88,26 @@ def edit_manifests(folder: Path, change: Callable[[list[dict[str, Any]]], Any]) 
     lines = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
     (out / MANIFEST_JSONL).write_text(lines, encoding="utf-8")
     vouch(folder)
+
+
+def violations_of(root: Path, **options: Any) -> list[tuple[str, str]]:
+    return [(violation.where, violation.what) for violation in verify_split(root, **options)]
+
+
+def check_violations(root: Path, *expected: tuple[str, str], **options: Any) -> None:
+    """Expect these violations and no other: place, and a pattern for what is said."""
+    violations = violations_of(root, **options)
+    assert [where for where, _ in violations] == [where for where, _ in expected], violations
+    for (_, what), (_, pattern) in zip(violations, expected, strict=True):
+        assert re.search(pattern, what), what
+
+
+def edit_table(path: Path, change: Callable[[list[dict[str, Any]]], Any]) -> None:
+    """Change the rows of a parquet file in place."""
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path)
 
 
 def vouch(folder: Path) -> None:
@@ -179,3 +204,40 @@ _TYPES = {
     "from_timestamp": pa.float64(),
     "exact": pa.bool_(),
 }
+
+
+def queries(folder: Path, names: list[str], lesson: int = 5, **values: Any) -> Dataset:
+    episodes = [listed(name, lesson=lesson, **values) for name in names]
+    return metadata_only(folder, "demonstrations", episodes)
+
+
+def units(folder: Path, names: list[str], **values: Any) -> Dataset:
+    return metadata_only(folder, "distractors", [listed(name, **values) for name in names])
+
+
+def named(families: dict[str, int], split: str = "train") -> list[str]:
+    return [f"{family}/{split}/{i}" for family, count in families.items() for i in range(count)]
+
+
+def write(plan: ManifestPlan, out: Path) -> list[dict[str, Any]]:
+    """Write the manifests, and return the rows of the parquet file."""
+    for _ in write_manifests(plan, out):
+        pass
+    return pq.read_table(out / "buffers.parquet").to_pylist()
+
+
+@cache
+def pair() -> tuple[Dataset, Dataset]:
+    """Six queries of three families and nine units of four, tables only; read-only."""
+    folder = _temporary()
+    tests = ["MoveCube/test/0", "MoveCube/test/2", "InsertPeg/test/10", "InsertPeg/test/9"]
+    return (
+        queries(folder / "d", [*tests, "Drawer/test/0", "MoveCube/val/1"]),
+        units(folder / "u", named({"MoveCube": 3, "InsertPeg": 2, "PatternLock": 3, "Drawer": 1})),
+    )
+
+
+def _temporary() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="interference-tests-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

@@ -125,7 +125,8 @@ def wrong_imports(module: str, source: str) -> Iterator[str]:
     for line in visitor.relative:
         yield f"{module}:{line} relative import"
     for name, inside_function, line in visitor.found:
-        commands = name == f"{PACKAGE}.{area_of(name)}.commands"
+        area = f"{PACKAGE}.{area_of(name)}"
+        commands = name in (f"{area}.commands", f"{area}.check_commands")
         from_cli = module == f"{PACKAGE}.cli" and (inside_function or commands)
         if area_of(name) not in MAY_IMPORT[area_of(module)] and not from_cli:
             yield f"{module}:{line} imports {name}"

@@ -5,6 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from robomme_interference_data.cli import app
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
     InvalidIdError,
@@ -14,7 +15,6 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import SIMULATORS, Status, make_simulator
-from robomme_interference_data.cli import app
 from robomme_interference_data.simulators.score import Outcome, markdown_table, play_all, wilson
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,

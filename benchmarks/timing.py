@@ -1,0 +1,127 @@
+"""What the benchmarks share: interleaved timing, peak memory, the machine, and a table."""
+
+import argparse
+import gc
+import multiprocessing
+import os
+import platform
+import re
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+__all__ = [
+    "Times",
+    "in_fresh_process",
+    "interleave",
+    "machine",
+    "megabytes",
+    "peak_memory",
+    "positive",
+    "table",
+]
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds that each way took, one number a round."""
+
+    seconds: Mapping[str, Sequence[float]]
+
+    def median(self, way: str) -> float:
+        """Return the median seconds of a way."""
+        return statistics.median(self.seconds[way])
+
+    def ratio(self, way: str, against: str) -> float:
+        """Return how many times as long a way took: the median of the rounds' own ratios.
+
+        A round's ratio compares two times taken one after the other, so what else the machine
+        did at that time weighs on both.
+        """
+        pairs = zip(self.seconds[way], self.seconds[against], strict=True)
+        return statistics.median(one / other for one, other in pairs)
+
+
+def interleave(ways: Mapping[str, Callable[[], object]], rounds: int) -> Times:
+    """Time several ways in turn, A B C, C B A, A B C, …, after one round of warm-up."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    order = list(ways)
+    for number in range(rounds + 1):
+        for name in order:
+            gc.disable()  # a collection would fall on whichever way happens to run
+            began = time.perf_counter()
+            ways[name]()
+            ended = time.perf_counter()
+            gc.enable()
+            if number > 0:
+                seconds[name].append(ended - began)
+        order.reverse()
+    return Times(seconds)
+
+
+def in_fresh_process[T](function: Callable[..., T], *arguments: object) -> T:
+    """Call a module-level function in a new Python process and return its result."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def peak_memory() -> int:
+    """Return the most memory that this process has held so far, in bytes."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # Not ru_maxrss: on Linux it starts at the size of the process that started this one.
+        found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text())
+        if found:
+            return int(found[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def machine(*distributions: str) -> str:
+    """Return the processor, and the versions of Python and of distributions, in one line."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        found = re.search(r"model name\s*: (.+)", cpuinfo.read_text())
+        model = found[1] if found else model
+    versions = [f"{name} {metadata.version(name)}" for name in distributions]
+    python = f"Python {platform.python_version()}"
+    return ", ".join([f"{os.cpu_count()} cores ({model})", python, *versions])
+
+
+def megabytes(size: float) -> str:
+    """Return a size in bytes as MB (10⁶ bytes), for a table."""
+    return f"{size / 1e6:,.1f}"
+
+
+def positive(text: str) -> int:
+    """Read a positive number from the command line (a `type` of argparse)."""
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return int(text)
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lay out a Markdown table.
+
+    Args:
+        title: Sentence above the table.
+        columns: Headers, each after its alignment: `<` left or `>` right.
+        rows: Cells, row by row.
+    """
+    sides = [column[0] for column in columns]
+    lines = [[column[1:] for column in columns], *map(list, rows)]
+    widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+    laid = [
+        "| " + " | ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)) + " |"
+        for line in lines
+    ]
+    rules = ["-" * (w - 1) + {"<": "-", ">": ":"}[s] for s, w in zip(sides, widths, strict=True)]
+    return "\n".join([title, "", laid[0], f"| {' | '.join(rules)} |", *laid[1:]])

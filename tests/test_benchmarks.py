@@ -1,0 +1,189 @@
+"""The benchmarks run, at their smallest size, and print what docs/performance.md shows."""
+
+import argparse
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import factories
+import numpy as np
+import pytest
+
+from robomme_interference_data import Dataset
+from robomme_interference_data.files import LocalFiles
+
+FOLDER = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def timing() -> ModuleType:
+    return module("timing")
+
+
+def module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", FOLDER / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = loaded  # dataclasses look their module up
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+def run(name: str, *options: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(FOLDER / f"{name}.py"), *map(str, options)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+
+
+def printed(name: str, *options: str | Path) -> list[list[list[str]]]:
+    """Run a benchmark; return the cells of its tables, without headers."""
+    done = run(name, *options)
+    assert done.returncode == 0, done.stderr
+    machine, *blocks = done.stdout.strip().split("\n\n")
+    assert re.match(r"\d+ cores \(.+\), Python 3\.\d+\.\d+, ", machine)
+    tables = [block.splitlines() for block in blocks if block.startswith("|")]
+    assert tables and all(re.fullmatch(r"\|( -+:? \|)+|\|( -+[-:] \|)+", t[1]) for t in tables)
+    return [[[c.strip() for c in line.strip("|").split("|")] for line in t[2:]] for t in tables]
+
+
+@pytest.mark.slow
+def test_load_prints_times_ratios_and_memory() -> None:
+    options = ("--rounds", "1", "--lerobot-frames", "3", "--chunk", "8")
+    split = factories.split()
+    loading, streaming = printed("load", "--split", split, *options)
+    assert [row[0] for row in loading] == [
+        "Buffer.frames(), 1 thread",
+        "Buffer.frames(), 2 threads",
+        "Buffer.frames(), 1 thread",
+        "LeRobotDataset[i], pyav",
+        "LeRobotDataset[i], pyav",
+        "Buffer.frames(), cached, 1 thread",
+    ]
+    assert [row[5] for row in loading] == ["≤ 1.1", "≤ 0.7", "", "≥ 15", "≥ 15", "≤ 3"]
+    # One round: the printed ratio is that of the printed times, but for the cells' rounding.
+    for _, seconds, _, other, ratio, _ in loading[:5]:
+        low = (float(seconds) - 0.0005) / (float(other) + 0.0005)
+        high = (float(seconds) + 0.0005) / (float(other) - 0.0005)
+        assert low - 0.005 <= float(ratio) <= high + 0.005
+    # Median lesson: 20 or 36 frames, the smaller one; 32 frames a unit; 64 × 64 × 3 bytes a frame.
+    frames = {"k0": 20, "k1": 52, "k3": 116, "k3, 4 times as long": 464}
+    assert [row[:3] for row in streaming] == [
+        [name, str(count), f"{count * 64 * 64 * 3 / 1e6:.1f}"] for name, count in frames.items()
+    ]
+
+
+@pytest.mark.slow
+def test_build_prints_frames_per_second_of_each_step() -> None:
+    source = f"frames:{factories.sample()}"
+    (rows,) = printed("build", "--source", source, "--rounds", "1", "--workers", "1")
+    assert [row[0] for row in rows] == [
+        "bare encoder (PyAV)",
+        "encode, hash, statistics",
+        "… and decode again to verify",
+        "… and read the recording",
+        "whole build, 1 process",
+        "whole build, 1 processes",
+    ]
+    assert rows[0][3] == "1.00"
+    for _, milliseconds, rate, share, _ in rows:
+        assert 1000 / float(milliseconds) == pytest.approx(float(rate), rel=0.05)
+        assert 0 < float(share) < 1.5
+    # Decoding, reading and LeRobot's part cost something even on the noisiest machine.
+    assert float(rows[4][1]) > float(rows[0][1])
+
+
+def test_manifests_prints_how_cost_grows() -> None:
+    options = ("--units", "90", "--queries", "9", "18", "--rounds", "1")
+    (rows,) = printed("manifests", *options)
+    assert [row[0] for row in rows] == ["9", "18"]
+    assert rows[0][2:4] == ["", ""]  # nothing above the first line
+    assert all(float(cell.replace(",", "")) >= 0 for cell in rows[1][4:])
+    assert float(rows[1][2]) > 0
+
+
+@pytest.mark.slow
+def test_made_up_episode_tables_have_the_columns_of_real_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(FOLDER)  # for what the benchmarks share
+    manifests = module("manifests")
+    for kind in ("demonstrations", "distractors"):
+        made_up = Dataset(LocalFiles(manifests.write_episodes(tmp_path / kind, kind, 11)))
+        real = Dataset(LocalFiles(factories.split() / kind))
+        assert made_up.episodes.schema.names == real.episodes.schema.names
+        assert [str(t) for t in made_up.episodes.schema.types] == [
+            str(t) for t in real.episodes.schema.types
+        ]
+        assert len(list(made_up.records())) == 11
+
+
+@pytest.mark.parametrize("name", ["load", "build", "manifests"])
+def test_help_and_refusals(name: str) -> None:
+    shown = run(name, "--help")
+    assert shown.returncode == 0 and "--rounds" in shown.stdout
+    refused = run(name, "--rounds", "0")
+    assert refused.returncode == 2
+    assert "'0' is not a positive number" in refused.stderr
+
+
+def test_a_folder_that_is_no_split_is_refused_without_traceback(tmp_path: Path) -> None:
+    refused = run("load", "--split", tmp_path)
+    assert refused.returncode == 1
+    assert "is not a split" in refused.stderr and "Traceback" not in refused.stderr
+
+
+def test_ratio_is_the_median_of_the_rounds_own_ratios(timing: ModuleType) -> None:
+    times = timing.Times({"a": [2.0, 30.0, 6.0], "b": [1.0, 10.0, 4.0]})
+    assert times.median("a") == 6.0
+    assert times.ratio("a", "b") == 2.0  # of 2, 3 and 1.5
+
+
+def test_ways_are_timed_in_turns_after_a_warm_up(timing: ModuleType) -> None:
+    calls: list[str] = []
+    ways = {name: lambda name=name: calls.append(name) for name in "abc"}
+    times = timing.interleave(ways, 2)
+    assert "".join(calls) == "abc" + "cba" + "abc"
+    assert {name: len(seconds) for name, seconds in times.seconds.items()} == dict.fromkeys(
+        "abc", 2
+    )
+
+
+def test_peak_memory_is_this_process_own() -> None:
+    held = np.ones(200 * 2**20, np.uint8)  # must not count for the process that is started
+    code = "import timing; a = timing.peak_memory(); b = b'x' * 2**26; c = timing.peak_memory()"
+    shown = subprocess.run(
+        [sys.executable, "-c", f"{code}; print(a, c - a)"],
+        cwd=FOLDER,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    before, grown = map(int, shown.stdout.split())
+    assert before < held.nbytes
+    assert 2**26 - 2**20 < grown < 2**26 + 2**22
+
+
+def test_a_fresh_process_is_another_one(timing: ModuleType) -> None:
+    assert timing.in_fresh_process(os.getpid) != os.getpid()
+
+
+def test_table_is_aligned_markdown(timing: ModuleType) -> None:
+    text = timing.table("Title.", ["<name", ">s"], [["one", "1.50"], ["three", "12.00"]])
+    assert text.splitlines() == [
+        "Title.",
+        "",
+        "| name  |     s |",
+        "| ----- | ----: |",
+        "| one   |  1.50 |",
+        "| three | 12.00 |",
+    ]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "1.5", "many", ""])
+def test_only_positive_numbers_are_taken(timing: ModuleType, text: str) -> None:
+    assert timing.positive("7") == 7
+    with pytest.raises(argparse.ArgumentTypeError, match="is not a positive number"):
+        timing.positive(text)

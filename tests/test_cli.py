@@ -1,0 +1,421 @@
+"""The command line: data on stdout, messages on stderr, exit codes, no traceback."""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import factories
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import typer
+
+from robomme_interference_data import load_split
+from robomme_interference_data.cli import app, main, spread
+
+EPISODE = "VideoUnmask/test/1"
+SCRIPT = Path(sys.executable).with_name("robomme-interference")
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the command line in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capsys.readouterr()
+        code = ended.value.code
+        return (code if isinstance(code, int) else 0), out, err
+
+    return call
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    return factories.copy_of_split(tmp_path / "split")
+
+
+def commands(
+    command: Any = None, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command and group, with the words that call it."""
+    command = command or typer.main.get_command(app)
+    yield path, command
+    for name, inner in sorted(getattr(command, "commands", {}).items()):
+        yield from commands(inner, (*path, name))
+
+
+ALL = dict(commands())
+
+
+# --- help ------------------------------------------------------------------------------------
+
+
+def test_the_commands() -> None:
+    assert {
+        ("list",),
+        ("show",),
+        ("verify",),
+        ("audit",),
+        ("doctor",),
+        ("build", "all"),
+        ("build", "demonstrations"),
+        ("build", "distractors"),
+        ("build", "manifests"),
+        ("build", "sample"),
+    } <= ALL.keys()
+
+
+@pytest.mark.parametrize("path", ALL, ids=" ".join)
+def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
+    code, out, err = run(*path, "--help")
+    assert (code, err) == (0, "")
+    assert "Usage: robomme-interference" in out
+    command = ALL[path]
+    assert str(command.help).strip()
+    for parameter in command.params:
+        if parameter.name != "help":
+            assert str(parameter.help or "").strip(), f"{parameter.name} has no help"
+            if isinstance(parameter, click.Option) or parameter.opts[0].startswith("--"):
+                assert max(parameter.opts, key=len) in out
+    for name in getattr(command, "commands", {}):
+        assert name in out
+
+
+@pytest.mark.parametrize(
+    "path", [path for path, command in ALL.items() if hasattr(command, "commands")], ids=" ".join
+)
+def test_groups_without_a_command_show_their_help(path: tuple[str, ...], run: Run) -> None:
+    code, out, err = run(*path)
+    assert code == 2
+    assert "Usage: robomme-interference" in out + err
+
+
+def examples() -> list[str]:
+    found = []
+    for command in ALL.values():
+        lines = str(command.epilog or "").replace("\\\n", " ").splitlines()
+        found += [line.strip() for line in lines if line.strip().startswith("robomme-interference")]
+    return found
+
+
+def test_there_are_examples() -> None:
+    assert len(examples()) >= 8
+
+
+@pytest.mark.parametrize("line", examples())
+def test_examples_name_commands_and_options_that_exist(line: str) -> None:
+    words = shlex.split(line)[1:]
+    path: tuple[str, ...] = ()
+    while words and (*path, words[0]) in ALL:
+        path += (words.pop(0),)
+    assert path, line
+    options = {name for parameter in ALL[path].params for name in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= options
+
+
+# --- usage errors ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lits"], "No such command 'lits'"),
+        (["list"], "Missing argument"),
+        (["list", ".", "--bad"], "No such option: --bad"),
+        (["show", EPISODE], "Missing option '--k'"),
+        (["show", EPISODE, "--k", "three"], "'three' is not a valid int"),
+        (["list", ".", "--k", "1", "3"], "Got unexpected extra argument"),
+        (["build", "demonstrations", "--source", "frames:."], "Missing option '--out'"),
+    ],
+)
+def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"),
+    [
+        ([], []),
+        (["--k", "0", "1", "3"], ["--k", "0", "--k", "1", "--k", "3"]),
+        (["--k", "0"], ["--k", "0"]),
+        (["--k"], ["--k"]),
+        (["--k", "0", "1", "--seed", "5"], ["--k", "0", "--k", "1", "--seed", "5"]),
+        (["--seed", "5", "6"], ["--seed", "5", "6"]),
+        (["--k", "0", "--k", "1", "2"], ["--k", "0", "--k", "1", "--k", "2"]),
+        (["--k", "1", "x", "2"], ["--k", "1", "x", "2"]),
+        (["--k", "-1", "2"], ["--k", "-1", "--k", "2"]),
+        (["--k=0", "1"], ["--k=0", "1"]),
+    ],
+)
+def test_spread(given: list[str], taken: list[str]) -> None:
+    assert spread(given) == taken
+
+
+# --- known errors ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "lines"),
+    [
+        (
+            ["list", "{}/nowhere"],
+            ["Error: {}/nowhere is not a split: manifests/manifest.json is missing", "Point to"],
+        ),
+        (
+            ["list", "{}", "--family", "VideoUnmsk"],
+            [
+                "Error: family 'VideoUnmsk' is not in {}/manifests",
+                "Did you mean 'VideoUnmask'?",
+            ],
+        ),
+        (["list", "{}", "--k", "9"], ["Error: k 9 is not in {}/manifests", "Known: 0, 1, 3"]),
+        (
+            ["show", "VideoUnmask/test/9", "--split", "{}", "--k", "3"],
+            ["Error: VideoUnmask/test/9 is not in {}/manifests", "Did you mean 'VideoUnmask/test/"],
+        ),
+        (
+            ["show", "VideoUnmask", "--split", "{}", "--k", "3"],
+            ["Error: 'VideoUnmask' is not an episode id", "Expected <Family>/<split>/<index>"],
+        ),
+        (
+            ["show", EPISODE, "--split", "{}", "--k", "9"],
+            ["Error: k=9 is not in {}/manifests", "Planned there: 0, 1, 3."],
+        ),
+        (["verify", "{}/nowhere"], ["Error: {}/nowhere is not a split", "Point to the folder"]),
+        (["audit", "{}/nowhere"], ["Error: {}/nowhere is not a split", "Point to the folder"]),
+        (
+            ["build", "distractors", "--source", "frmes:{}", "--out", "{}/out"],
+            ["Error: --source 'frmes:{}' is not KIND:LOCATION", "Did you mean 'frames'?"],
+        ),
+    ],
+)
+def test_known_errors(arguments: list[str], lines: list[str], run: Run) -> None:
+    root = str(factories.split())
+    code, out, err = run(*(argument.replace("{}", root) for argument in arguments))
+    assert (code, out) == (1, "")
+    assert "Traceback" not in err
+    found = err.splitlines()
+    assert len(found) == len(lines)
+    for line, expected in zip(found, lines, strict=True):
+        assert line.startswith(expected.replace("{}", root))
+
+
+# --- list and show -----------------------------------------------------------------------------
+
+
+def test_list(run: Run) -> None:
+    code, out, err = run("list", factories.split())
+    assert (code, err) == (0, "")
+    rows = [line.split("│")[1:-1] for line in out.splitlines() if line.startswith("│")]
+    assert len(rows) == 24
+    found = [[cell.strip() for cell in row] for row in rows]
+    assert found[11] == [EPISODE, "3", "medium", "36", "132", "0.28"]
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ([], 24),
+        (["--k", "3"], 8),
+        (["--family", "MoveCube", "--difficulty", "easy"], 3),
+    ],
+)
+def test_list_as_json(options: list[str], count: int, run: Run) -> None:
+    code, out, err = run("list", factories.split(), "--json", *options)
+    assert (code, err) == (0, "")
+    rows = [json.loads(line) for line in out.splitlines()]
+    assert len(rows) == count
+    lines = (factories.split() / "manifests" / "buffers.jsonl").read_text().splitlines()
+    assert all(row in [json.loads(line) for line in lines] for row in rows)
+
+
+def test_show(run: Run) -> None:
+    code, out, err = run("show", EPISODE, "--split", factories.split(), "--k", 3)
+    assert (code, err) == (0, "")
+    assert f"{EPISODE} at k=3: watch the video carefully" in out
+    rows = [line.split("│")[1:-1] for line in out.splitlines() if line.startswith("│")]
+    found = [[cell.strip() for cell in row] for row in rows]
+    assert found[0] == ["0", "lesson", "VideoUnmask", EPISODE, "0 to 35"]
+    assert [row[4] for row in found] == ["0 to 35", "36 to 67", "68 to 99", "100 to 131"]
+    assert "132 history frames" in out
+    assert "sample at the first step holds 28% lesson" in " ".join(out.split())
+
+
+def test_show_as_json(run: Run) -> None:
+    code, out, err = run("show", EPISODE, "--split", factories.split(), "--k", 3, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out) == load_split(factories.split()).manifest(EPISODE, 3).as_dict()
+
+
+def test_show_draws_a_strip(run: Run, tmp_path: Path) -> None:
+    picture = tmp_path / "strip.png"
+    code, out, err = run(
+        "show", EPISODE, "--split", factories.split(), "--k", 1, "--out", picture, "--json"
+    )
+    assert code == 0
+    assert json.loads(out)["k"] == 1  # the message about the picture is not among the data
+    assert str(picture) in err.replace("\n", "")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_goals_are_shown_as_they_are(run: Run, copy: Path) -> None:
+    """Brackets and colons in them are not taken for markup."""
+    goal = "put [red] :fire: into [/b] the [bold]box"
+    path = copy / "manifests" / "buffers.parquet"
+    table = pq.ParquetFile(path).read()
+    place = table.schema.get_field_index("goals")
+    goals = pa.array([[goal]] * len(table), table.schema.field(place).type)
+    pq.write_table(table.set_column(place, table.schema.field(place), goals), path)
+    code, out, err = run("show", EPISODE, "--split", copy, "--k", 1)
+    assert (code, err) == (0, "")
+    assert goal in " ".join(out.split())
+
+
+# --- verify and audit ----------------------------------------------------------------------------
+
+
+def test_verify_a_clean_split(run: Run) -> None:
+    code, out, err = run("verify", factories.split())
+    assert (code, out) == (0, "")
+    assert f"All hashes and rules of {factories.split()} hold." in err.replace("\n", " ").replace(
+        "  ", " "
+    )
+    code, out, err = run("verify", factories.split(), "--json", "--no-decode")
+    assert (code, json.loads(out)) == (0, [])
+
+
+def remove_video(root: Path) -> None:
+    (root / "demonstrations/videos/observation.images.front/chunk-000/file-001.mp4").unlink()
+
+
+def change_line(root: Path) -> None:
+    path = root / "manifests/buffers.jsonl"
+    path.write_text(path.read_text().replace('"k": 3', '"k": 5', 1))
+
+
+def swap_videos(root: Path) -> None:
+    folder = root / "distractors/videos/observation.images.wrist/chunk-000"
+    shutil.copyfile(folder / "file-001.mp4", folder / "file-002.mp4")
+
+
+@pytest.mark.parametrize(
+    ("damage", "where", "what"),
+    [
+        (remove_video, "demonstrations VideoUnmask/test/0", "file-001.mp4 is missing"),
+        (change_line, "manifests/buffers.jsonl", "does not have the SHA-256"),
+        (swap_videos, "distractors MoveCube/train/0", "observation.images.wrist"),
+    ],
+)
+def test_verify_names_violations(
+    damage: Callable[[Path], None], where: str, what: str, run: Run, copy: Path
+) -> None:
+    damage(copy)
+    code, out, err = run("verify", copy)
+    assert code == 1
+    assert any(line.startswith(where) and what in line for line in out.splitlines())
+    assert "violations" in err
+    code, out, _ = run("verify", copy, "--json")
+    assert code == 1
+    assert any(where in found["where"] and what in found["what"] for found in json.loads(out))
+
+
+def test_audit(run: Run) -> None:
+    code, out, err = run("audit", factories.split())
+    assert (code, err) == (0, "No leaks.\n")
+    assert "Uses of a unit" in out
+    code, out, err = run("audit", factories.split(), "--json")
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["leaks"] == []
+    assert sum(report["units"].values()) == 8 * 3
+    assert report["usage"]["1"]["mean"] == 8 / 7
+
+
+# --- build manifests --------------------------------------------------------------------------
+
+
+def test_build_manifests_as_the_split_has_them(run: Run, tmp_path: Path) -> None:
+    root = factories.split()
+    code, out, _ = run(
+        "build", "manifests",
+        "--demonstrations", root / "demonstrations",
+        "--distractors", root / "distractors",
+        "--out", tmp_path / "manifests",
+        "--k", 3, 0, 1,
+        "--json",
+    )  # fmt: skip
+    assert code == 0
+    assert json.loads(out) == {
+        "out": str(tmp_path / "manifests"),
+        "buffers": 24,
+        "queries": 8,
+        "sessions": 8 * (1 + 2 + 4),
+    }
+    for name in ("buffers.parquet", "buffers.jsonl", "manifest.json"):
+        made = (tmp_path / "manifests" / name).read_bytes()
+        assert made == (root / "manifests" / name).read_bytes()
+
+
+# --- as a program ---------------------------------------------------------------------------------
+
+
+def script(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [SCRIPT, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        **options,
+    )
+
+
+def test_console_script() -> None:
+    done = script("list", factories.split(), "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len([json.loads(line) for line in done.stdout.splitlines()]) == 24
+
+
+def test_console_script_fails_without_a_traceback(tmp_path: Path) -> None:
+    done = script("show", EPISODE, "--split", tmp_path, "--k", 3)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith(f"Error: {tmp_path} is not a split")
+    assert "Traceback" not in done.stderr
+
+
+def test_console_script_takes_the_split_from_the_environment() -> None:
+    environment = {**os.environ, "ROBOMME_INTERFERENCE_SPLIT": str(factories.split())}
+    done = script("show", EPISODE, "--k", 3, "--json", env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["episode_id"] == EPISODE
+
+
+def test_the_reader_of_stdout_may_go_away() -> None:
+    """As with `robomme-interference list … | head`."""
+    with subprocess.Popen(
+        [SCRIPT, "list", factories.split(), "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.wait(120) == 1
+        assert process.stderr.read() == ""

@@ -1,0 +1,272 @@
+"""Worker processes: results exactly once, whatever the workers do, and none is left behind.
+
+Tasks are `functools.partial` objects of library functions, called by `operator.call` in the
+worker: so everything can be pickled by name in any process.
+"""
+
+import contextlib
+import math
+import operator
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.workers import Outcome, run_tasks
+
+pytestmark = pytest.mark.timeout(150)
+
+FOREVER = 100_000.0
+
+
+def run(tasks: list[Any], workers: int = 1, **options: Any) -> list[Outcome]:
+    return list(run_tasks(operator.call, tasks, workers=workers, **options))
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that ended and that nobody waited for does not."""
+    stat = Path(f"/proc/{pid}/stat")
+    if Path("/proc/self/stat").exists():
+        try:
+            return stat.read_text().rpartition(")")[2].split()[0] != "Z"
+        except (FileNotFoundError, ProcessLookupError):
+            return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def wait_until_gone(pids: list[int], seconds: float = 30) -> None:
+    deadline = time.monotonic() + seconds
+    while any(map(is_alive, pids)):
+        assert time.monotonic() < deadline, f"still running: {list(filter(is_alive, pids))}"
+        time.sleep(0.05)
+
+
+def test_every_task_once() -> None:
+    """More tasks than workers; outcomes come in any order."""
+    tasks = [partial(math.sqrt, number) for number in range(40)]
+    outcomes = run(tasks, workers=3)
+    assert Counter(outcome.task.args[0] for outcome in outcomes) == Counter(range(40))
+    for outcome in outcomes:
+        assert outcome.value == math.sqrt(outcome.task.args[0])
+        assert outcome.error is None
+        assert outcome.attempts == 1
+
+
+def test_no_tasks_and_more_workers_than_tasks() -> None:
+    assert run([], workers=4) == []
+    (outcome,) = run([partial(math.sqrt, 4)], workers=4)
+    assert outcome.value == 2
+
+
+def test_other_processes_do_the_work() -> None:
+    outcomes = run([partial(os.getpid) for _ in range(10)], workers=2)
+    pids = {outcome.value for outcome in outcomes}
+    assert os.getpid() not in pids
+    assert 1 <= len(pids) <= 2
+    wait_until_gone(list(pids))
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_workers_must_be_positive(workers: int) -> None:
+    with pytest.raises(InvalidOptionError, match=f"--workers {workers}; expected 1 or more"):
+        run([partial(math.sqrt, 4)], workers=workers)
+
+
+def test_whatever_a_task_does_the_others_are_done(tmp_path: Path) -> None:
+    """One worker meets every kind of trouble; what raised is final, what died is tried again."""
+    marker = tmp_path / "died before"
+    dies_once = (
+        f"import os, pathlib\nmarker = pathlib.Path({str(marker)!r})\n"
+        "if not marker.exists():\n    marker.touch()\n    os._exit(7)\n"
+    )
+    tasks = {
+        "returns None": partial(exec, ""),
+        "returns much": partial(bytes, 20_000_000),
+        "raises": partial(int, "no number"),
+        "raises ours": partial(EpisodeId.parse, "VideoRepick"),
+        "exits": partial(os._exit, 3),
+        "asks to exit": partial(sys.exit, 4),
+        "is killed": partial(signal.raise_signal, signal.SIGKILL),
+        "crashes": partial(signal.raise_signal, signal.SIGSEGV),
+        "is interrupted": partial(signal.raise_signal, signal.SIGINT),
+        "cannot be sent": partial(threading.Lock),
+        "dies once": partial(exec, dies_once),
+        "works": partial(math.sqrt, 9),
+    }
+    outcomes = run(list(tasks.values()), workers=2)
+    # Tasks come back as copies: they are told apart by what they are made of.
+    key = {(task.func, str(task.args)): name for name, task in tasks.items()}
+    found = {key[outcome.task.func, str(outcome.task.args)]: outcome for outcome in outcomes}
+    assert len(outcomes) == len(found) == len(tasks)
+
+    for name in ("returns None", "is interrupted"):  # Ctrl-C is the parent's to handle
+        assert (found[name].value, found[name].error, found[name].attempts) == (None, None, 1)
+    assert found["returns much"].value == bytes(20_000_000)
+    assert found["works"].value == 3
+
+    error = found["raises"].error
+    assert isinstance(error, RuntimeError)
+    assert str(error).startswith("ValueError: invalid literal for int()")
+    assert "Traceback" in str(error)
+    error = found["raises ours"].error
+    assert isinstance(error, InvalidIdError)
+    assert error.hint == "Expected <Family>/<split>/<index>, for example VideoRepick/test/7."
+    error = found["cannot be sent"].error
+    assert isinstance(error, RuntimeError)
+    assert "cannot pickle '_thread.lock' object" in str(error)
+    for name in ("raises", "raises ours", "cannot be sent"):
+        assert found[name].attempts == 1
+
+    for name, code in (
+        ("exits", 3),
+        ("asks to exit", 4),
+        ("is killed", -signal.SIGKILL),
+        ("crashes", -signal.SIGSEGV),
+    ):
+        error = found[name].error
+        assert isinstance(error, RuntimeError)
+        assert str(error) == f"the worker process died (exit code {code})"
+        assert (found[name].value, found[name].attempts) == (None, 2)
+    assert (found["dies once"].error, found["dies once"].attempts) == (None, 2)
+
+
+def test_attempts() -> None:
+    (outcome,) = run([partial(os._exit, 1)], attempts=1)
+    assert outcome.attempts == 1
+    (outcome,) = run([partial(os._exit, 1)], attempts=3)
+    assert outcome.attempts == 3
+
+
+def test_time_limit(tmp_path: Path) -> None:
+    marker = tmp_path / "hung before"
+    hangs_once = (
+        f"import pathlib, time\nmarker = pathlib.Path({str(marker)!r})\n"
+        f"if not marker.exists():\n    marker.touch()\n    time.sleep({FOREVER})\n"
+    )
+    pids = tmp_path / "pids"
+    hangs = (
+        "import os, pathlib, time\n"
+        f"pathlib.Path({str(pids)!r}).open('a').write(f'{{os.getpid()}} ')\n"
+        f"time.sleep({FOREVER})\n"
+    )
+    tasks = [partial(exec, hangs), partial(exec, hangs_once), partial(math.sqrt, 4)]
+    started = time.monotonic()
+    outcomes = run(tasks, workers=2, time_limit=5)
+    assert time.monotonic() - started < 60
+    found = {str(outcome.task.args): outcome for outcome in outcomes}
+    assert len(found) == len(outcomes) == 3
+    outcome = found[str((hangs,))]
+    assert isinstance(outcome.error, TimeoutError)
+    assert str(outcome.error) == "still running after 5 s"
+    assert outcome.attempts == 2
+    outcome = found[str((hangs_once,))]
+    assert (outcome.error, outcome.attempts) == (None, 2)
+    assert found["(4,)"].value == 2
+    # The hung processes were ended, not left to themselves.
+    hung = list(map(int, pids.read_text().split()))
+    assert len(hung) == 2
+    wait_until_gone(hung)
+
+
+@pytest.fixture
+def pid_folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "pids"
+    folder.mkdir()
+    return folder
+
+
+def hang_with_pid(folder: Path) -> Any:
+    return partial(
+        exec,
+        f"import os, pathlib, time\npathlib.Path({str(folder)!r}, str(os.getpid())).touch()\n"
+        f"time.sleep({FOREVER})\n",
+    )
+
+
+def pids_in(folder: Path, count: int) -> list[int]:
+    """Wait for as many workers to say that they are at work."""
+    deadline = time.monotonic() + 60
+    while len(list(folder.iterdir())) < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return [int(path.name) for path in folder.iterdir()]
+
+
+def test_closing_stops_the_workers(pid_folder: Path) -> None:
+    tasks = [partial(math.sqrt, 4), *(hang_with_pid(pid_folder) for _ in range(3))]
+    outcomes = run_tasks(operator.call, tasks, workers=3)
+    assert next(outcomes).value == 2
+    pids = pids_in(pid_folder, 2)
+    assert all(map(is_alive, pids))
+    outcomes.close()
+    wait_until_gone(pids, seconds=5)
+
+
+def test_an_error_of_the_caller_stops_the_workers(pid_folder: Path) -> None:
+    tasks = [partial(math.sqrt, 4), hang_with_pid(pid_folder)]
+    with (
+        pytest.raises(ZeroDivisionError),
+        contextlib.closing(run_tasks(operator.call, tasks, workers=2)) as outcomes,
+    ):
+        for _ in outcomes:
+            pids = pids_in(pid_folder, 1)
+            raise ZeroDivisionError
+    wait_until_gone(pids, seconds=5)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_workers_end_with_their_parent(pid_folder: Path, how: signal.Signals) -> None:
+    """However it ends, and though their tasks hang."""
+    code = (
+        "import operator, sys\n"
+        "from functools import partial\n"
+        "from robomme_interference_data.workers import run_tasks\n"
+        "if __name__ == '__main__':\n"
+        f"    task = partial(exec, {hang_with_pid(pid_folder).args[0]!r})\n"
+        "    list(run_tasks(operator.call, [task] * 4, workers=2))\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as parent:
+        try:
+            pids = pids_in(pid_folder, 2)
+            assert all(map(is_alive, pids))
+            parent.send_signal(how)
+            parent.wait(30)
+        finally:
+            parent.kill()
+    wait_until_gone(pids, seconds=20)
+
+
+def test_idle_workers_end_with_their_parent(pid_folder: Path) -> None:
+    """One worker waits for work when the parent is killed."""
+    script = (
+        "import operator, os, pathlib, signal, time\n"
+        "from functools import partial\n"
+        "from robomme_interference_data.workers import run_tasks\n"
+        "if __name__ == '__main__':\n"
+        f"    folder = {str(pid_folder)!r}\n"
+        f"    tasks = [partial(os.getpid), partial(exec, {hang_with_pid(pid_folder).args[0]!r})]\n"
+        "    for outcome in run_tasks(operator.call, tasks, workers=2):\n"
+        "        pathlib.Path(folder, str(outcome.value)).touch()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script]) as parent:
+        try:
+            pids = pids_in(pid_folder, 2)
+        finally:
+            parent.kill()
+    wait_until_gone(pids, seconds=20)
