@@ -268,13 +268,12 @@ def test_without_a_vulkan_device_there_is_one_error() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(7200)
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_oracle_solves_the_test_split(family: str) -> None:
+def test_the_oracle_solves_test_episodes(family: str) -> None:
+    """The last six of each family; all 450 are `robomme-interference simulate-score`'s."""
     from robomme_interference_data.simulators.score import play_all
     from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
-    outcomes = list(play_all("oracle", episode_ids(family, "test")))
-    bad = [o for o in outcomes if o.status is not Status.SUCCESS]
-    assert len(bad) <= 1, bad
-    assert all(o.difficulty != "easy" for o in bad), bad
+    outcomes = list(play_all("oracle", episode_ids(family, "test")[-6:]))
+    assert [o.status for o in outcomes] == [Status.SUCCESS] * 6, outcomes
+    assert {o.difficulty for o in outcomes} == {"easy", "medium", "hard"}
