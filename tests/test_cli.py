@@ -136,7 +136,7 @@ def test_examples_name_commands_and_options_that_exist(line: str) -> None:
         (["list"], "Missing argument"),
         (["list", ".", "--bad"], "No such option: --bad"),
         (["show", EPISODE], "Missing option '--k'"),
-        (["show", EPISODE, "--k", "three"], "'three' is not a valid int"),
+        (["show", EPISODE, "--k", "three"], "Invalid value for '--k'"),
         (["list", ".", "--k", "1", "3"], "Got unexpected extra argument"),
         (["build", "demonstrations", "--source", "frames:."], "Missing option '--out'"),
     ],
