@@ -35,7 +35,7 @@ def module(name: str) -> ModuleType:
 
 def run(name: str, *options: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(FOLDER / f"{name}.py"), *map(str, options)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=560, check=False)
 
 
 def printed(name: str, *options: str | Path) -> list[list[list[str]]]:

@@ -325,7 +325,7 @@ def test_made_up_buffers(name: str) -> None:
     check(made, entries)
     made.verify()
     assert [session.entry for session in made.sessions] == entries
-    for index in {0, len(made) // 2, len(made) - 1} - {-1} if len(made) else ():
+    for index in range(0, len(made), 5):
         np.testing.assert_array_equal(made.frame(index), expected_frames(entries, "front")[index])
 
 

@@ -228,6 +228,7 @@ def test_the_real_split_verifies(split: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # 3,000 frames of 256 × 256
 def test_the_lessons_of_all_nine_families(shared_data: Path, tmp_path: Path) -> None:
     as_frames_folder(shared_data / "lessons", tmp_path / "lessons", FAMILIES)
     build("demonstrations", open_source(f"frames:{tmp_path / 'lessons'}"), tmp_path / "out")

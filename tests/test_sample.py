@@ -118,6 +118,7 @@ def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_command_and_everything_after(tmp_path: Path) -> None:
     runner = CliRunner()
     sample, split = tmp_path / "sample", tmp_path / "split"
