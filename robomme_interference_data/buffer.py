@@ -212,33 +212,47 @@ class Buffer:
         self._datasets[query.dataset].read_frames(query.episode_index, feature, query.frame, out)
         return out[0]
 
-    def stream(self, chunk: int = 64, cameras: tuple[str, ...] | None = None) -> Iterator[Chunk]:
-        """Decode the buffer in chunks, in order, holding one chunk at a time.
+    def stream(
+        self,
+        chunk: int = 64,
+        cameras: tuple[str, ...] | None = None,
+        start: int = 0,
+        stop: int | None = None,
+    ) -> Iterator[Chunk]:
+        """Decode the buffer, or a span of it, in chunks, in order, holding one chunk at a time.
 
         Args:
             chunk: Frames in a chunk; the last one may be shorter.
             cameras: Names of the cameras; None for all.
+            start: First frame of the span.
+            stop: Frame after its last one; None for the buffer's end.
 
         Raises:
-            InvalidOptionError: `chunk` is not positive.
+            InvalidOptionError: `chunk` is not positive, or the span is not inside the buffer.
             UnknownNameError, MissingFileError, FormatError, TruncatedVideoError: As `frames`.
         """
         if chunk < 1:
             raise InvalidOptionError(f"chunk={chunk}; expected 1 or more")
+        end = len(self) if stop is None else stop
+        if not 0 <= start <= end <= len(self):
+            raise InvalidOptionError(
+                f"frames {start} to {end} are not inside the buffer of {self.episode_id} at "
+                f"k={self.k}, which has {len(self)} history frames, numbered from 0"
+            )
         wanted = self.cameras if cameras is None else cameras
         names = {name: self._feature(name) for name in wanted}
-        decoders = {name: self._iter_frames(feature) for name, feature in names.items()}
+        decoders = {name: self._iter_frames(feature, start, end) for name, feature in names.items()}
         session_index = self.session_index
         try:
-            for start in range(0, len(self), chunk):
-                stop = min(start + chunk, len(self))
+            for first in range(start, end, chunk):
+                last = min(first + chunk, end)
                 frames = {}
                 for name, feature in names.items():
-                    out = np.empty((stop - start, *self._shape(feature)), np.uint8)
-                    for position in range(stop - start):
+                    out = np.empty((last - first, *self._shape(feature)), np.uint8)
+                    for position in range(last - first):
                         out[position] = next(decoders[name])
                     frames[name] = out
-                yield Chunk(start, frames, self.states[start:stop], session_index[start:stop])
+                yield Chunk(first, frames, self.states[first:last], session_index[first:last])
         finally:
             for decoder in decoders.values():
                 decoder.close()
@@ -310,12 +324,22 @@ class Buffer:
 
         return finish
 
-    def _iter_frames(self, feature: str) -> Generator[NDArray[np.uint8]]:
-        for entry in self.manifest.sessions:
-            dataset = self._datasets[entry.dataset]
-            for frame in dataset.iter_frames(entry.episode_index, feature, entry.start, entry.stop):
-                for _ in range(entry.repeat):
+    def _iter_frames(self, feature: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
+        for session in self.sessions:
+            first, last = max(start, session.start), min(stop, session.stop)
+            if first >= last:
+                continue
+            entry = session.entry
+            stored = entry.start + (first - session.start) // entry.repeat
+            end = entry.start + -(-(last - session.start) // entry.repeat)
+            dataset, position = self._datasets[entry.dataset], first
+            for frame in dataset.iter_frames(entry.episode_index, feature, stored, end):
+                shown = min(
+                    last, position + entry.repeat - (position - session.start) % entry.repeat
+                )
+                while position < shown:
                     yield frame
+                    position += 1
 
     def _vectors(self, feature: str) -> NDArray[np.float32]:
         parts = []

@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,16 @@ class Split:
                 )
             opened[name] = dataset
         return opened
+
+    @property
+    def name(self) -> str:
+        """Name of the split: that of its folder."""
+        return self.root.resolve().name
+
+    @cached_property
+    def revision(self) -> str:
+        """Identity of the split: SHA-256 of `manifest.json`, which names all data by hash."""
+        return sha256((self.root / MANIFESTS / MANIFEST_JSON).read_bytes()).hexdigest()
 
     @property
     def episode_ids(self) -> tuple[EpisodeId, ...]:

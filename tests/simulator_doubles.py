@@ -32,7 +32,9 @@ class Double:
         self.marks = Path(marks) if marks else None
         self.left = 0
 
-    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
         episode = EpisodeId.parse(episode_id)
         if episode.index in (1, 2) and self._first_time(episode.index):
             if episode.index == 1:
@@ -50,7 +52,7 @@ class Double:
         info = EpisodeInfo("goal", ("goal",), "easy", episode.index, "double")
         return lesson, self._observe(), info
 
-    def step(self, action: np.ndarray) -> tuple[Observation, Status]:
+    def step(self, action: np.ndarray, observe: bool = True) -> tuple[Observation, Status]:
         self.left -= 1
         return self._observe(), Status.ONGOING if self.left else Status.SUCCESS
 

@@ -168,6 +168,30 @@ def test_stream_may_be_left_early() -> None:
     assert len(list(made.stream(50))) == 3
 
 
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_a_span_is_the_same_frames_of_the_whole(repeat: int) -> None:
+    made = buffer(3)
+    held = [replace(entry, repeat=repeat) for entry in made.manifest.sessions]
+    frames = sum(entry.num_frames for entry in held)
+    manifest = replace(made.manifest, sessions=tuple(held), history_frames=frames)
+    made = Buffer(manifest, made._datasets)
+    whole, states = made.frames("front"), made.states
+    bound = made.sessions[1].start
+    for start, stop in [(0, 1), (bound - 2, bound + 2), (bound, bound + 4), (5, frames), (7, 7)]:
+        chunks = list(made.stream(3, ("front",), start, stop))
+        assert [c.start for c in chunks] == list(range(start, stop, 3))
+        got = [chunk.frames["front"] for chunk in chunks]
+        np.testing.assert_array_equal(np.concatenate([whole[:0], *got]), whole[start:stop])
+        got = [chunk.states for chunk in chunks]
+        np.testing.assert_array_equal(np.concatenate([states[:0], *got]), states[start:stop])
+
+
+@pytest.mark.parametrize("span", [(-1, 3), (4, 3), (0, 100_000)])
+def test_a_span_must_be_inside(span: tuple[int, int]) -> None:
+    with pytest.raises(InvalidOptionError, match=r"are not inside the buffer of"):
+        next(buffer(1).stream(8, None, *span))
+
+
 @pytest.mark.parametrize("chunk", [0, -1])
 def test_chunk_must_be_positive(chunk: int) -> None:
     with pytest.raises(InvalidOptionError, match=f"chunk={chunk}; expected 1 or more"):

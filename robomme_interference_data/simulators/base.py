@@ -28,8 +28,8 @@ class Observation:
     """What a policy sees at one time step.
 
     Attributes:
-        images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB. Empty if the
-            simulator was made with `render=False`.
+        images: Camera name (`front`, `wrist`) to image, `(256, 256, 3) uint8` RGB; only the
+            cameras that the simulator was asked to draw, and empty where no images were wanted.
         state: `(8,) float32`: 7 joint positions in rad, then the gripper's opening, which is the
             way of one finger, 0 closed to 0.04 m open.
     """
@@ -43,7 +43,8 @@ class Demonstration:
     """The lesson of an episode: T time steps, the first live observation not among them.
 
     Attributes:
-        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; empty with `render=False`.
+        images: Camera name to frames, `(T, H, W, 3) uint8` RGB; empty where they
+            were not wanted.
         states: `(T, 8) float32`, as `Observation.state`; `states[t]` belongs to frame t.
         actions: `(T, 8) float32`: the action taken at time step t, after frame t was seen: 7
             absolute joint targets in rad, then the gripper, −1 closed to 1 open.
@@ -83,13 +84,17 @@ class EpisodeInfo:
 class Simulator(Protocol):
     """One episode at a time of the benchmark's task families."""
 
-    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
         """Start an episode: play its demonstration, then set the scene for execution.
 
         The same id gives the same frames, states and first observation, bit for bit.
 
         Args:
             episode_id: `<Family>/<split>/<index>`, such as `MoveCube/test/3`.
+            demonstration: Whether the frames of the demonstration are wanted. It is played in any
+                case; without, a simulator need not draw it, and its `images` may be empty.
 
         Raises:
             InvalidIdError: The text is not an episode id.
@@ -97,11 +102,13 @@ class Simulator(Protocol):
         """
         ...
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, Status]:
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
         """Execute one action for a tenth of a second.
 
         Args:
             action: `(8,) float32`: 7 absolute joint targets in rad, gripper −1 closed to 1 open.
+            observe: Whether the images are wanted; without, a simulator need not draw them, and
+                the observation's `images` may be empty. The state is always there.
 
         Raises:
             InvalidOptionError: The action has another shape, or is not finite.

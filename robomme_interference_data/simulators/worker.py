@@ -41,17 +41,21 @@ class RemoteSimulator:
         self._process: Any = None
         self._pipe: Connection | None = None
 
-    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
         """Start an episode; see `Simulator.reset`."""
         self._left = self._episode_s
         if self._process is None:
             self._start()
-        result: tuple[Demonstration, Observation, EpisodeInfo] = self._call("reset", episode_id)
+        result: tuple[Demonstration, Observation, EpisodeInfo] = self._call(
+            "reset", episode_id, demonstration
+        )
         return result
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, Status]:
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
         """Execute one action; see `Simulator.step`."""
-        result: tuple[Observation, Status] = self._call("step", action)
+        result: tuple[Observation, Status] = self._call("step", action, observe)
         return result
 
     def act(self, policy: str) -> NDArray[np.float32]:

@@ -1,6 +1,7 @@
 """The ManiSkill environment behind all nine families."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,9 @@ from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
 from robomme_interference_data.simulators.tabletop.panda import PANDA, draw_low_polygon
 
-__all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
+__all__ = ["CAMERAS", "FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 
+CAMERAS = ("front", "wrist")
 FRONT_EYE = (0.54, 0.0, 0.60)  # m
 FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
 FRONT_VIEW = math.radians(43)
@@ -37,8 +39,9 @@ _GUESS_STREAM = 2_000_003
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
     """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
 
-    `reset` takes the options `difficulty`, and `answer`, the index of the hidden answer to use
-    instead of the seed's own. Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
+    `demonstrated` names the cameras that draw the demonstration. `reset` takes the options
+    `difficulty`, and `answer`, the index of the hidden answer to use instead of the seed's own.
+    Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
 
     Args:
         family: Task family to start with; `family` may be set before a reset.
@@ -51,6 +54,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def __init__(self, family: str = FAMILIES[0], render: bool = True, **options: Any):
         self.family = family
         self.drawing = render
+        self.demonstrated: Sequence[str] = CAMERAS
         self._demonstrating = False
         options.setdefault("obs_mode", "rgb" if render else "none")
         options.setdefault("reward_mode", "sparse")
@@ -145,12 +149,13 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         next(self._scripts[policy], None)  # a script that is through holds its last pose
         return self.arm.action.copy()
 
-    def observe(self) -> Observation:
-        """Return what a policy sees now."""
+    def observe(self, cameras: Sequence[str] = CAMERAS) -> Observation:
+        """Return what a policy sees now, drawing these cameras."""
         images = {}
-        if self.drawing:
+        if self.drawing and cameras:
             self.scene.sub_scenes[0].update_render()
-            for name, sensor in self._sensors.items():
+            for name in cameras:
+                sensor = self._sensors[name]
                 camera = sensor.camera._render_cameras[0]
                 camera.take_picture()
                 images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
@@ -164,7 +169,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def _demonstrate(self) -> Demonstration:
         seen, actions = [], []
         for _ in self.episode.demonstrate(self.arm, self._answer):
-            seen.append(self.observe())
+            seen.append(self.observe(self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
         self.kit.restore()

@@ -1,5 +1,6 @@
 """The embedded suite as a simulator: nine families in one environment, an episode at a time."""
 
+from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -20,7 +21,7 @@ from robomme_interference_data.simulators.base import (
     Observation,
     Status,
 )
-from robomme_interference_data.simulators.tabletop.env import TabletopEnv
+from robomme_interference_data.simulators.tabletop.env import CAMERAS, TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
 
 __all__ = ["TabletopSimulator"]
@@ -34,32 +35,43 @@ class TabletopSimulator:
     Args:
         render: Whether to draw. Without, observations hold no images, and episodes run several
             times as fast: for policies that do not look.
+        cameras: Names of the cameras to draw; fewer are faster.
 
     Raises:
+        UnknownNameError: There is no such camera.
         NoRendererError: No Vulkan device of this machine can render.
     """
 
     name = "tabletop"
 
-    def __init__(self, render: bool = True):
+    def __init__(self, render: bool = True, cameras: Sequence[str] = CAMERAS):
+        for camera in cameras:
+            if camera not in CAMERAS:
+                raise UnknownNameError(
+                    f"the tabletop simulator has no camera {camera!r}", nearest(camera, CAMERAS)
+                )
+        self._cameras = tuple(name for name in CAMERAS if name in cameras)
         _find_renderer()  # sapien wants one even where nothing is drawn
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
         self._env = TabletopEnv(render=render, obs_mode="none")
-        self._env.observe()  # the first picture is slow: shaders are compiled
+        self._env.observe(self._cameras)  # the first picture is slow: shaders are compiled
         self._steps: int | None = None
 
-    def reset(self, episode_id: str) -> tuple[Demonstration, Observation, EpisodeInfo]:
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
         """Start an episode; see `Simulator.reset`."""
         episode = EpisodeId.parse(str(episode_id))
         seed = seed_of(episode)
         self._steps = None
         self._env.family = episode.family
+        self._env.demonstrated = self._cameras if demonstration else ()
         _, info = self._env.reset(seed=seed)
         self._steps = 0
         about = EpisodeInfo(info["goal"], info["goals"], info["difficulty"], seed, self.name)
-        return info["demonstration"], self._env.observe(), about
+        return info["demonstration"], self._env.observe(self._cameras), about
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, Status]:
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
         """Execute one action; see `Simulator.step`."""
         steps = self._running()
         action = np.asarray(action, dtype=np.float32)
@@ -73,7 +85,7 @@ class TabletopSimulator:
         status = self._env.status
         if status is Status.ONGOING and self._steps >= MAX_STEPS:
             status = self._env.status = Status.TIMEOUT
-        return self._env.observe(), status
+        return self._env.observe(self._cameras if observe else ()), status
 
     def act(self, policy: str) -> NDArray[np.float32]:
         """Return the next action of `oracle` or `guess`; see `Simulator.act`."""
