@@ -30,6 +30,10 @@ __all__ = [
     "NoRendererError",
     "MotionError",
     "SimulatorCrashError",
+    # policies
+    "PolicyError",
+    "PolicyServerError",
+    "WireError",
     # helpers
     "nearest",
 ]
@@ -114,6 +118,18 @@ class MotionError(InterferenceError, RuntimeError):
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
     """A simulator's worker process died, or did not answer in time."""
+
+
+class PolicyError(InterferenceError, RuntimeError):
+    """A policy that does not fit the simulator, breaks the order of calls, or gives no action."""
+
+
+class PolicyServerError(InterferenceError, ConnectionError):
+    """A policy server that cannot be reached, reports an error, or does not answer in time."""
+
+
+class WireError(InterferenceError, ValueError):
+    """A message that the protocol of the policy servers cannot carry."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:
