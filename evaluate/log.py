@@ -24,7 +24,16 @@ from robomme_interference_data.files import atomic_path, canonical_json, read_js
 from robomme_interference_data.locks import hold
 from robomme_interference_data.simulators.base import Status
 
-__all__ = ["CSV_NAME", "LOG_NAME", "PARQUET_NAME", "RUN_NAME", "RunLog", "open_log", "read_log", "summary"]
+__all__ = [
+    "CSV_NAME",
+    "LOG_NAME",
+    "PARQUET_NAME",
+    "RUN_NAME",
+    "RunLog",
+    "open_log",
+    "read_log",
+    "summary",
+]
 
 LOG_NAME = "rollouts.jsonl"
 PARQUET_NAME = "rollouts.parquet"
@@ -130,7 +139,11 @@ def open_log(folder: Path, identity: Mapping[str, Any], resume: bool = True) -> 
     with hold(folder / ".lock", busy):
         path = folder / RUN_NAME
         if not path.exists():
-            header = {"format_version": LOG_VERSION, "identity": dict(identity), "plans": []}
+            header: dict[str, Any] = {
+                "format_version": LOG_VERSION,
+                "identity": dict(identity),
+                "plans": [],
+            }
             log = RunLog(folder, header, {})
             log.write_header()
         else:

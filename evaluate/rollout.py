@@ -1,7 +1,7 @@
 """One rollout: reset, feed the history that the condition prescribes, then the live loop."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -80,7 +80,7 @@ class _Clock:
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def part(self, name: str) -> Any:
+    def part(self, name: str) -> Iterator[None]:
         began = time.perf_counter()
         try:
             yield
@@ -151,12 +151,13 @@ def run_rollout(
             )
         )
         if buffer is not None:
-            for chunk in buffer.stream(config.history_chunk, policy.cameras, start, stop):
+            for chunk in buffer.stream(config.history_chunk, policy.history_cameras, start, stop):
                 policy.add_history(chunk.frames, chunk.states, stop - start)
     status, steps = _live(policy, simulator, first, info.goal, clock, watcher)
     if status is Status.ERROR:
         raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
     lesson = 0 if buffer is None else _lesson_frames(buffer, start, stop)
+    times: dict[str, Any] = {name: round(value, 4) for name, value in clock.seconds.items()}
     return Rollout(
         **base_row(config, item),
         seed=info.seed,
@@ -169,7 +170,7 @@ def run_rollout(
         lesson_frames=lesson,
         lesson_share=None if buffer is None else _share(buffer, start, stop),
         **_retrieval_columns(selector, chosen),
-        **{name: round(seconds, 4) for name, seconds in clock.seconds.items()},
+        **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
 

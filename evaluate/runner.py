@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    UnknownNameError,
-    nearest,
+from robomme_interference_data.evaluate.checks import (
+    applicable,
+    check_plan,
+    check_settings,
+    describe_policy,
 )
 from robomme_interference_data.evaluate.config import RunConfig, identity, provenance
 from robomme_interference_data.evaluate.log import RunLog, open_log, summary
@@ -21,19 +22,12 @@ from robomme_interference_data.evaluate.plan import (
     plan_work,
     select_families,
 )
-from robomme_interference_data.evaluate.policies.registry import (
-    check_workers,
-    default_system,
-    make_policy,
-)
+from robomme_interference_data.evaluate.policies.registry import default_system
 from robomme_interference_data.evaluate.rollout import base_row
-from robomme_interference_data.evaluate.rows import KEY_COLUMNS, NO_HISTORY, Rollout
-from robomme_interference_data.evaluate.systems import check_condition, check_history, name_system
-from robomme_interference_data.evaluate.worker import RolloutWorker, error_row, make_selector
-from robomme_interference_data.ids import condition_name
-from robomme_interference_data.loader import Split, load_split
+from robomme_interference_data.evaluate.rows import KEY_COLUMNS, Rollout
+from robomme_interference_data.evaluate.worker import RolloutWorker, error_row
+from robomme_interference_data.loader import load_split
 from robomme_interference_data.simulators.base import Status
-from robomme_interference_data.simulators.registry import SIMULATORS
 from robomme_interference_data.workers import Outcome, run_tasks
 
 __all__ = ["Listener", "RunResult", "run_evaluation"]
@@ -79,7 +73,7 @@ def run_evaluation(
     out: str | Path,
     *,
     simulator: str = "tabletop",
-    conditions: Sequence[str] = (NO_HISTORY, "k0", "k1", "k3", "k7"),
+    conditions: Sequence[str] | None = None,
     families: Sequence[str] = ("all",),
     episodes: str = "0-49",
     episode_split: str = "test",
@@ -110,7 +104,8 @@ def run_evaluation(
         split: Folder of the split of buffers.
         out: Folder of the run.
         simulator: `tabletop`, `robomme`, or `module:function` of your own.
-        conditions: `no-history`, `k0`, `k1`, …
+        conditions: `no-history`, `k0`, `k1`, …; None for all that the split has and the system
+            takes.
         families: Task families, or `all`.
         episodes: Indices, such as `0-49` or `0,3,10-12`; ends are included.
         episode_split: `train`, `val` or `test`.
@@ -159,17 +154,18 @@ def run_evaluation(
         history_chunk=history_chunk,
         max_errors=max_errors,
     )
+    about = describe_policy(config)
+    check_settings(config, opened, about)
     plan = plan_work(
         opened.episode_ids,
         episode_split=episode_split,
         families=select_families(families, opened.families),
         episodes=parse_episodes(episodes),
-        conditions=conditions,
+        conditions=applicable(config, opened, about) if conditions is None else conditions,
     )
-    _check(config, opened, plan)
-    about = _check_policy(config, opened, conditions)
+    check_plan(config, opened, about, plan)
     with open_log(Path(out), identity(config), resume) as log:
-        log.write_header(policy=about, status="running", **provenance(list(command)))
+        log.write_header(policy=about.metadata, status="running", **provenance(list(command)))
         log.header["plans"] = [*log.header["plans"], _plan_of(plan)]
         log.write_header()
         return _run(config, plan, log, listener)
@@ -190,7 +186,7 @@ def _run(
     written = time.monotonic()
     errors = 0
     outcomes = run_tasks(
-        RolloutWorker(config), todo, workers=config.workers, time_limit=config.rollout_s
+        RolloutWorker(config, log.folder), todo, workers=config.workers, time_limit=config.rollout_s
     )
     try:
         for outcome in outcomes:
@@ -244,67 +240,3 @@ def _plan_of(plan: Sequence[WorkItem]) -> dict[str, object]:
         "episodes": sorted({item.episode.index for item in plan}),
         "conditions": list(dict.fromkeys(item.condition for item in plan)),
     }
-
-
-def _check(config: RunConfig, split: Split, plan: Sequence[WorkItem]) -> None:
-    """Check all that can be known without a policy or a simulator."""
-    if config.simulator not in SIMULATORS and ":" not in config.simulator:
-        raise UnknownNameError(
-            f"there is no simulator {config.simulator!r}", nearest(config.simulator, SIMULATORS)
-        )
-    for name in ("workers", "history_chunk", "max_errors", "rollout_s"):
-        if getattr(config, name) <= 0:
-            raise InvalidOptionError(f"{name} {getattr(config, name)}; expected more than 0")
-    check_workers(config.policy, config.workers)
-    system = name_system(config.system)
-    for condition in dict.fromkeys(item.condition for item in plan):
-        check_condition(system, condition)
-        planned = [NO_HISTORY, *(condition_name(k) for k in split.k_values)]
-        if condition not in planned:
-            raise UnknownNameError(
-                f"the split has no buffers for {condition}; it has {', '.join(planned)}",
-                "Plan them: robomme-interference build manifests … --k 0 1 3 7",
-            )
-    for item in plan:
-        manifest = split.manifest(item.episode, item.k or split.k_values[0])
-        if manifest.simulator not in (None, config.simulator):
-            raise InvalidOptionError(
-                f"{item.episode} was recorded on the simulator {manifest.simulator!r}, the run "
-                f"is on {config.simulator!r}",
-                f"Give --simulator {manifest.simulator}, or a split of {config.simulator}.",
-            )
-        if item.k is not None:
-            check_history(system, manifest)
-    if config.retrieval is not None and not system.retrieval and system.paper:
-        raise InvalidOptionError(
-            f"system {system.name} has no retrieval step, and --retrieval puts one in front",
-            "Leave out one of the two, or give a --system of your own.",
-        )
-
-
-def _check_policy(
-    config: RunConfig, split: Split, conditions: Sequence[str]
-) -> dict[str, object]:
-    """Make the policy once, check what it wants, and return what it says of itself."""
-    policy = make_policy(config.policy, memory=config.memory)
-    try:
-        buffer = split.load(split.episode_ids[0], split.k_values[0])
-        missing = [name for name in policy.cameras if name not in buffer.cameras]
-        if missing and policy.wants_history:
-            raise InvalidOptionError(
-                f"the policy wants the camera {missing[0]!r}; the split has "
-                f"{', '.join(buffer.cameras)}",
-                "Build the split with that camera (build … --cameras), or take another policy.",
-            )
-        beyond = [name for name in conditions if name != NO_HISTORY]
-        if beyond and not policy.wants_history:
-            raise InvalidOptionError(
-                f"the policy {config.policy} takes no history, so {beyond[0]} says nothing of it",
-                f"Give --conditions {NO_HISTORY}.",
-            )
-        if config.retrieval is not None:
-            make_selector(config)
-        return dict(policy.metadata())
-    finally:
-        policy.close()
-

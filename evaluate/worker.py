@@ -1,6 +1,8 @@
 """What a worker process of a run does: one rollout after the other."""
 
+import dataclasses
 import traceback
+from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import InterferenceError
@@ -26,10 +28,12 @@ class RolloutWorker:
 
     Args:
         config: The run.
+        out: The run's folder, for videos.
     """
 
-    def __init__(self, config: RunConfig):
+    def __init__(self, config: RunConfig, out: Path):
         self.config = config
+        self._out = out
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._split: Split | None = None
@@ -58,18 +62,17 @@ class RolloutWorker:
         }
         if not self.config.videos:
             return run_rollout(self.config, item, **parts)
-        from robomme_interference_data.evaluate.videos import record_rollout
+        from robomme_interference_data.evaluate.videos import record_rollout, video_name
 
-        return record_rollout(self.config, item, **parts)
+        row = record_rollout(self.config, item, self._out, **parts)
+        return dataclasses.replace(row, video=video_name(item))
 
     def _prepare(self) -> None:
         config = self.config
         if self._split is None:
             self._split = load_split(config.split, threads=1)
         if self._policy is None:
-            self._policy = make_policy(
-                config.policy, memory=config.memory, worker=worker_number()
-            )
+            self._policy = make_policy(config.policy, memory=config.memory, worker=worker_number())
         if self._selector is None and config.retrieval is not None:
             self._selector = make_selector(config)
         if self._simulator is None:

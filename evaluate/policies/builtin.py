@@ -21,6 +21,7 @@ class _Blind:
     """Takes whatever it is given and keeps nothing of it."""
 
     cameras: tuple[str, ...] = ()
+    history_cameras: tuple[str, ...] = ()
     wants_history = True
     every_frame = False
     privileged = False
@@ -28,9 +29,7 @@ class _Blind:
     def __init__(self, name: str):
         self.name = name
 
-    def add_history(
-        self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int
-    ) -> None:
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         """Forget it."""
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:

@@ -21,7 +21,7 @@ from robomme_interference_data.simulators.base import Observation
 __all__ = ["MEMORIES", "ReplayPolicy", "follow"]
 
 MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
-    "full": lambda live: range(live),
+    "full": range,
     "framesamp": lambda live: even_sample(live)[:-1],
     "window": lambda live: range(max(0, live - SAMPLE_FRAMES + 1), live),
 }
@@ -55,7 +55,8 @@ class ReplayPolicy:
         UnknownNameError: There is no such memory rule.
     """
 
-    cameras = ("front",)
+    cameras: tuple[str, ...] = ("front",)
+    history_cameras: tuple[str, ...] = ("front",)
     wants_history = True
     privileged = False
     every_frame = False
@@ -77,9 +78,7 @@ class ReplayPolicy:
         self._plan: NDArray[np.float32] | None = None
         self._done = 0
 
-    def add_history(
-        self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int
-    ) -> None:
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         """Take frames into memory. What the rule keeps depends on how many follow."""
         self._views.append(thumbnails(frames["front"]))
         self._states.append(np.array(states, np.float32))
