@@ -12,7 +12,11 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.policies.registry import check_workers, make_policy
+from robomme_interference_data.evaluate.policies.registry import (
+    check_workers,
+    make_policy,
+    parse_policy,
+)
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.systems import (
     System,
@@ -44,8 +48,10 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
     Raises:
         InterferenceError: It cannot be made, or its server cannot be reached.
     """
-    check_workers(config.policy, config.workers)
-    policy = make_policy(config.policy, memory=config.memory)
+    check_workers(parse_policy(config.policy), config.workers)
+    policy = make_policy(
+        config.policy, **({} if config.memory is None else {"memory": config.memory})
+    )
     try:
         return PolicyTraits(
             tuple(policy.history_cameras),

@@ -72,7 +72,8 @@ class RolloutWorker:
         if self._split is None:
             self._split = load_split(config.split, threads=1)
         if self._policy is None:
-            self._policy = make_policy(config.policy, memory=config.memory, worker=worker_number())
+            options = {} if config.memory is None else {"memory": config.memory}
+            self._policy = make_policy(config.policy, worker=worker_number(), **options)
         if self._selector is None and config.retrieval is not None:
             self._selector = make_selector(config)
         if self._simulator is None:
