@@ -30,10 +30,12 @@ __all__ = [
     "NoRendererError",
     "MotionError",
     "SimulatorCrashError",
-    # policies
+    # evaluation
     "PolicyError",
     "PolicyServerError",
     "WireError",
+    "RolloutError",
+    "RunFolderError",
     # helpers
     "nearest",
 ]
@@ -121,7 +123,7 @@ class SimulatorCrashError(InterferenceError, RuntimeError):
 
 
 class PolicyError(InterferenceError, RuntimeError):
-    """A policy that does not fit the simulator, breaks the order of calls, or gives no action."""
+    """A policy that does not fit, breaks, is called out of order, or answers what it may not."""
 
 
 class PolicyServerError(InterferenceError, ConnectionError):
@@ -130,6 +132,14 @@ class PolicyServerError(InterferenceError, ConnectionError):
 
 class WireError(InterferenceError, ValueError):
     """A message that the protocol of the policy servers cannot carry."""
+
+
+class RolloutError(InterferenceError, RuntimeError):
+    """A rollout that cannot be run as planned: simulator and data contradict each other."""
+
+
+class RunFolderError(InterferenceError, FileExistsError):
+    """A run's folder that holds another run, or that another process is writing."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:

@@ -9,6 +9,7 @@ class Still:
     """Holds every joint at zero."""
 
     cameras: Any = ("front",)
+    history_cameras: Any = ()
     wants_history = False
     privileged = False
     every_frame = False

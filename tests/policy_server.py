@@ -110,9 +110,6 @@ class Memory:
             assert live == 1, f"{live} live frames before the first answer"
         else:
             assert 0 < self._fresh <= LIVE, f"{self._fresh} frames since the last answer"
-        return self.answer(message)
-
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
         image, wrist = message["observation/image"], message["observation/wrist_image"]
         state, prompt = message["observation/state"], message["prompt"]
         for picture in (image, wrist):
@@ -124,16 +121,6 @@ class Memory:
         actions = np.tile(state.astype(np.float64), (CHUNK, 1))
         actions[:, 7] = 1.0 if state[7] > 0.02 else -1.0  # 0 to 0.04 m open; -1 closes
         return {"state": state, "actions": actions, "infer_time_ms": 1.0}
-
-
-class NoMemory(Memory):
-    """A server without a memory: frames that it is sent make no difference."""
-
-    def add_buffer(self, message: dict[str, Any]) -> None:
-        pass
-
-    def infer(self, message: dict[str, Any]) -> dict[str, Any]:
-        return self.answer(message)
 
 
 class PolicyServer:
@@ -255,10 +242,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Serve a policy that holds still.")
     parser.add_argument("--port", type=int, default=0, help="0: any free one; it is printed")
     parser.add_argument("--log", type=Path, help="file that gets a JSON line for each call")
-    parser.add_argument("--memoryless", action="store_true", help="keep no memory")
     options = parser.parse_args()
-    memory = NoMemory() if options.memoryless else Memory(keep=False)
-    server = PolicyServer(memory, port=options.port, log=options.log)
+    server = PolicyServer(Memory(keep=False), port=options.port, log=options.log)
 
     def tell() -> None:
         sys.stdout.write(f"{server.url}\n")

@@ -108,14 +108,14 @@ def test_each_worker_has_a_server() -> None:
 
 
 def test_options_reach_the_policy() -> None:
-    server: Any = make_policy("websocket://a:1", memoryless=True)
-    assert not server.wants_history
+    server: Any = make_policy("websocket://a:1", chunk_frames=5)
+    assert server._chunk == 5
     policy: Any = make_policy("python:own_policies:still", gripper=-1)
     assert policy.action[0, 7] == -1
     with pytest.raises(InvalidOptionError, match="unexpected keyword argument 'memory'") as raised:
         make_policy("websocket://a:1", memory="full")
     assert raised.value.hint == (
-        "Its options: memoryless, chunk_frames, connect_s, response_s, attempts, backoff_s."
+        "Its options: chunk_frames, connect_s, response_s, attempts, backoff_s."
     )
     with pytest.raises(InvalidOptionError, match="missing a required argument: 'gripper'"):
         make_policy("python:own_policies:still")
@@ -134,7 +134,11 @@ def test_a_factory_that_asks_is_told_its_worker() -> None:
         ("python:own_policies.deeper:make", UnknownNameError, "no module 'own_policies.deeper'"),
         ("python:own_policies:stil", UnknownNameError, "Did you mean 'still'"),
         ("python:own_policies:NUMBER", UnknownNameError, "has no function 'NUMBER'"),
-        ("python:own_policies:nothing", PolicyError, "object has no cameras, wants_history"),
+        (
+            "python:own_policies:nothing",
+            PolicyError,
+            "object has no cameras, history_cameras, wants_history",
+        ),
         ("python:own_policies:nothing", PolicyError, "reset(), add_history()"),
         ("python:own_policies:all_cameras", PolicyError, "cameras ('front', 'top')"),
         ("python:own_policies:one_camera", PolicyError, "Expected a tuple"),

@@ -16,7 +16,7 @@ import policy_server
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policy_server import Memory, NoMemory, PolicyServer
+from policy_server import Memory, PolicyServer
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
@@ -177,15 +177,6 @@ def test_the_metadata_is_what_the_server_says(server: PolicyServer) -> None:
     rollout(policy, 0, [], [])
     policy.close()
     assert server.connections == 1
-
-
-def test_a_server_without_memory_is_sent_none() -> None:
-    with PolicyServer(NoMemory()).running() as server:
-        policy = client(server, memoryless=True)
-        assert (policy.wants_history, policy.every_frame) == (False, False)
-        rollout(policy, 0, [], [1])
-        policy.close()
-        assert server.calls == [RESET, INFER, INFER]
 
 
 def test_a_second_rollout_starts_from_nothing(server: PolicyServer) -> None:

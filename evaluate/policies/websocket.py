@@ -22,12 +22,11 @@ class WebsocketPolicy:
     """A policy server, by host and port.
 
     The seed of a rollout means nothing to a server: it was started with a seed of its own, to
-    which it returns at every reset.
+    which it returns at every reset. A server without a memory ignores the frames that it is sent.
 
     Args:
         host: Name or address of the server.
         port: Its port.
-        memoryless: The server keeps no memory (`pi05_baseline`), so it is sent none.
         chunk_frames: Most frames in a message. 16 is what a live message carries too: a server
             that compiles for each length (JAX) then compiles no further ones for the history.
         connect_s: Most seconds that one attempt to connect may take.
@@ -38,14 +37,16 @@ class WebsocketPolicy:
     """
 
     cameras = ("front", "wrist")
+    history_cameras = ("front",)
+    wants_history = True
     privileged = False
+    every_frame = True
 
     def __init__(
         self,
         host: str,
         port: int,
         *,
-        memoryless: bool = False,
         chunk_frames: int = 16,
         connect_s: float = 10.0,
         response_s: float = 600.0,
@@ -57,7 +58,6 @@ class WebsocketPolicy:
                 f"chunk_frames {chunk_frames}, attempts {attempts}, connect_s {connect_s}, "
                 f"response_s {response_s}, backoff_s {backoff_s}: expected positive numbers"
             )
-        self.wants_history = self.every_frame = not memoryless
         self._chunk = chunk_frames
         self._server = ServerConnection(
             host,
@@ -95,8 +95,6 @@ class WebsocketPolicy:
             PolicyError: Frames and states do not fit, or another length was announced.
             PolicyServerError: The server reports an error, or is gone.
         """
-        if not self.wants_history:
-            return
         images = check_frames(frames, states, "front")
         if self._live or exec_start_idx != self._history:
             raise PolicyError(
@@ -119,8 +117,6 @@ class WebsocketPolicy:
             PolicyError: Frames and states do not fit, or history is missing.
             PolicyServerError: The server reports an error, or is gone.
         """
-        if not self.wants_history:
-            return
         images = check_frames(frames, states, "front")
         if self._live:
             self._send(images, states)
