@@ -152,15 +152,24 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
     ("given", "taken"),
     [
         ([], []),
-        (["--k", "0", "1", "3"], ["--k", "0", "--k", "1", "--k", "3"]),
-        (["--k", "0"], ["--k", "0"]),
-        (["--k"], ["--k"]),
-        (["--k", "0", "1", "--seed", "5"], ["--k", "0", "--k", "1", "--seed", "5"]),
-        (["--seed", "5", "6"], ["--seed", "5", "6"]),
-        (["--k", "0", "--k", "1", "2"], ["--k", "0", "--k", "1", "--k", "2"]),
-        (["--k", "1", "x", "2"], ["--k", "1", "x", "2"]),
-        (["--k", "-1", "2"], ["--k", "-1", "--k", "2"]),
-        (["--k=0", "1"], ["--k=0", "1"]),
+        (["build", "--k", "0", "1", "3"], ["build", "--k", "0", "--k", "1", "--k", "3"]),
+        (["build", "--k", "0"], ["build", "--k", "0"]),
+        (["build", "--k"], ["build", "--k"]),
+        (
+            ["build", "--k", "0", "1", "--seed", "5"],
+            ["build", "--k", "0", "--k", "1", "--seed", "5"],
+        ),
+        (["build", "--seed", "5", "6"], ["build", "--seed", "5", "6"]),
+        (
+            ["build", "--k", "0", "--k", "1", "2"],
+            ["build", "--k", "0", "--k", "1", "--k", "2"],
+        ),
+        (["build", "--k=0", "1"], ["build", "--k=0", "1"]),
+        (["list", "--k", "0", "1"], ["list", "--k", "0", "1"]),
+        (
+            ["evaluate", "--conditions", "no-history", "k7", "--families", "A", "--out", "x"],
+            "evaluate --conditions no-history --conditions k7 --families A --out x".split(),
+        ),
     ],
 )
 def test_spread(given: list[str], taken: list[str]) -> None:
