@@ -105,7 +105,7 @@ def typical_cosine(embeddings: NDArray[np.float16]) -> float:
     indices = [j * (len(embeddings) - 1) // (count - 1) for j in range(count)]
     sample = embeddings[indices].astype(np.float32)
     pairs = (sample @ sample.T)[np.triu_indices(count, 1)]
-    return float(np.round(np.median(pairs), 4))
+    return round(float(np.median(pairs)), 4)
 
 
 def adaptive_threshold(typical: float) -> float:

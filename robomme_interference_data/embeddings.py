@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data import parquet
 from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
     FORMAT_VERSION,
     INDEX_CENTRE,
     INDEX_DIR,
@@ -88,7 +90,9 @@ class EmbeddingIndex:
     def __init__(self, files: Files, revision: str, encoder: str):
         self._files = files
         self._folder = index_folder(encoder)
-        self._remedy = f"Type: robomme-interference index --data {self._root} --encoder {encoder}"
+        self._remedy = (
+            f"Type: robomme-interference index --data {_data_of(self._root)} --encoder {encoder}"
+        )
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
@@ -208,3 +212,9 @@ class EmbeddingIndex:
                 f"It is damaged: make it again. {self._remedy}",
             )
         return array
+
+
+def _data_of(root: str) -> str:
+    """Return the split that a dataset belongs to, as both are indexed together; else itself."""
+    path = PurePath(root)
+    return str(path.parent) if path.name in (DEMONSTRATIONS, DISTRACTORS) else root

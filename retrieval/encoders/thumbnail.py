@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.errors import InvalidOptionError
+
 __all__ = ["Thumbnail"]
 
 CELLS = 8
@@ -37,13 +39,16 @@ class Thumbnail:
     def prepare(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features, `(N, 528) float32`: colours from 0 to 1, then differences."""
         height, width = images.shape[1:3]
-        rows, columns = _overlaps(height), _overlaps(width)
-        sums = np.empty((len(images), CELLS, CELLS, 3))
-        # Products and sums of integers below 2⁵³: exact in float64, in whatever order.
-        for number, image in enumerate(images):
-            bands = rows @ image.reshape(height, -1).astype(np.float64)
-            sums[number] = np.tensordot(bands.reshape(CELLS, width, 3), columns, (1, 1)).swapaxes(1, 2)
-        colours = sums / (255 * height * width)
+        if min(height, width) < CELLS:
+            raise InvalidOptionError(
+                f"images of {height} × {width} pixels; thumbnail needs {CELLS} × {CELLS} or more"
+            )
+        rows, columns = _edges(height), _edges(width)
+        # Sums of integers: exact, in whatever order.
+        bands = np.add.reduceat(images, rows[:-1], axis=1, dtype=np.uint32)
+        sums = np.add.reduceat(bands, columns[:-1], axis=2)
+        pixels = np.diff(rows)[:, None, None] * np.diff(columns)[None, :, None]
+        colours = sums / (255 * pixels)
         right = np.diff(colours, axis=2)
         below = np.diff(colours, axis=1)
         parts = [part.reshape(len(images), -1) for part in (colours, right, below)]
@@ -54,10 +59,6 @@ class Thumbnail:
         return prepared
 
 
-def _overlaps(pixels: int) -> NDArray[np.float64]:
-    """Return how much each pixel of a side lies in each cell, `(8, pixels)`, in 1/8 pixels."""
-    edges = np.arange(CELLS + 1) * pixels
-    starts = np.arange(pixels) * CELLS
-    upper = np.minimum(edges[1:, None], starts + CELLS)
-    lower = np.maximum(edges[:-1, None], starts)
-    return np.maximum(upper - lower, 0).astype(np.float64)
+def _edges(pixels: int) -> NDArray[np.int64]:
+    """Return the first pixel of each cell of a side, and the end, `(9,)`."""
+    return np.arange(CELLS + 1) * pixels // CELLS
