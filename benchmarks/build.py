@@ -27,7 +27,7 @@ from robomme_interference_data.build_dataset.encode import (
     get_codec,
 )
 from robomme_interference_data.build_dataset.plan import PlannedEpisode, plan_dataset
-from robomme_interference_data.build_dataset.progress import BuildProgress
+from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.sources.base import Frame, Source, SourceEpisode

@@ -22,7 +22,7 @@ from robomme_interference_data.build_dataset.plan import (
     plan_dataset,
     select,
 )
-from robomme_interference_data.build_dataset.progress import BuildProgress
+from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.build_dataset.sources.base import Source, SourceEpisode
 from robomme_interference_data.build_dataset.stage import (
     StagedEpisode,

@@ -218,7 +218,7 @@ def sample(
     test: Annotated[int, typer.Option(help="Test episodes of each family.")] = 1,
 ) -> None:
     """Record a small made-up sample, to try everything: --source frames:OUT."""
-    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.progress import BuildProgress
     from robomme_interference_data.build_dataset.sample import write_sample
     from robomme_interference_data.constants import FAMILIES
 
@@ -242,7 +242,7 @@ def _build(
     from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
     from robomme_interference_data.build_dataset.encode import get_codec
     from robomme_interference_data.build_dataset.plan import parse_ranges
-    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.progress import BuildProgress
     from robomme_interference_data.build_dataset.sources import open_source
     from robomme_interference_data.simulators.registry import SIMULATORS
 
@@ -306,7 +306,7 @@ def _record(
     settings: "Settings",
 ) -> "Source | None":
     """Play the wanted episodes of a simulator; None if the dataset of them is there already."""
-    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.progress import BuildProgress
     from robomme_interference_data.build_dataset.record import (
         RecordedSource,
         check_unbuilt,
@@ -347,7 +347,7 @@ def _manifests(
     as_json: bool,
 ) -> None:
     from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-    from robomme_interference_data.build_dataset.progress import BuildProgress
+    from robomme_interference_data.progress import BuildProgress
     from robomme_interference_data.dataset import Dataset
     from robomme_interference_data.files import LocalFiles, read_json
 

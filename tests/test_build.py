@@ -16,7 +16,7 @@ from recordings import MemorySource, build, contents, listed, opened, run_here
 from robomme_interference_data.build_dataset import build as build_module
 from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
 from robomme_interference_data.build_dataset.encode import CODECS
-from robomme_interference_data.build_dataset.progress import BuildProgress
+from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.errors import (
     BuildError,
     InvalidOptionError,

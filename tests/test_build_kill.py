@@ -17,7 +17,7 @@ from recordings import contents
 
 from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
 from robomme_interference_data.build_dataset.encode import CODECS
-from robomme_interference_data.build_dataset.progress import BuildProgress
+from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.stage import read_staged
