@@ -49,9 +49,8 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
         InterferenceError: It cannot be made, or its server cannot be reached.
     """
     check_workers(parse_policy(config.policy), config.workers)
-    policy = make_policy(
-        config.policy, **({} if config.memory is None else {"memory": config.memory})
-    )
+    options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
+    policy = make_policy(config.policy, **options)
     try:
         return PolicyTraits(
             tuple(policy.history_cameras),
@@ -75,7 +74,10 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
     for setting in ("workers", "history_chunk", "max_errors", "rollout_s"):
         if getattr(config, setting) <= 0:
-            raise InvalidOptionError(f"{setting} {getattr(config, setting)}; expected more than 0")
+            raise InvalidOptionError(
+                f"{setting} {getattr(config, setting)}; expected more than 0",
+                "Leave it out for the default.",
+            )
     if policy.privileged and name == "robomme":
         raise InvalidOptionError(
             f"the policy {config.policy} asks the simulator for actions, and robomme gives none",

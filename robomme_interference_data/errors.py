@@ -22,6 +22,9 @@ __all__ = [
     "HashMismatchError",
     "TruncatedVideoError",
     "SourceError",
+    "MissingIndexError",
+    "StaleIndexError",
+    "MissingWeightsError",
     # what was to be written
     "BuildError",
     "PoolTooSmallError",
@@ -96,6 +99,18 @@ class TruncatedVideoError(InterferenceError, ValueError):
 
 class SourceError(InterferenceError, ValueError):
     """Recorded episodes that cannot be used as they are."""
+
+
+class MissingIndexError(InterferenceError, FileNotFoundError):
+    """A dataset without the embeddings that are asked for."""
+
+
+class StaleIndexError(InterferenceError, ValueError):
+    """Embeddings that were made of other data, or with another encoder, than is asked for."""
+
+
+class MissingWeightsError(InterferenceError, FileNotFoundError):
+    """The weights of a model are not on this machine."""
 
 
 class BuildError(InterferenceError, RuntimeError):
