@@ -113,7 +113,7 @@ class MotionError(InterferenceError, RuntimeError):
 
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
-    """A simulator's worker process died, or did not answer in time."""
+    """A simulator broke: its process died or did not answer in time, or it says so itself."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:
