@@ -22,6 +22,9 @@ __all__ = [
     "HashMismatchError",
     "TruncatedVideoError",
     "SourceError",
+    "MissingIndexError",
+    "StaleIndexError",
+    "MissingWeightsError",
     # what was to be written
     "BuildError",
     "PoolTooSmallError",
@@ -30,6 +33,12 @@ __all__ = [
     "NoRendererError",
     "MotionError",
     "SimulatorCrashError",
+    # evaluation
+    "PolicyError",
+    "PolicyServerError",
+    "WireError",
+    "RolloutError",
+    "RunFolderError",
     # helpers
     "nearest",
 ]
@@ -92,6 +101,18 @@ class SourceError(InterferenceError, ValueError):
     """Recorded episodes that cannot be used as they are."""
 
 
+class MissingIndexError(InterferenceError, FileNotFoundError):
+    """A dataset without the embeddings that are asked for."""
+
+
+class StaleIndexError(InterferenceError, ValueError):
+    """Embeddings that were made of other data, or with another encoder, than is asked for."""
+
+
+class MissingWeightsError(InterferenceError, FileNotFoundError):
+    """The weights of a model are not on this machine."""
+
+
 class BuildError(InterferenceError, RuntimeError):
     """A build that cannot go on."""
 
@@ -114,6 +135,26 @@ class MotionError(InterferenceError, RuntimeError):
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
     """A simulator broke: its process died or did not answer in time, or it says so itself."""
+
+
+class PolicyError(InterferenceError, RuntimeError):
+    """A policy that does not fit, breaks, is called out of order, or answers what it may not."""
+
+
+class PolicyServerError(InterferenceError, ConnectionError):
+    """A policy server that cannot be reached, reports an error, or does not answer in time."""
+
+
+class WireError(InterferenceError, ValueError):
+    """A message that the protocol of the policy servers cannot carry."""
+
+
+class RolloutError(InterferenceError, RuntimeError):
+    """A rollout that cannot be run as planned: simulator and data contradict each other."""
+
+
+class RunFolderError(InterferenceError, FileExistsError):
+    """A run's folder that holds another run, or that another process is writing."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:
