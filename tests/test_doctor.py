@@ -80,6 +80,7 @@ def test_this_environment_has_all_that_is_needed() -> None:
         "OpenCV",
         "Simulator [sim]",
         "Vulkan",
+        "Official simulator",
         "Retrieval [retrieval]",
         "Score [score]",
         "Hub token",
