@@ -48,11 +48,30 @@ class Watcher(Protocol):
 class Selection(Protocol):
     """The span that a retrieval step chose; see `retrieval.selector.Selection`."""
 
-    start: int
-    stop: int
-    lesson_fraction: float
-    filler_fraction: float
-    query_fraction: float
+    @property
+    def start(self) -> int:
+        """First frame in the buffer."""
+        ...
+
+    @property
+    def stop(self) -> int:
+        """Frame after the last one."""
+        ...
+
+    @property
+    def lesson_fraction(self) -> float:
+        """Share of lesson frames in an even sample of the span and what is seen now."""
+        ...
+
+    @property
+    def filler_fraction(self) -> float:
+        """The same for frames of other sessions."""
+        ...
+
+    @property
+    def query_fraction(self) -> float:
+        """The same for what is seen now."""
+        ...
 
 
 class Selector(Protocol):

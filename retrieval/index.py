@@ -146,9 +146,7 @@ class _Work:
 
     def holding(self) -> Any:
         self.parts.mkdir(parents=True, exist_ok=True)
-        busy = BuildError(
-            f"another process makes {self.folder}", "Wait for it to end, or stop it."
-        )
+        busy = BuildError(f"another process makes {self.folder}", "Wait for it to end, or stop it.")
         return hold(self.parts / "lock", busy)
 
     def is_done(self) -> bool:
@@ -315,4 +313,3 @@ def _mean(works: Sequence[_Work]) -> NDArray[np.float32]:
             total = total + features.sum(axis=0, dtype=np.float64)
             count += len(features)
     return np.asarray(total / count, np.float32)
-

@@ -54,9 +54,7 @@ def cosines(
     return np.round(out, _DIGITS)
 
 
-def adjacent_cosines(
-    embeddings: NDArray[np.float16], block: int = _BLOCK
-) -> NDArray[np.float32]:
+def adjacent_cosines(embeddings: NDArray[np.float16], block: int = _BLOCK) -> NDArray[np.float32]:
     """Return the cosine of each frame with the next, `(T - 1,) float32`, in bounded memory.
 
     Args:

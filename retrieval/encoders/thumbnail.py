@@ -28,7 +28,7 @@ class Thumbnail:
     name = "thumbnail"
     centred = True
     batch = 64
-    threshold = None
+    threshold: float | None = None
     computed_in = "numpy"
 
     @property
