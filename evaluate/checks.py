@@ -12,7 +12,11 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.policies.registry import check_workers, make_policy
+from robomme_interference_data.evaluate.policies.registry import (
+    check_workers,
+    make_policy,
+    parse_policy,
+)
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.systems import (
     System,
@@ -44,8 +48,9 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
     Raises:
         InterferenceError: It cannot be made, or its server cannot be reached.
     """
-    check_workers(config.policy, config.workers)
-    policy = make_policy(config.policy, memory=config.memory)
+    check_workers(parse_policy(config.policy), config.workers)
+    options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
+    policy = make_policy(config.policy, **options)
     try:
         return PolicyTraits(
             tuple(policy.history_cameras),
@@ -69,7 +74,10 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
     for setting in ("workers", "history_chunk", "max_errors", "rollout_s"):
         if getattr(config, setting) <= 0:
-            raise InvalidOptionError(f"{setting} {getattr(config, setting)}; expected more than 0")
+            raise InvalidOptionError(
+                f"{setting} {getattr(config, setting)}; expected more than 0",
+                "Leave it out for the default.",
+            )
     if policy.privileged and name == "robomme":
         raise InvalidOptionError(
             f"the policy {config.policy} asks the simulator for actions, and robomme gives none",

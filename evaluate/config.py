@@ -1,6 +1,7 @@
 """What a run is: its settings, which of them make it that run, and the header that says so."""
 
 import platform
+import re
 import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -8,10 +9,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import RunFolderError
+from robomme_interference_data.errors import InvalidOptionError, RunFolderError
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION
 
-__all__ = ["IDENTITY", "RunConfig", "check_same_run", "identity", "provenance"]
+__all__ = [
+    "IDENTITY",
+    "RunConfig",
+    "check_same_run",
+    "default_system",
+    "identity",
+    "provenance",
+]
 
 IDENTITY = (
     "system",
@@ -75,6 +83,26 @@ class RunConfig:
 
 EXECUTION = tuple(f.name for f in fields(RunConfig) if f.name not in IDENTITY)
 """Settings of how a run is carried out: a run may be resumed with others."""
+
+
+def default_system(policy: str, memory: str | None, retrieval: bool) -> str:
+    """Return the name under which rows stand if none is given.
+
+    Raises:
+        InvalidOptionError: The policy does not say which system it is.
+    """
+    kind, _, target = policy.partition(":")
+    if kind == "websocket":
+        raise InvalidOptionError(
+            f"the rows of {policy} need the name of the system that it serves",
+            "Give --system, such as perceptual-framesamp-modul, or a name of your own: see "
+            "docs/systems.md.",
+        )
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", target.rstrip("/").split("/")[-1]).strip("-")
+    if policy == "replay":
+        name = f"replay-{memory or 'full'}"
+    name = name or policy
+    return f"retrieval-{name}" if retrieval else name
 
 
 def identity(config: RunConfig) -> dict[str, Any]:

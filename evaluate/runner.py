@@ -14,7 +14,12 @@ from robomme_interference_data.evaluate.checks import (
     check_settings,
     describe_policy,
 )
-from robomme_interference_data.evaluate.config import RunConfig, identity, provenance
+from robomme_interference_data.evaluate.config import (
+    RunConfig,
+    default_system,
+    identity,
+    provenance,
+)
 from robomme_interference_data.evaluate.log import RunLog, open_log, summary
 from robomme_interference_data.evaluate.plan import (
     WorkItem,
@@ -22,7 +27,6 @@ from robomme_interference_data.evaluate.plan import (
     plan_work,
     select_families,
 )
-from robomme_interference_data.evaluate.policies.registry import default_system
 from robomme_interference_data.evaluate.rollout import base_row
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, Rollout
 from robomme_interference_data.evaluate.worker import RolloutWorker, error_row
@@ -133,7 +137,7 @@ def run_evaluation(
         PolicyError: The policy cannot be made, or its server not reached.
     """
     opened = load_split(split)
-    label = system or default_system(policy, memory=memory, retrieval=retrieval is not None)
+    label = system or default_system(policy, memory, retrieval is not None)
     config = RunConfig(
         system=label,
         policy=policy,

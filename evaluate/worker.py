@@ -10,9 +10,10 @@ from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout import Selector, base_row, run_rollout
+from robomme_interference_data.evaluate.rollout import base_row, run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.loader import Split, load_split
+from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.simulators.base import Simulator, Status
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.workers import worker_number
@@ -72,7 +73,10 @@ class RolloutWorker:
         if self._split is None:
             self._split = load_split(config.split, threads=1)
         if self._policy is None:
-            self._policy = make_policy(config.policy, memory=config.memory, worker=worker_number())
+            options: dict[str, Any] = {}
+            if config.memory is not None:
+                options["memory"] = config.memory
+            self._policy = make_policy(config.policy, worker=worker_number(), **options)
         if self._selector is None and config.retrieval is not None:
             self._selector = make_selector(config)
         if self._simulator is None:
@@ -126,10 +130,8 @@ def error_row(
 
 def make_selector(config: RunConfig) -> Selector:
     """Make the retrieval step of a run."""
-    from robomme_interference_data.retrieval.selector import Selector as Retrieval
-
     assert config.retrieval is not None
-    return Retrieval(config.retrieval, threshold=config.retrieval_threshold)
+    return Selector(config.retrieval, threshold=config.retrieval_threshold)
 
 
 def simulator_options(

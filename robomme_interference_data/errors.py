@@ -35,6 +35,8 @@ __all__ = [
     "SimulatorCrashError",
     # evaluation
     "PolicyError",
+    "PolicyServerError",
+    "WireError",
     "RolloutError",
     "RunFolderError",
     # helpers
@@ -136,7 +138,15 @@ class SimulatorCrashError(InterferenceError, RuntimeError):
 
 
 class PolicyError(InterferenceError, RuntimeError):
-    """A policy, or the server behind it, broke or answered what it may not."""
+    """A policy that does not fit, breaks, is called out of order, or answers what it may not."""
+
+
+class PolicyServerError(InterferenceError, ConnectionError):
+    """A policy server that cannot be reached, reports an error, or does not answer in time."""
+
+
+class WireError(InterferenceError, ValueError):
+    """A message that the protocol of the policy servers cannot carry."""
 
 
 class RolloutError(InterferenceError, RuntimeError):

@@ -168,7 +168,17 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
         (["list", "--k", "0", "1"], ["list", "--k", "0", "1"]),
         (
             ["evaluate", "--conditions", "no-history", "k7", "--families", "A", "--out", "x"],
-            "evaluate --conditions no-history --conditions k7 --families A --out x".split(),
+            [
+                "evaluate",
+                "--conditions",
+                "no-history",
+                "--conditions",
+                "k7",
+                "--families",
+                "A",
+                "--out",
+                "x",
+            ],
         ),
     ],
 )

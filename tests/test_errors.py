@@ -33,6 +33,9 @@ BUILTINS = {
     "BuildError": RuntimeError,
     "PoolTooSmallError": ValueError,
     "HistoryTooLongError": ValueError,
+    "PolicyError": RuntimeError,
+    "PolicyServerError": ConnectionError,
+    "WireError": ValueError,
 }
 
 
