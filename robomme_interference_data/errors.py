@@ -30,6 +30,10 @@ __all__ = [
     "NoRendererError",
     "MotionError",
     "SimulatorCrashError",
+    # evaluation
+    "PolicyError",
+    "RolloutError",
+    "RunFolderError",
     # helpers
     "nearest",
 ]
@@ -114,6 +118,18 @@ class MotionError(InterferenceError, RuntimeError):
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
     """A simulator's worker process died, or did not answer in time."""
+
+
+class PolicyError(InterferenceError, RuntimeError):
+    """A policy, or the server behind it, broke or answered what it may not."""
+
+
+class RolloutError(InterferenceError, RuntimeError):
+    """A rollout that cannot be run as planned: simulator and data contradict each other."""
+
+
+class RunFolderError(InterferenceError, FileExistsError):
+    """A run's folder that holds another run, or that another process is writing."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:

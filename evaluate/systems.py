@@ -1,0 +1,226 @@
+"""The systems of the paper, and the benchmark's own controls, as data.
+
+A system is a policy together with its memory mechanism. Its name labels the rows of a run, so a
+name of this table promises the conditions and limits given here; see `name_system` for labels of
+your own.
+"""
+
+import re
+from dataclasses import dataclass
+from difflib import SequenceMatcher
+
+from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
+from robomme_interference_data.errors import (
+    HistoryTooLongError,
+    InvalidIdError,
+    InvalidOptionError,
+    UnknownNameError,
+    nearest,
+)
+from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
+
+__all__ = [
+    "PAPER_SYSTEMS",
+    "SYSTEMS",
+    "System",
+    "check_condition",
+    "check_history",
+    "display_name",
+    "get_system",
+    "name_system",
+]
+
+_FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_TOO_ALIKE = 0.9  # of difflib's ratio: one letter in ten
+
+
+@dataclass(frozen=True)
+class System:
+    """One system.
+
+    Attributes:
+        name: Name in rows, options and file names.
+        display: Name in tables and figures.
+        representation: What the memory is made of, such as `frames` or `tokens`; `none` without.
+        integration: How the memory enters the policy: `modulator`, `context`, `expert`,
+            `subgoals`, or None.
+        no_history: Whether `no-history` applies.
+        with_history: Whether `k0`, `k1`, … apply.
+        subgoals: What a vision-language model in front of the policy writes:
+            `simple_subgoal`, `grounded_subgoal`, or None where there is none.
+        retrieval: Whether a retrieval step chooses what the memory gets.
+        position_limit: History and live frames together that the memory holds; None: no limit.
+        paper: Whether the paper reports it.
+    """
+
+    name: str
+    display: str
+    representation: str
+    integration: str | None
+    no_history: bool = True
+    with_history: bool = True
+    subgoals: str | None = None
+    retrieval: bool = False
+    position_limit: int | None = None
+    paper: bool = False
+
+
+def _released(
+    name: str, display: str, representation: str, integration: str, *, retrieval: bool = False
+) -> System:
+    """A system whose server keeps the frames, with an embedding for each of 4096 positions."""
+    return System(
+        name,
+        display,
+        representation,
+        integration,
+        # With nothing to choose from it is the system without retrieval.
+        no_history=not retrieval,
+        retrieval=retrieval,
+        position_limit=POSITION_LIMIT,
+        paper=True,
+    )
+
+
+def _symbolic(name: str, display: str, representation: str, subgoals: str) -> System:
+    """A system whose server keeps nothing: the model in front of it reads the history."""
+    return System(name, display, representation, "subgoals", subgoals=subgoals, paper=True)
+
+
+def _control(name: str, display: str, memory: str = "none", *, retrieval: bool = False) -> System:
+    return System(name, display, memory, None, no_history=not retrieval, retrieval=retrieval)
+
+
+PAPER_SYSTEMS: tuple[System, ...] = (
+    System("pi05_baseline", "π0.5 (baseline)", "none", None, with_history=False, paper=True),
+    _released("perceptual-framesamp-modul", "FrameSamp-Modul", "frames", "modulator"),
+    _released("perceptual-tokendrop-modul", "TokenDrop-Modul", "tokens", "modulator"),
+    _released("perceptual-framesamp-context", "FrameSamp-Context", "frames", "context"),
+    _released("perceptual-framesamp-expert", "FrameSamp-Expert", "frames", "expert"),
+    _released("perceptual-tokendrop-context", "TokenDrop-Context", "tokens", "context"),
+    _released("perceptual-tokendrop-expert", "TokenDrop-Expert", "tokens", "expert"),
+    _released("recurrent-ttt-expert", "Recurrent-TTT-Expert", "hidden state", "expert"),
+    _released("recurrent-ttt-context", "Recurrent-TTT-Context", "hidden state", "context"),
+    _symbolic("symbolic-simplesg", "SimpleSG", "text", "simple_subgoal"),
+    _symbolic("symbolic-groundsg", "GroundSG", "text with points", "grounded_subgoal"),
+    _symbolic("memer", "MemER", "text with points and key frames", "grounded_subgoal"),
+    _released(
+        "retrieval-framesamp-modul",
+        "Retrieval-FrameSamp-Modul",
+        "frames",
+        "modulator",
+        retrieval=True,
+    ),
+)
+"""The twelve systems of the paper's main table in its order, then the one with retrieval."""
+
+_CONTROLS = (
+    _control("oracle", "Oracle"),
+    _control("guess", "Guess"),
+    _control("hold", "Hold"),
+    _control("replay-full", "Replay-Full", "all frames"),
+    _control("replay-framesamp", "Replay-FrameSamp", "frames"),
+    _control("replay-window", "Replay-Window", "last frames"),
+    _control("retrieval-replay-full", "Retrieval-Replay-Full", "all frames", retrieval=True),
+    _control("retrieval-replay-framesamp", "Retrieval-Replay-FrameSamp", "frames", retrieval=True),
+    _control("retrieval-replay-window", "Retrieval-Replay-Window", "last frames", retrieval=True),
+)
+
+SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
+"""Name to system: the paper's, then the built-in policies. The order is that of tables."""
+
+
+def get_system(name: str) -> System:
+    """Return a system of the table.
+
+    Raises:
+        UnknownNameError: The table does not hold it.
+    """
+    if name not in SYSTEMS:
+        raise UnknownNameError(f"there is no system {name!r}", nearest(name, SYSTEMS))
+    return SYSTEMS[name]
+
+
+def name_system(name: str) -> System:
+    """Return a system of the table, or one with a name of your own.
+
+    A name of your own is free of conditions and limits. It may not read like one of the table:
+    what differs from one in case, separators or one letter in ten is refused, so that neither a
+    slip nor a variant passes for a published system.
+
+    Raises:
+        InvalidIdError: The name has other than 1 to 64 letters, digits, `.`, `_` and `-`, or
+            does not begin with a letter or digit.
+        UnknownNameError: It reads like a system of the table, without being one.
+    """
+    if name in SYSTEMS:
+        return SYSTEMS[name]
+    if not _FREE_NAME.fullmatch(name):
+        raise InvalidIdError(
+            f"{name!r} is not the name of a system",
+            "Expected up to 64 letters, digits, '.', '_' and '-', such as my-memory.",
+        )
+    for system in SYSTEMS.values():
+        if any(_alike(name, known) for known in (system.name, system.display)):
+            raise UnknownNameError(
+                f"{name!r} reads like the system {system.name!r}, which it is not",
+                f"Write {system.name!r} if that is what runs, or take a name that cannot be "
+                "mistaken for it.",
+            )
+    return System(name, name, "own", None)
+
+
+def _alike(name: str, known: str) -> bool:
+    folded, other = (re.sub(r"[^a-z0-9]", "", text.lower()) for text in (name, known))
+    # Short names such as `hold` are alike only when they are equal.
+    return folded == other or SequenceMatcher(None, folded, other).ratio() >= _TOO_ALIKE
+
+
+def display_name(name: str) -> str:
+    """Return the name for tables and figures; a name that is not in the table stays as it is."""
+    return SYSTEMS[name].display if name in SYSTEMS else name
+
+
+def check_condition(system: System, condition: str) -> None:
+    """Refuse a condition that does not apply to a system.
+
+    Args:
+        system: The system.
+        condition: `no-history`, `k0`, `k1`, …
+
+    Raises:
+        InvalidIdError: The text is no condition.
+        InvalidOptionError: The condition does not apply.
+    """
+    condition_rank(condition)
+    if condition == NO_HISTORY and not system.no_history:
+        plain = system.name.removeprefix("retrieval-")
+        plain = plain if plain in SYSTEMS else f"perceptual-{plain}"
+        raise InvalidOptionError(
+            f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
+            f"Run {plain} under {NO_HISTORY}: without history it is the same system.",
+        )
+    if condition != NO_HISTORY and not system.with_history:
+        raise InvalidOptionError(
+            f"{system.name} has no memory: {condition} does not apply",
+            f"Run it under {NO_HISTORY} only.",
+        )
+
+
+def check_history(system: System, frames: int) -> None:
+    """Refuse a history that, with a whole rollout after it, exceeds the system's positions.
+
+    Args:
+        system: The system.
+        frames: Number of history frames.
+
+    Raises:
+        HistoryTooLongError: `frames` + 1300 is more than the system's `position_limit`.
+    """
+    limit = system.position_limit
+    if limit is not None and frames + MAX_STEPS > limit:
+        raise HistoryTooLongError(
+            f"{frames} history frames and {MAX_STEPS} steps exceed the {limit} positions of "
+            f"{system.name}",
+            "Leave out that episode or condition, or run a system without such a limit.",
+        )
