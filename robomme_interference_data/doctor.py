@@ -38,6 +38,7 @@ _ROBOMME_TIMEOUT_S = 120
 _EXTRAS = {
     "build": "Build datasets",
     "sim": "Simulator",
+    "evaluate": "Evaluate",
     "retrieval": "Retrieval",
     "score": "Score",
 }
@@ -73,6 +74,7 @@ def checks() -> list[Check]:
         _extra("sim"),
         _vulkan(),
         _robomme(),
+        _extra("evaluate"),
         _extra("retrieval"),
         _extra("score"),
         _hub_token(),

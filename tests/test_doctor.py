@@ -81,6 +81,7 @@ def test_this_environment_has_all_that_is_needed() -> None:
         "Simulator [sim]",
         "Vulkan",
         "Official simulator",
+        "Evaluate [evaluate]",
         "Retrieval [retrieval]",
         "Score [score]",
         "Hub token",
