@@ -141,9 +141,11 @@ def simulator_options(
     wanted = {*policy.cameras, *([selector.camera] if selector else [])}
     if config.videos:
         wanted |= {"front", "wrist"}
+    if config.check_lesson:
+        wanted |= {"front"}
     cameras = tuple(name for name in ("front", "wrist") if name in wanted)
     if config.simulator == "robomme":
-        return {"python": config.robomme_python, "cameras": cameras or ("front",)}
+        return {"python": config.robomme_python, "cameras": cameras}
     if config.simulator != "tabletop" or config.check_lesson:
         return {}
     return {"cameras": cameras}
