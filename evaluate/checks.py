@@ -27,7 +27,7 @@ from robomme_interference_data.evaluate.systems import (
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.ids import condition_name
 from robomme_interference_data.loader import Split
-from robomme_interference_data.simulators.registry import SIMULATORS
+from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
 
 __all__ = ["PolicyTraits", "applicable", "check_plan", "check_settings", "describe_policy"]
 
@@ -49,9 +49,8 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
         InterferenceError: It cannot be made, or its server cannot be reached.
     """
     check_workers(parse_policy(config.policy), config.workers)
-    policy = make_policy(
-        config.policy, **({} if config.memory is None else {"memory": config.memory})
-    )
+    options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
+    policy = make_policy(config.policy, **options)
     try:
         return PolicyTraits(
             tuple(policy.history_cameras),
@@ -75,7 +74,10 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
     for setting in ("workers", "history_chunk", "max_errors", "rollout_s"):
         if getattr(config, setting) <= 0:
-            raise InvalidOptionError(f"{setting} {getattr(config, setting)}; expected more than 0")
+            raise InvalidOptionError(
+                f"{setting} {getattr(config, setting)}; expected more than 0",
+                "Leave it out for the default.",
+            )
     if policy.privileged and name == "robomme":
         raise InvalidOptionError(
             f"the policy {config.policy} asks the simulator for actions, and robomme gives none",
@@ -120,6 +122,7 @@ def check_plan(
         InvalidOptionError: A condition does not apply, or the split is of another simulator.
         UnknownNameError: The split has no buffers for a condition.
         HistoryTooLongError: A buffer exceeds the system's position limit.
+        MissingExtraError: RoboMME's interpreter does not have it.
     """
     system = name_system(config.system)
     known = [NO_HISTORY, *(condition_name(k) for k in split.k_values)]
@@ -142,6 +145,8 @@ def check_plan(
             )
         if item.k is not None and config.retrieval is None:
             check_history(system, manifest.history_frames)
+    if config.simulator == "robomme":  # its interpreter may be missing, or lack RoboMME
+        make_simulator("robomme", python=config.robomme_python).close()
 
 
 def _refusal(system: System, policy: PolicyTraits, condition: str) -> InterferenceError | None:

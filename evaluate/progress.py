@@ -35,9 +35,9 @@ class RunProgress:
             console=self._console,
         )
         self._task = self._progress.add_task("evaluate", total=None)
-        self._live = Live(console=self._console, get_renderable=self._draw, refresh_per_second=2)
         self._planned: dict[tuple[str, str], int] = {}
         self._rows: dict[tuple[object, ...], Rollout] = {}
+        self._live = Live(console=self._console, get_renderable=self._draw, refresh_per_second=2)
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:

@@ -19,6 +19,7 @@ from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, Rollout
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.loader import Split
+from robomme_interference_data.retrieval.selector import Selection, Selector
 from robomme_interference_data.simulators.base import (
     Demonstration,
     EpisodeInfo,
@@ -27,7 +28,7 @@ from robomme_interference_data.simulators.base import (
     Status,
 )
 
-__all__ = ["ACTION_CHUNK", "Selector", "Watcher", "base_row", "check_lesson", "run_rollout"]
+__all__ = ["ACTION_CHUNK", "Watcher", "base_row", "check_lesson", "run_rollout"]
 
 ACTION_CHUNK = 16
 """Actions of a chunk that are executed before the policy is asked again (paper)."""
@@ -42,34 +43,6 @@ class Watcher(Protocol):
 
     def step(self, observation: Observation, status: Status, subgoal: str | None) -> None:
         """Take what came of a step."""
-        ...
-
-
-class Selection(Protocol):
-    """The span that a retrieval step chose; see `retrieval.selector.Selection`."""
-
-    start: int
-    stop: int
-    lesson_fraction: float
-    filler_fraction: float
-    query_fraction: float
-
-
-class Selector(Protocol):
-    """A retrieval step in front of the policy; see `retrieval.selector.Selector`."""
-
-    @property
-    def name(self) -> str:
-        """Encoder and rule."""
-        ...
-
-    @property
-    def camera(self) -> str:
-        """Camera whose frames it compares."""
-        ...
-
-    def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Selection:
-        """Choose the span of the history that the first live image asks for."""
         ...
 
 

@@ -10,9 +10,10 @@ from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout import Selector, base_row, run_rollout
+from robomme_interference_data.evaluate.rollout import base_row, run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.loader import Split, load_split
+from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.simulators.base import Simulator, Status
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.workers import worker_number
@@ -72,7 +73,9 @@ class RolloutWorker:
         if self._split is None:
             self._split = load_split(config.split, threads=1)
         if self._policy is None:
-            options = {} if config.memory is None else {"memory": config.memory}
+            options: dict[str, Any] = {}
+            if config.memory is not None:
+                options["memory"] = config.memory
             self._policy = make_policy(config.policy, worker=worker_number(), **options)
         if self._selector is None and config.retrieval is not None:
             self._selector = make_selector(config)
@@ -127,23 +130,22 @@ def error_row(
 
 def make_selector(config: RunConfig) -> Selector:
     """Make the retrieval step of a run."""
-    from robomme_interference_data.retrieval.selector import Selector as Retrieval
-
     assert config.retrieval is not None
-    return Retrieval(config.retrieval, threshold=config.retrieval_threshold)
+    return Selector(config.retrieval, threshold=config.retrieval_threshold)
 
 
 def simulator_options(
     config: RunConfig, policy: Policy, selector: Selector | None
 ) -> dict[str, Any]:
     """Return the options of a run's simulator: it draws only what somebody looks at."""
-    if config.simulator == "robomme":
-        return {"python": config.robomme_python}
-    if config.simulator != "tabletop":
-        return {}
-    if config.check_lesson:
-        return {}
     wanted = {*policy.cameras, *([selector.camera] if selector else [])}
     if config.videos:
         wanted |= {"front", "wrist"}
-    return {"cameras": tuple(sorted(wanted))}
+    if config.check_lesson:
+        wanted |= {"front"}
+    cameras = tuple(name for name in ("front", "wrist") if name in wanted)
+    if config.simulator == "robomme":
+        return {"python": config.robomme_python, "cameras": cameras}
+    if config.simulator != "tabletop" or config.check_lesson:
+        return {}
+    return {"cameras": cameras}

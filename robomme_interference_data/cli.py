@@ -15,6 +15,7 @@ from robomme_interference_data.build_dataset import check_commands
 from robomme_interference_data.build_dataset import commands as build_commands
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluate_commands
+from robomme_interference_data.retrieval import commands as retrieval_commands
 from robomme_interference_data.simulators import commands as simulator_commands
 
 __all__ = ["app", "main"]
@@ -68,6 +69,7 @@ app.command()(check_commands.verify)
 app.command()(check_commands.audit)
 app.command(name="list")(commands.list_buffers)
 app.command()(commands.show)
+app.command()(retrieval_commands.index)
 app.command()(commands.doctor)
 app.command()(simulator_commands.simulate)
 app.command(name="simulate-score")(simulator_commands.simulate_score)

@@ -22,6 +22,9 @@ __all__ = [
     "HashMismatchError",
     "TruncatedVideoError",
     "SourceError",
+    "MissingIndexError",
+    "StaleIndexError",
+    "MissingWeightsError",
     # what was to be written
     "BuildError",
     "PoolTooSmallError",
@@ -32,6 +35,8 @@ __all__ = [
     "SimulatorCrashError",
     # evaluation
     "PolicyError",
+    "PolicyServerError",
+    "WireError",
     "RolloutError",
     "RunFolderError",
     # helpers
@@ -96,6 +101,18 @@ class SourceError(InterferenceError, ValueError):
     """Recorded episodes that cannot be used as they are."""
 
 
+class MissingIndexError(InterferenceError, FileNotFoundError):
+    """A dataset without the embeddings that are asked for."""
+
+
+class StaleIndexError(InterferenceError, ValueError):
+    """Embeddings that were made of other data, or with another encoder, than is asked for."""
+
+
+class MissingWeightsError(InterferenceError, FileNotFoundError):
+    """The weights of a model are not on this machine."""
+
+
 class BuildError(InterferenceError, RuntimeError):
     """A build that cannot go on."""
 
@@ -117,11 +134,19 @@ class MotionError(InterferenceError, RuntimeError):
 
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
-    """A simulator's worker process died, or did not answer in time."""
+    """A simulator broke: its process died or did not answer in time, or it says so itself."""
 
 
 class PolicyError(InterferenceError, RuntimeError):
-    """A policy, or the server behind it, broke or answered what it may not."""
+    """A policy that does not fit, breaks, is called out of order, or answers what it may not."""
+
+
+class PolicyServerError(InterferenceError, ConnectionError):
+    """A policy server that cannot be reached, reports an error, or does not answer in time."""
+
+
+class WireError(InterferenceError, ValueError):
+    """A message that the protocol of the policy servers cannot carry."""
 
 
 class RolloutError(InterferenceError, RuntimeError):

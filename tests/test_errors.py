@@ -27,9 +27,15 @@ BUILTINS = {
     "HashMismatchError": ValueError,
     "TruncatedVideoError": ValueError,
     "SourceError": ValueError,
+    "MissingIndexError": FileNotFoundError,
+    "StaleIndexError": ValueError,
+    "MissingWeightsError": FileNotFoundError,
     "BuildError": RuntimeError,
     "PoolTooSmallError": ValueError,
     "HistoryTooLongError": ValueError,
+    "PolicyError": RuntimeError,
+    "PolicyServerError": ConnectionError,
+    "WireError": ValueError,
 }
 
 

@@ -217,7 +217,7 @@ def _check_options(
 
 def _check_protocol(text: str, policy: Any) -> None:
     methods = ("reset", "add_history", "observe", "act", "metadata", "close")
-    values = ("cameras", "wants_history", "privileged", "every_frame")
+    values = ("cameras", "history_cameras", "wants_history", "privileged", "every_frame")
     missing = [name for name in values if not hasattr(policy, name)]
     missing += [f"{name}()" for name in methods if not callable(getattr(policy, name, None))]
     if missing:
@@ -225,8 +225,9 @@ def _check_protocol(text: str, policy: Any) -> None:
             f"policy {text!r}: {type(policy).__name__} has no {', '.join(missing)}",
             "evaluate/policies/base.py says what a policy must have; docs/systems.md has one.",
         )
-    if isinstance(policy.cameras, str) or not set(policy.cameras) <= {"front", "wrist"}:
-        raise PolicyError(
-            f"policy {text!r} asks for the cameras {policy.cameras!r}",
-            "Expected a tuple of 'front' and 'wrist'.",
-        )
+    for cameras in (policy.cameras, policy.history_cameras):
+        if isinstance(cameras, str) or not set(cameras) <= {"front", "wrist"}:
+            raise PolicyError(
+                f"policy {text!r} asks for the cameras {cameras!r}",
+                "Expected a tuple of 'front' and 'wrist'.",
+            )
