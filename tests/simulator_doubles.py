@@ -79,6 +79,6 @@ def make(**options: Any) -> Double:
     return Double(**options)
 
 
-def make_once() -> Double:
+def make_once(**options: Any) -> Double:
     """Make one that behaves badly once for each index; marks go where `DOUBLE_MARKS` says."""
-    return Double(os.environ["DOUBLE_MARKS"])
+    return Double(os.environ["DOUBLE_MARKS"], **options)

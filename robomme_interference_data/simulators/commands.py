@@ -10,6 +10,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Observation, Status
@@ -116,12 +117,16 @@ def simulate_score(
 
     _check(policy, POLICIES)
     episodes, outcomes = episode_ids(family, split), []
-    for outcome in play_all(policy, episodes, workers=workers):
-        outcomes.append(outcome)
-        if outcome.status is not Status.SUCCESS and policy == "oracle":
-            _messages.print(f"{outcome.episode} ({outcome.difficulty}): {outcome.status}")
-        if len(outcomes) % 50 == 0:
-            _messages.print(f"{len(outcomes)} of {len(episodes)} episodes played")
+    with Progress(
+        *Progress.get_default_columns(), MofNCompleteColumn(), console=_messages
+    ) as progress:
+        bar = progress.add_task("episodes", total=len(episodes))
+        for outcome in play_all(policy, episodes, workers=workers):
+            outcomes.append(outcome)
+            progress.advance(bar)
+            if outcome.why or (policy == "oracle" and outcome.status is not Status.SUCCESS):
+                _messages.print(f"{outcome.episode}: {outcome.status} {outcome.why}")
+    outcomes.sort(key=lambda outcome: episodes.index(outcome.episode))
     if as_json:
         rows = [{**vars(o), "episode": str(o.episode), "status": str(o.status)} for o in outcomes]
         typer.echo(json.dumps(rows))

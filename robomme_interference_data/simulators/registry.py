@@ -1,13 +1,14 @@
 """Simulators by name; the libraries behind them are imported when one is made."""
 
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from typing import Any
 
 from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Simulator
 
-__all__ = ["SIMULATORS", "make_simulator"]
+__all__ = ["SIMULATORS", "make_simulator", "own_simulator"]
 
 
 def _tabletop(**options: Any) -> Simulator:
@@ -36,8 +37,7 @@ def make_simulator(name: str, **options: Any) -> Simulator:
 
     Args:
         name: `tabletop`, `robomme`, or `module:function` for a simulator of your own.
-        **options: For the simulator: `tabletop` takes `render`, `robomme` takes `python`, the path
-            of RoboMME's own interpreter; see `TabletopSimulator` and `RoboMMESimulator`.
+        **options: For the simulator: see `TabletopSimulator` and `RoboMMESimulator`.
 
     Raises:
         UnknownNameError: There is no such simulator.
@@ -58,3 +58,12 @@ def make_simulator(name: str, **options: Any) -> Simulator:
             "Expected <module>:<function>, which can be imported and returns a simulator.",
         ) from error
     return simulator
+
+
+@cache
+def own_simulator(name: str, **options: Any) -> Simulator:
+    """Return this process's simulator of a name and options; it is made once and kept.
+
+    For functions that `workers.run_tasks` calls in its worker processes, each many times.
+    """
+    return make_simulator(name, **options)
