@@ -366,3 +366,54 @@ def test_the_saved_policies_are_always_the_same(tmp_path: Path) -> None:
     one, other = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("one", "other"))
     assert one == other
     assert lerobot_policies.SMALL.keys() == {"act", "vqbet", "diffusion"}
+
+
+@pytest.mark.slow
+def test_a_policy_trained_on_built_demonstrations_acts(tmp_path: Path) -> None:
+    import factories
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.factory import (
+        get_policy_class,
+        make_policy_config,
+        make_pre_post_processors,
+    )
+
+    from robomme_interference_data.build_dataset.sample import write_sample
+
+    families = ("MoveCube", "PatternLock")
+    for _ in write_sample(
+        tmp_path / "rec", families=families, train=1, test=1, size=SIZE, demonstration=20
+    ):
+        pass
+    factories.build("frames", tmp_path / "rec", tmp_path / "demonstrations", split="test")
+    config = make_policy_config(
+        "act",
+        device="cpu",
+        push_to_hub=False,
+        pretrained_backbone_weights=None,
+        **lerobot_policies.features(),
+        **lerobot_policies.SMALL["act"],
+    )
+    dataset = LeRobotDataset(
+        "local/demonstrations",
+        root=tmp_path / "demonstrations",
+        delta_timestamps={ACTION: [step / 10 for step in config.action_delta_indices]},
+        video_backend="pyav",
+    )
+    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    model = get_policy_class("act")(config).train()
+    optimizer = torch.optim.AdamW(model.parameters(), 1e-3)
+    losses = []
+    batch = before(torch.utils.data.default_collate([dataset[index] for index in range(4)]))
+    for _ in range(5):
+        loss, _ = model.forward(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+    folder = tmp_path / "policy"
+    for part in (model, before, after):
+        part.save_pretrained(folder)
+    (actions,) = play(make_policy(f"lerobot:{folder}", device="cpu"), 0, [1])
+    assert actions.shape == (16, 8)
