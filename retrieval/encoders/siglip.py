@@ -200,4 +200,3 @@ def _weights_digest(vision: Any) -> str:
         running.update(f"{name} {tuple(value.shape)}\n".encode())
         running.update(value.numpy().tobytes())
     return running.hexdigest()
-
