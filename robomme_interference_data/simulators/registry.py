@@ -21,7 +21,13 @@ def _tabletop(**options: Any) -> Simulator:
     return TabletopSimulator(**options)
 
 
-SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop}
+def _robomme(**options: Any) -> Simulator:
+    from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+
+    return RoboMMESimulator(**options)
+
+
+SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop, "robomme": _robomme}
 """Name to a function that makes the simulator; another backend adds itself here."""
 
 
@@ -29,12 +35,14 @@ def make_simulator(name: str, **options: Any) -> Simulator:
     """Make a simulator in this process; keep to one, and use `RemoteSimulator` for more.
 
     Args:
-        name: `tabletop`, or `module:function` for a simulator of your own.
-        **options: For the simulator; `tabletop` takes `render`, see `TabletopSimulator`.
+        name: `tabletop`, `robomme`, or `module:function` for a simulator of your own.
+        **options: For the simulator: `tabletop` takes `render`, `robomme` takes `python`, the path
+            of RoboMME's own interpreter; see `TabletopSimulator` and `RoboMMESimulator`.
 
     Raises:
         UnknownNameError: There is no such simulator.
         MissingExtraError: Its libraries are not installed.
+        InvalidOptionError: An option is not what it may be.
         NoRendererError: This machine cannot draw its cameras' pictures.
     """
     if name in SIMULATORS:
