@@ -14,6 +14,7 @@ from robomme_interference_data import commands
 from robomme_interference_data.build_dataset import check_commands
 from robomme_interference_data.build_dataset import commands as build_commands
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate.score import commands as score_commands
 from robomme_interference_data.simulators import commands as simulator_commands
 
 __all__ = ["app", "main"]
@@ -65,6 +66,7 @@ app.command()(commands.show)
 app.command()(commands.doctor)
 app.command()(simulator_commands.simulate)
 app.command(name="simulate-score")(simulator_commands.simulate_score)
+app.command()(score_commands.score)
 
 
 def main() -> None:

@@ -27,6 +27,7 @@ BUILTINS = {
     "HashMismatchError": ValueError,
     "TruncatedVideoError": ValueError,
     "SourceError": ValueError,
+    "BadRowsError": ValueError,
     "BuildError": RuntimeError,
     "PoolTooSmallError": ValueError,
     "HistoryTooLongError": ValueError,

@@ -1,17 +1,17 @@
 """How often a built-in policy succeeds: the suite's own check that it is solvable and fair."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import SimulatorCrashError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.intervals import wilson
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.pool import map_episodes
 from robomme_interference_data.simulators.worker import RemoteSimulator
 
-__all__ = ["Outcome", "markdown_table", "play_all", "wilson"]
+__all__ = ["Outcome", "markdown_table", "play_all"]
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,6 @@ def play_all(
             yield Outcome(episode, "", Status.ERROR, 0, 0, 0.0)
         else:
             yield result
-
-
-def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson score interval of a rate, by default at 95%; `(0, 1)` without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    rate = successes / trials
-    middle = rate + z * z / (2 * trials)
-    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    scale = 1 + z * z / trials
-    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
 def markdown_table(outcomes: Iterable[Outcome]) -> str:
