@@ -47,7 +47,8 @@ def _together(columns: Sequence[int]) -> Callable[[Floats], Floats]:
     def features(values: Floats) -> Floats:
         chosen = values[:, list(columns)]
         chosen = np.concatenate([chosen, np.ones((len(chosen), 1))], axis=1)
-        return np.where(np.isnan(chosen).any(axis=1)[:, None], 0.0, chosen)
+        chosen[np.isnan(chosen).any(axis=1)] = 0.0
+        return chosen
 
     return features
 

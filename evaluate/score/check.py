@@ -161,10 +161,7 @@ class Checker:
             if known != revisions[place]:
                 rows.refuse(
                     (simulator == number) & (code == place),
-                    lambda row, known=known: (
-                        f"revision {rows.shown('revision', row)} beside "
-                        f"{known!r}: rows of different splits do not mix"
-                    ),
+                    _beside(rows, known),
                 )
 
     def _check_episodes(self, rows: "_Rows", codes: dict[str, Codes]) -> None:
@@ -190,10 +187,7 @@ class Checker:
             wrong[said] = known[at] != given[said]
             rows.refuse(
                 wrong,
-                lambda row, name=name: (
-                    f"{name} {rows.shown(name, row)} differs from that of "
-                    "other rows of the same episode"
-                ),
+                _differs(rows, name),
             )
 
     def _grow(self, episode: int) -> None:
@@ -235,7 +229,7 @@ class _Rows:
             if not pa.types.is_dictionary(column.type):
                 column = column.dictionary_encode()
             values = [*column.dictionary.to_pylist(), None]
-            index = column.indices.fill_null(len(values) - 1).to_numpy().astype(np.int64)
+            index = _numbers(column.indices, len(values) - 1)
         codes = np.zeros(len(values), np.int64)
         reasons = {}
         for place in np.unique(index).tolist():
@@ -263,7 +257,7 @@ class _Rows:
         elif not pa.types.is_int64(column.type):
             column = _whole(column)
         empty = self.batch.columns[name].is_null().to_numpy(zero_copy_only=False)
-        found = column.fill_null(-1).to_numpy()
+        found = _numbers(column, -1)
         found = np.where((found < 0) | (found > most), -1, found)
         refused = found < 0
         if default is not None:
@@ -287,6 +281,31 @@ class _Rows:
     def shown(self, name: str, row: int) -> str:
         value = self.batch.columns[name][row].as_py()
         return "(empty)" if value is None else repr(value)
+
+
+def _beside(rows: _Rows, known: str) -> Callable[[int], str]:
+    return lambda row: (
+        f"revision {rows.shown('revision', row)} beside {known!r}: rows of different splits do "
+        "not mix"
+    )
+
+
+def _differs(rows: _Rows, name: str) -> Callable[[int], str]:
+    return lambda row: (
+        f"{name} {rows.shown(name, row)} differs from that of other rows of the same episode"
+    )
+
+
+def _numbers(array: Any, null: int) -> Codes:
+    """Return an Arrow array of whole numbers as numpy's, with a number for null.
+
+    `fill_null` would import pandas wherever that is installed, which takes seconds.
+    """
+    if not array.null_count:
+        return array.to_numpy().astype(np.int64, copy=False)
+    empty = array.is_null().to_numpy(zero_copy_only=False)
+    data = np.frombuffer(array.buffers()[1], array.type.to_pandas_dtype())
+    return np.where(empty, null, data[array.offset : array.offset + len(array)])
 
 
 def _whole(values: Any) -> Any:

@@ -107,8 +107,8 @@ class _Columns:
         self.complete: dict[tuple[str, str], bool] = {}
         self.first: list[NDArray[np.int8]] = []
         columns = []
-        for outcomes in (one, base):
-            for condition in () if outcomes is None else outcomes.conditions:
+        for outcomes in [one] if base is None else [one, base]:
+            for condition in outcomes.conditions:
                 column = outcomes.column(condition, self.episodes)
                 cell = (outcomes.system, condition)
                 counts = self.episodes[~np.isnan(column)]

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,17 @@ __all__ = [
     "outcomes_of",
 ]
 
-Grid = Literal["benchmark", "given"]
-"""Which episodes a complete cell has: the benchmark's, or those of any of the given rows."""
+
+class Grid(StrEnum):
+    """Which episodes a complete cell has.
+
+    `benchmark`: the paper's nine families × test episodes 0 to 49; `given`: those episodes that
+    any of the rows of the simulator is of.
+    """
+
+    BENCHMARK = "benchmark"
+    GIVEN = "given"
+
 
 SUCCESS, ERROR = STATUSES.index("success"), STATUSES.index("error")
 TEST_EPISODES = 50
@@ -168,7 +177,7 @@ def expected_episodes(
     """Return for each simulator what a complete cell has (see `Grid`)."""
     expected = {}
     for code, simulator in enumerate(rollouts.simulators):
-        if grid == "given":
+        if grid is Grid.GIVEN:
             parts = [one.episodes for one in outcomes if one.simulator == simulator]
             episodes = np.unique(np.concatenate([*parts, np.zeros(0, np.int64)]))
         else:

@@ -60,18 +60,18 @@ class Published:
 def published() -> tuple[Published, ...]:
     """Return all published rates, in the paper's order."""
     file = resources.files(__package__).joinpath("data", "published.csv")
-    with file.open(encoding="utf-8", newline="") as lines:
-        return tuple(
-            Published(
-                int(row["table"]),
-                row["simulator"],
-                row["system"],
-                row["condition"],
-                float(row["percent"]),
-                int(row["episodes"]),
-            )
-            for row in csv.DictReader(lines)
+    rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+    return tuple(
+        Published(
+            int(row["table"]),
+            row["simulator"],
+            row["system"],
+            row["condition"],
+            float(row["percent"]),
+            int(row["episodes"]),
         )
+        for row in rows
+    )
 
 
 def comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Published]]:
@@ -114,7 +114,7 @@ def paper_table(cells: Sequence[Cell]) -> Table:
     )
     note = (
         f"Published: {SOURCE}. 95% intervals: Wilson for rates; Newcombe's hybrid score for "
-        "differences, which takes both sides as independent samples, as the paper's rows are not at "
+        "differences, which takes both sides as independent samples: the paper's rows are not at "
         f"hand to be paired.{left}"
     )
     return Table("paper", "Beside the published rates", columns, tuple(rows), note)

@@ -66,7 +66,7 @@ def score(
     paths: Sequence[Path],
     system: str | None = None,
     lenient: bool = False,
-    grid: Grid = "benchmark",
+    grid: Grid = Grid.BENCHMARK,
     against_paper: bool = False,
     draws: int = DRAWS,
 ) -> Score:
@@ -76,7 +76,7 @@ def score(
         paths: Folders of runs, CSVs and parquet files.
         system: Name of the system of rows that name none.
         lenient: Skip and count bad rows.
-        grid: Which episodes a complete cell has: the `benchmark`'s, or those `given`.
+        grid: Which episodes a complete cell has.
         against_paper: Put the published rates beside ours.
         draws: Bootstrap samples.
 
