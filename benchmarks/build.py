@@ -27,7 +27,6 @@ from robomme_interference_data.build_dataset.encode import (
     get_codec,
 )
 from robomme_interference_data.build_dataset.plan import PlannedEpisode, plan_dataset
-from robomme_interference_data.build_dataset.progress import BuildProgress
 from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.sources.base import Frame, Source, SourceEpisode
@@ -36,6 +35,7 @@ from robomme_interference_data.build_dataset.writer import load_lerobot, require
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
 from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.progress import BuildProgress
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 FAMILIES = ("VideoUnmask", "VideoUnmaskSwap", "PatternLock")

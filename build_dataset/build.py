@@ -22,7 +22,6 @@ from robomme_interference_data.build_dataset.plan import (
     plan_dataset,
     select,
 )
-from robomme_interference_data.build_dataset.progress import BuildProgress
 from robomme_interference_data.build_dataset.sources.base import Source, SourceEpisode
 from robomme_interference_data.build_dataset.stage import (
     StagedEpisode,
@@ -45,6 +44,7 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.workers import run_tasks
 
 __all__ = ["BuildResult", "Filters", "Settings", "build_dataset"]

@@ -24,9 +24,9 @@ def verify(
     as_json: AsJson = False,
 ) -> None:
     """Recompute every hash and rule of a split and name each violation; fails if there is one."""
-    from robomme_interference_data.build_dataset.progress import BuildProgress
     from robomme_interference_data.build_dataset.verify import verify_split
     from robomme_interference_data.loader import load_split
+    from robomme_interference_data.progress import BuildProgress
 
     opened = load_split(split)
     header = opened.reader.header["datasets"].values()

@@ -218,9 +218,9 @@ def sample(
     test: Annotated[int, typer.Option(help="Test episodes of each family.")] = 1,
 ) -> None:
     """Record a small made-up sample, to try everything: --source frames:OUT."""
-    from robomme_interference_data.build_dataset.progress import BuildProgress
     from robomme_interference_data.build_dataset.sample import write_sample
     from robomme_interference_data.constants import FAMILIES
+    from robomme_interference_data.progress import BuildProgress
 
     with BuildProgress(unit="episodes") as progress:
         progress.start("Recording the sample", len(FAMILIES) * (train + test))
@@ -242,8 +242,8 @@ def _build(
     from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
     from robomme_interference_data.build_dataset.encode import get_codec
     from robomme_interference_data.build_dataset.plan import parse_ranges
-    from robomme_interference_data.build_dataset.progress import BuildProgress
     from robomme_interference_data.build_dataset.sources import open_source
+    from robomme_interference_data.progress import BuildProgress
     from robomme_interference_data.simulators.registry import SIMULATORS
 
     families, split, episodes = filters
@@ -306,12 +306,12 @@ def _record(
     settings: "Settings",
 ) -> "Source | None":
     """Play the wanted episodes of a simulator; None if the dataset of them is there already."""
-    from robomme_interference_data.build_dataset.progress import BuildProgress
     from robomme_interference_data.build_dataset.record import (
         RecordedSource,
         check_unbuilt,
         record_episodes,
     )
+    from robomme_interference_data.progress import BuildProgress
     from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
     episodes = [
@@ -347,9 +347,9 @@ def _manifests(
     as_json: bool,
 ) -> None:
     from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-    from robomme_interference_data.build_dataset.progress import BuildProgress
     from robomme_interference_data.dataset import Dataset
     from robomme_interference_data.files import LocalFiles, read_json
+    from robomme_interference_data.progress import BuildProgress
 
     queries = Dataset(LocalFiles(demonstrations))
     units = Dataset(LocalFiles(distractors))

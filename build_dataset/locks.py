@@ -1,11 +1,11 @@
 """Hold an output folder while it is made, so that two builds of it cannot disturb each other."""
 
-import fcntl
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from robomme_interference_data.errors import BuildError
+from robomme_interference_data.locks import hold
 
 __all__ = ["locked", "work_folder"]
 
@@ -27,12 +27,6 @@ def locked(out: Path) -> Iterator[Path]:
     """
     work = work_folder(out)
     work.mkdir(parents=True, exist_ok=True)
-    # A file, not the folder itself: network file systems lock only what is open for writing.
-    with (work / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise BuildError(
-                f"another build of {out} is running", "Wait for it to end, or stop it."
-            ) from None
+    busy = BuildError(f"another build of {out} is running", "Wait for it to end, or stop it.")
+    with hold(work / "lock", busy):
         yield work

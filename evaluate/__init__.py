@@ -1,0 +1,14 @@
+"""Run policies on the benchmark, and score what came out.
+
+```python
+from robomme_interference_data.evaluate import run_evaluation
+
+result = run_evaluation("replay", "demo/tabletop", "runs/replay-full", episodes="0")
+```
+"""
+
+from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
+from robomme_interference_data.evaluate.rows import Rollout
+from robomme_interference_data.evaluate.runner import RunResult, run_evaluation
+
+__all__ = ["Policy", "Rollout", "RolloutInfo", "RunResult", "run_evaluation"]

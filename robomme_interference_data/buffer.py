@@ -15,9 +15,11 @@ from robomme_interference_data.cache import DecodedCache
 from robomme_interference_data.constants import CAMERA_PREFIX, STATE
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.digest import combine
+from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
+    StaleIndexError,
     UnknownNameError,
     nearest,
 )
@@ -211,6 +213,51 @@ class Buffer:
         out = np.empty((1, *self._shape(feature)), np.uint8)
         self._datasets[query.dataset].read_frames(query.episode_index, feature, query.frame, out)
         return out[0]
+
+    def embeddings(self, encoder: str) -> NDArray[np.float16]:
+        """Look up the embeddings of all frames; none is decoded.
+
+        Args:
+            encoder: Name of the encoder, such as `thumbnail`, whose index lies in the datasets.
+
+        Returns:
+            `(T, D) float16`, each of length 1, in the buffer's order.
+
+        Raises:
+            MissingIndexError: A dataset has no embeddings of this encoder.
+            StaleIndexError: They were made of other data, or differently in the two datasets.
+            FormatError: They are of an unknown version, or damaged.
+        """
+        parts = []
+        query = self.query_index(encoder)
+        for entry in self.manifest.sessions:
+            index = self._datasets[entry.dataset].index(encoder)
+            if (index.fingerprint, index.camera) != (query.fingerprint, query.camera):
+                raise StaleIndexError(
+                    f"the embeddings of encoder {encoder!r} were made differently in "
+                    f"{self._datasets[self.manifest.query.dataset].files.describe()} and in "
+                    f"{self._datasets[entry.dataset].files.describe()}",
+                    "Make them again, both at once: robomme-interference index --data SPLIT "
+                    f"--encoder {encoder}",
+                )
+            values = index.span(entry.episode_index, entry.start, entry.stop)
+            parts.append(values if entry.repeat == 1 else np.repeat(values, entry.repeat, axis=0))
+        if len(parts) == 1:
+            return parts[0]
+        return np.concatenate(parts) if parts else np.empty((0, query.size), np.float16)
+
+    def query_embedding(self, encoder: str) -> NDArray[np.float16]:
+        """Look up the embedding of the first live observation, `(D,) float16`; see `embeddings`.
+
+        For grading without a simulator: in a rollout, what the robot sees is embedded then.
+        """
+        query = self.manifest.query
+        index = self.query_index(encoder)
+        return index.span(query.episode_index, query.frame, query.frame + 1)[0]
+
+    def query_index(self, encoder: str) -> EmbeddingIndex:
+        """Return the index of the query's dataset; see `embeddings` for the errors."""
+        return self._datasets[self.manifest.query.dataset].index(encoder)
 
     def stream(
         self,

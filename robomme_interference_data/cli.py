@@ -14,28 +14,35 @@ from robomme_interference_data import commands
 from robomme_interference_data.build_dataset import check_commands
 from robomme_interference_data.build_dataset import commands as build_commands
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate import commands as evaluate_commands
 from robomme_interference_data.evaluate.score import commands as score_commands
+from robomme_interference_data.retrieval import commands as retrieval_commands
 from robomme_interference_data.simulators import commands as simulator_commands
 
 __all__ = ["app", "main"]
 
 
+SEVERAL = {"build": ("--k",), "evaluate": ("--conditions", "--families")}
+"""Options that take several values, by command."""
+
+
 class _Root(TyperGroup):
-    """Lets `--k` of the build commands take several numbers, as in `--k 0 1 3 7`."""
+    """Lets options take several values, as in `--k 0 1 3 7`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, spread(args) if args[:1] == ["build"] else args)
+        return super().parse_args(ctx, spread(args))
 
 
 def spread(args: list[str]) -> list[str]:
-    """Repeat `--k` before each of several numbers: click's options take one value each."""
+    """Repeat an option before each of its values: click's options take one value each."""
+    options = SEVERAL.get(args[0], ()) if args else ()
     spreaded: list[str] = []
-    open_option = False
+    option: str | None = None
     for arg in args:
-        if open_option and arg.isdigit() and spreaded[-2:-1] == ["--k"]:
-            spreaded += ["--k", arg]
-            continue
-        open_option = bool(spreaded) and spreaded[-1] == "--k"
+        if arg.startswith("-"):
+            option = arg if arg in options else None
+        elif option is not None and spreaded[-1] != option:
+            spreaded.append(option)
         spreaded.append(arg)
     return spreaded
 
@@ -63,10 +70,12 @@ app.command()(check_commands.verify)
 app.command()(check_commands.audit)
 app.command(name="list")(commands.list_buffers)
 app.command()(commands.show)
+app.command()(retrieval_commands.index)
 app.command()(commands.doctor)
 app.command()(simulator_commands.simulate)
 app.command(name="simulate-score")(simulator_commands.simulate_score)
 app.command()(score_commands.score)
+app.command()(evaluate_commands.evaluate)
 
 
 def main() -> None:

@@ -65,6 +65,11 @@ STATS_PATH = "meta/stats.json"
 EPISODES_DIR = "meta/episodes"
 IDENTITY_PATH = "meta/interference.json"
 REPORT_PATH = "meta/build_report.json"
+INDEX_DIR = "index"
+INDEX_HEADER = "index.json"
+INDEX_EMBEDDINGS = "embeddings.npy"
+INDEX_ROWS = "rows.parquet"
+INDEX_CENTRE = "centre.npy"
 
 # --- paths inside a split ----------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ from robomme_interference_data.constants import (
     STATE,
 )
 from robomme_interference_data.digest import FeatureDigests
+from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import (
     FormatError,
     MissingFileError,
@@ -87,6 +88,7 @@ class Dataset:
     def __init__(self, files: Files):
         self.files = files
         self._rows: dict[int, dict[str, Any]] = {}
+        self._indexes: dict[str, EmbeddingIndex] = {}
         path = files.path(INFO_PATH)
         self.info = read_json(path)
         version = self.info.get("codebase_version")
@@ -216,6 +218,21 @@ class Dataset:
                 nearest(str(episode), known),
             )
         return int(found)
+
+    def index(self, encoder: str) -> EmbeddingIndex:
+        """Return the embeddings of the stored frames, opened once.
+
+        Args:
+            encoder: Name of the encoder, such as `thumbnail`.
+
+        Raises:
+            MissingIndexError: The dataset has no embeddings of this encoder.
+            StaleIndexError: They were made of other data.
+            FormatError: They are of an unknown version, or damaged.
+        """
+        if encoder not in self._indexes:
+            self._indexes[encoder] = EmbeddingIndex(self.files, self.revision, encoder)
+        return self._indexes[encoder]
 
     def digests(self, episode_index: int, start: int, stop: int) -> dict[str, str] | None:
         """Return the recorded feature digests of a span; None if none are recorded for it."""

@@ -23,6 +23,9 @@ __all__ = [
     "TruncatedVideoError",
     "SourceError",
     "BadRowsError",
+    "MissingIndexError",
+    "StaleIndexError",
+    "MissingWeightsError",
     # what was to be written
     "BuildError",
     "PoolTooSmallError",
@@ -31,6 +34,12 @@ __all__ = [
     "NoRendererError",
     "MotionError",
     "SimulatorCrashError",
+    # evaluation
+    "PolicyError",
+    "PolicyServerError",
+    "WireError",
+    "RolloutError",
+    "RunFolderError",
     # helpers
     "nearest",
 ]
@@ -97,6 +106,18 @@ class BadRowsError(InterferenceError, ValueError):
     """Rows of rollouts that contradict themselves, each other or the protocol."""
 
 
+class MissingIndexError(InterferenceError, FileNotFoundError):
+    """A dataset without the embeddings that are asked for."""
+
+
+class StaleIndexError(InterferenceError, ValueError):
+    """Embeddings that were made of other data, or with another encoder, than is asked for."""
+
+
+class MissingWeightsError(InterferenceError, FileNotFoundError):
+    """The weights of a model are not on this machine."""
+
+
 class BuildError(InterferenceError, RuntimeError):
     """A build that cannot go on."""
 
@@ -119,6 +140,26 @@ class MotionError(InterferenceError, RuntimeError):
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
     """A simulator's worker process died, or did not answer in time."""
+
+
+class PolicyError(InterferenceError, RuntimeError):
+    """A policy that does not fit, breaks, is called out of order, or answers what it may not."""
+
+
+class PolicyServerError(InterferenceError, ConnectionError):
+    """A policy server that cannot be reached, reports an error, or does not answer in time."""
+
+
+class WireError(InterferenceError, ValueError):
+    """A message that the protocol of the policy servers cannot carry."""
+
+
+class RolloutError(InterferenceError, RuntimeError):
+    """A rollout that cannot be run as planned: simulator and data contradict each other."""
+
+
+class RunFolderError(InterferenceError, FileExistsError):
+    """A run's folder that holds another run, or that another process is writing."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError
 
-__all__ = ["Outcome", "run_tasks"]
+__all__ = ["Outcome", "run_tasks", "worker_number"]
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Outcome:
 class _Worker:
     """A process, the parent's end of its pipe, and the task that it works on."""
 
-    def __init__(self, context: Any, function: Callable[[Any], Any]):
+    def __init__(self, context: Any, function: Callable[[Any], Any], number: int):
         self.pipe, other = context.Pipe()
-        self.process = context.Process(target=_serve, args=(function, other), daemon=True)
+        self.process = context.Process(target=_serve, args=(function, other, number), daemon=True)
         self.process.start()
         other.close()
         self.task: Any = None
@@ -111,7 +111,7 @@ def run_tasks(
     waiting = deque((task, 1) for task in tasks)
     # "spawn": a fork of a process with threads (encoders, simulators) can hang.
     context = multiprocessing.get_context("spawn")
-    running = [_Worker(context, function) for _ in range(min(workers, len(waiting)))]
+    running = [_Worker(context, function, n) for n in range(min(workers, len(waiting)))]
     try:
         while waiting or any(worker.busy for worker in running):
             for worker in running:
@@ -127,7 +127,7 @@ def run_tasks(
                     yield result
                     continue
                 worker.stop()
-                running[place] = _Worker(context, function)
+                running[place] = _Worker(context, function, place)
                 if worker.attempts < attempts:
                     waiting.append((worker.task, worker.attempts + 1))
                 else:
@@ -145,8 +145,18 @@ def _patience(running: list[_Worker], time_limit: float | None) -> float | None:
     return max(0.05, first + time_limit - time.monotonic())
 
 
-def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
+def worker_number() -> int:
+    """Return which of the workers this process is, from 0; its replacement has the same number."""
+    return _number
+
+
+_number = 0
+
+
+def _serve(function: Callable[[Any], Any], pipe: Connection, number: int) -> None:
     """Work on tasks until the parent is gone."""
+    global _number  # noqa: PLW0603, a process is one worker
+    _number = number
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     # A parent that was killed cannot stop a task that hangs.
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -11,10 +11,10 @@ from robomme_interference_data import Dataset
 from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
 from robomme_interference_data.build_dataset.encode import get_codec
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-from robomme_interference_data.build_dataset.progress import BuildProgress
 from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.progress import BuildProgress
 
 FAMILIES = ("VideoRepick", "VideoUnmask", "MoveCube", "PatternLock")
 K = (0, 1, 3)

@@ -18,11 +18,11 @@ from robomme_interference_data.build_dataset.build import (
     build_dataset,
 )
 from robomme_interference_data.build_dataset.encode import get_codec
-from robomme_interference_data.build_dataset.progress import BuildProgress
 from robomme_interference_data.build_dataset.sources.base import Frame, Source, SourceEpisode
 from robomme_interference_data.errors import SourceError
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.workers import Outcome
 
 HEIGHT, WIDTH = 16, 24

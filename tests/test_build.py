@@ -16,13 +16,13 @@ from recordings import MemorySource, build, contents, listed, opened, run_here
 from robomme_interference_data.build_dataset import build as build_module
 from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
 from robomme_interference_data.build_dataset.encode import CODECS
-from robomme_interference_data.build_dataset.progress import BuildProgress
 from robomme_interference_data.errors import (
     BuildError,
     InvalidOptionError,
     MissingFileError,
     SourceError,
 )
+from robomme_interference_data.progress import BuildProgress
 
 NAMES = [f"{family}/train/{i}" for family in ("MoveCube", "Drawer") for i in range(2)]
 EPISODES = [listed(name) for name in NAMES]

@@ -17,11 +17,11 @@ from recordings import contents
 
 from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
 from robomme_interference_data.build_dataset.encode import CODECS
-from robomme_interference_data.build_dataset.progress import BuildProgress
 from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.stage import read_staged
 from robomme_interference_data.build_dataset.writer import load_lerobot
+from robomme_interference_data.progress import BuildProgress
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 

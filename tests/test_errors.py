@@ -28,9 +28,15 @@ BUILTINS = {
     "TruncatedVideoError": ValueError,
     "SourceError": ValueError,
     "BadRowsError": ValueError,
+    "MissingIndexError": FileNotFoundError,
+    "StaleIndexError": ValueError,
+    "MissingWeightsError": FileNotFoundError,
     "BuildError": RuntimeError,
     "PoolTooSmallError": ValueError,
     "HistoryTooLongError": ValueError,
+    "PolicyError": RuntimeError,
+    "PolicyServerError": ConnectionError,
+    "WireError": ValueError,
 }
 
 

@@ -43,8 +43,9 @@ class Policy(Protocol):
     each of them; `act`; and so on.
 
     Attributes:
-        cameras: Cameras whose frames it wants, such as `("front", "wrist")`: no others are drawn
-            or decoded.
+        cameras: Cameras whose live frames it wants, such as `("front", "wrist")`: no others are
+            drawn.
+        history_cameras: Cameras whose history it wants: no others are decoded.
         wants_history: Whether history makes a difference to it; if not, it runs `no-history` only.
         privileged: Whether it gets `RolloutInfo.simulator`.
         every_frame: Whether it wants what is seen after each action; if not, `observe` gets only
@@ -52,6 +53,7 @@ class Policy(Protocol):
     """
 
     cameras: tuple[str, ...]
+    history_cameras: tuple[str, ...]
     wants_history: bool
     privileged: bool
     every_frame: bool
@@ -64,14 +66,19 @@ class Policy(Protocol):
         """Take the next chunk of the history.
 
         Args:
-            frames: `(T, H, W, 3) uint8` of each of `cameras`.
+            frames: `(T, H, W, 3) uint8` of each of `history_cameras`.
             states: `(T, 8) float32`.
             exec_start_idx: Number of history frames in all, the same with every chunk.
         """
         ...
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Take the live observations since the last call, as `add_history` takes history."""
+        """Take the live observations since the last call.
+
+        Args:
+            frames: `(T, H, W, 3) uint8` of each of `cameras`.
+            states: `(T, 8) float32`.
+        """
         ...
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:

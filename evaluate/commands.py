@@ -1,0 +1,142 @@
+"""The command `evaluate`."""
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from robomme_interference_data.errors import InvalidOptionError
+
+__all__ = ["evaluate"]
+
+_messages = Console(stderr=True)
+
+
+def evaluate(
+    policy: Annotated[
+        str,
+        typer.Option(
+            help="replay, oracle, guess, hold, websocket://host:port[,host:port…], "
+            "lerobot:REPO_OR_PATH or python:module:factory."
+        ),
+    ],
+    split: Annotated[Path, typer.Option(help="Folder of the split of buffers.")],
+    out: Annotated[Path, typer.Option(help="Folder of the run; an earlier run is gone on with.")],
+    simulator: Annotated[str, typer.Option(help="tabletop or robomme.")] = "tabletop",
+    conditions: Annotated[
+        list[str] | None,
+        typer.Option(help="no-history, k0, k1, …; by default all that apply.", show_default=False),
+    ] = None,
+    families: Annotated[list[str], typer.Option(help="Task families, or all.")] = ["all"],  # noqa: B006
+    episodes: Annotated[str, typer.Option(help="Indices, such as 0-49 or 0,3,10-12.")] = "0-49",
+    episode_split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    system: Annotated[
+        str | None, typer.Option(help="Name for the rows; see docs/systems.md.")
+    ] = None,
+    memory: Annotated[
+        str | None, typer.Option(help="Memory of replay: full, framesamp or window.")
+    ] = None,
+    model_seed: Annotated[int, typer.Option(help="Seed for the policy.")] = 0,
+    retrieval: Annotated[
+        str | None,
+        typer.Option(help="Put a retrieval step with this encoder in front of the policy."),
+    ] = None,
+    retrieval_threshold: Annotated[
+        float | None, typer.Option(help="Cosine below which the retrieval step cuts.")
+    ] = None,
+    robomme_python: Annotated[
+        str | None,
+        typer.Option(help="Interpreter that has RoboMME.", envvar="ROBOMME_PYTHON"),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Worker processes.")] = 1,
+    videos: Annotated[bool, typer.Option(help="Write a video of each rollout.")] = False,
+    check_lesson: Annotated[
+        bool,
+        typer.Option(help="Compare each lesson with what the simulator plays, bit for bit."),
+    ] = False,
+    rollout_timeout: Annotated[float, typer.Option(help="Seconds a rollout may take.")] = 3600.0,
+    history_chunk: Annotated[
+        int, typer.Option(min=1, help="Frames of history handed over at a time.")
+    ] = 64,
+    max_errors: Annotated[
+        int, typer.Option(min=1, help="Errors in a row after which the run stops.")
+    ] = 10,
+    resume: Annotated[bool, typer.Option(help="Go on with a run that is there.")] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Write the rows as JSON.")] = False,
+) -> None:
+    """Roll out a policy under the benchmark's conditions, one row per rollout.
+
+    Before each episode the policy gets the history that the condition prescribes: nothing
+    (no-history), the lesson (k0), or the lesson and k sessions of other tasks. RUN/rollouts.csv,
+    RUN/rollouts.parquet and RUN/run.json hold what came out. Stop it at any time: the same
+    command goes on, skips what is finished and repeats what broke.
+
+    Examples:
+      robomme-interference evaluate --policy replay --memory window --split S --out runs/window
+
+      robomme-interference evaluate --policy websocket://localhost:8000 --split S --out runs/mine
+      --system perceptual-framesamp-modul --conditions k0 k7 --families MoveCube RouteStick
+
+      robomme-interference evaluate --policy oracle --split S --out runs/oracle --episodes 0-4
+      --videos
+    """
+    from robomme_interference_data.evaluate.progress import RunProgress, rate_table
+    from robomme_interference_data.evaluate.runner import run_evaluation
+    from robomme_interference_data.simulators.base import Status
+
+    if memory is not None and policy != "replay":
+        raise InvalidOptionError(
+            f"--memory {memory} says nothing to the policy {policy}: only replay has memory rules",
+            "Leave it out.",
+        )
+    command = shlex.join(["robomme-interference", *sys.argv[1:]])
+    try:
+        with RunProgress(quiet=as_json) as progress:
+            result = run_evaluation(
+                policy,
+                split,
+                out,
+                simulator=simulator,
+                conditions=conditions,
+                families=families,
+                episodes=episodes,
+                episode_split=episode_split,
+                system=system,
+                memory=memory,
+                model_seed=model_seed,
+                retrieval=retrieval,
+                retrieval_threshold=retrieval_threshold,
+                robomme_python=robomme_python,
+                check_lesson=check_lesson,
+                videos=videos,
+                workers=workers,
+                rollout_s=rollout_timeout,
+                history_chunk=history_chunk,
+                max_errors=max_errors,
+                resume=resume,
+                command=[command],
+                listener=progress,
+            )
+    except KeyboardInterrupt:
+        _messages.print(f"\nStopped. Finished rollouts are in {out}; go on with:", markup=False)
+        _messages.print(command, markup=False, soft_wrap=True)
+        raise typer.Exit(130) from None
+    if as_json:
+        typer.echo(json.dumps([row.as_dict() for row in result.rows], ensure_ascii=False))
+    else:
+        Console().print(rate_table(result.rows))
+        typer.echo(f"{len(result.rows)} of {result.planned} rollouts in {out}/rollouts.csv")
+    broken = result.counts[str(Status.ERROR)]
+    if result.stopped is not None:
+        _messages.print(f"Stopped: {result.stopped}", style="red", markup=False)
+    if broken:
+        _messages.print(
+            f"{broken} rollouts broke (see {out}/errors.log); the same command runs them again:",
+            markup=False,
+        )
+        _messages.print(command, markup=False, soft_wrap=True)
+        raise typer.Exit(1)

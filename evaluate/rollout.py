@@ -1,0 +1,275 @@
+"""One rollout: reset, feed the history that the condition prescribes, then the live loop."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.draw import even_sample
+from robomme_interference_data.errors import PolicyError, RolloutError
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
+from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, Rollout
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.loader import Split
+from robomme_interference_data.retrieval.selector import Selection, Selector
+from robomme_interference_data.simulators.base import (
+    Demonstration,
+    EpisodeInfo,
+    Observation,
+    Simulator,
+    Status,
+)
+
+__all__ = ["ACTION_CHUNK", "Watcher", "base_row", "check_lesson", "run_rollout"]
+
+ACTION_CHUNK = 16
+"""Actions of a chunk that are executed before the policy is asked again (paper)."""
+
+
+class Watcher(Protocol):
+    """Sees a rollout as it goes, for a video. It wants the front camera at every step."""
+
+    def begin(self, buffer: Buffer | None, first: Observation, info: EpisodeInfo) -> None:
+        """Take what is known before the first step."""
+        ...
+
+    def step(self, observation: Observation, status: Status, subgoal: str | None) -> None:
+        """Take what came of a step."""
+        ...
+
+
+@dataclass
+class _Clock:
+    """Seconds by part of a rollout."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+def base_row(config: RunConfig, item: WorkItem) -> dict[str, Any]:
+    """Return the columns that are known before a rollout begins: its key."""
+    return {
+        "system": config.system,
+        "simulator": config.simulator,
+        "split": config.split_name,
+        "revision": config.revision,
+        "family": item.episode.family,
+        "condition": item.condition,
+        "episode_split": item.episode.split,
+        "episode": item.episode.index,
+        "model_seed": config.model_seed,
+        "protocol_version": PROTOCOL_VERSION,
+    }
+
+
+def run_rollout(
+    config: RunConfig,
+    item: WorkItem,
+    *,
+    simulator: Simulator,
+    policy: Policy,
+    split: Split,
+    selector: Selector | None = None,
+    watcher: Watcher | None = None,
+) -> Rollout:
+    """Run one rollout and return its row.
+
+    The policy never gets what the simulator returns of the demonstration: its history comes from
+    the dataset, and under `no-history` there is none (protocol, rules 2 and 6).
+
+    Raises:
+        RolloutError: Simulator and dataset speak of different episodes.
+        PolicyError: The policy broke, or returned no actions.
+        SimulatorCrashError: The simulator broke.
+    """
+    clock = _Clock()
+    began = time.perf_counter()
+    buffer = None if item.k is None else split.load(item.episode, item.k)
+    with clock.part("reset_s"):
+        demonstration, first, info = simulator.reset(
+            str(item.episode), demonstration=config.check_lesson
+        )
+    _check_episode(item.episode, split, info)
+    if config.check_lesson:
+        check_lesson(split.load(item.episode, split.k_values[0]), demonstration, first)
+    if watcher is not None:
+        watcher.begin(buffer, first, info)
+    chosen = None
+    start, stop = 0, 0 if buffer is None else len(buffer)
+    with clock.part("history_s"):
+        if selector is not None and buffer is not None and len(buffer):
+            chosen = selector.select(buffer, first.images[selector.camera])
+            start, stop = chosen.start, chosen.stop
+        policy.reset(
+            RolloutInfo(
+                info.goal,
+                stop - start,
+                config.model_seed,
+                simulator if policy.privileged else None,
+            )
+        )
+        if buffer is not None:
+            for chunk in buffer.stream(config.history_chunk, policy.history_cameras, start, stop):
+                policy.add_history(chunk.frames, chunk.states, stop - start)
+    status, steps = _live(policy, simulator, first, info.goal, clock, watcher)
+    if status is Status.ERROR:
+        raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
+    lesson = 0 if buffer is None else _lesson_frames(buffer, start, stop)
+    times: dict[str, Any] = {name: round(value, 4) for name, value in clock.seconds.items()}
+    return Rollout(
+        **base_row(config, item),
+        seed=info.seed,
+        difficulty=info.difficulty,
+        goal=info.goal,
+        status=str(status),
+        success=status is Status.SUCCESS,
+        steps=steps,
+        history_frames=stop - start,
+        lesson_frames=lesson,
+        lesson_share=None if buffer is None else _share(buffer, start, stop),
+        **_retrieval_columns(selector, chosen),
+        **times,
+        wall_s=round(time.perf_counter() - began, 4),
+    )
+
+
+def _live(
+    policy: Policy,
+    simulator: Simulator,
+    first: Observation,
+    goal: str,
+    clock: _Clock,
+    watcher: Watcher | None,
+) -> tuple[Status, int]:
+    """Run the live loop; return how it ended and the number of executed steps."""
+    seen, steps = [first], 0
+    while True:
+        with clock.part("policy_s"):
+            frames = {name: np.stack([one.images[name] for one in seen]) for name in policy.cameras}
+            policy.observe(frames, np.stack([one.state for one in seen]))
+            actions = _checked(policy.act(seen[-1], goal))[: MAX_STEPS - steps]
+        seen = []
+        for number, action in enumerate(actions, 1):
+            decides = number == len(actions)
+            wanted = policy.every_frame or decides
+            with clock.part("simulator_s"):
+                observed, status = simulator.step(action, observe=wanted or watcher is not None)
+            steps += 1
+            if watcher is not None:
+                watcher.step(observed, status, getattr(policy, "subgoal", None))
+            if status is not Status.ONGOING:
+                return status, steps
+            if wanted:
+                seen.append(observed)
+        if steps >= MAX_STEPS:
+            return Status.TIMEOUT, steps
+
+
+def _checked(actions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the actions of a chunk that are executed."""
+    found = np.asarray(actions)
+    if found.ndim != 2 or found.shape[1] != 8 or not len(found):
+        raise PolicyError(
+            f"the policy returned actions of shape {found.shape}; expected (n, 8) with n ≥ 1",
+            "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
+        )
+    executed = found[:ACTION_CHUNK].astype(np.float32)
+    if not np.isfinite(executed).all():
+        raise PolicyError("the policy returned actions that are not finite numbers")
+    return executed
+
+
+def _check_episode(episode: EpisodeId, split: Split, info: EpisodeInfo) -> None:
+    """Check that the simulator's episode is the one that the dataset recorded."""
+    manifest = split.manifest(episode, split.k_values[0])
+    for name in ("seed", "difficulty"):
+        recorded, played = getattr(manifest, name), getattr(info, name)
+        if recorded is not None and recorded != played:
+            raise RolloutError(
+                f"{episode}: {name} is {recorded!r} in the dataset, {played!r} in the simulator",
+                "The dataset was recorded with another version of the simulator: build it again.",
+            )
+
+
+def check_lesson(buffer: Buffer, played: Demonstration, first: Observation) -> None:
+    """Compare the lesson and query frame of the dataset with what the simulator played.
+
+    Raises:
+        RolloutError: They differ in a bit; says where first.
+    """
+    episode = buffer.episode_id
+    lesson = next(s for s in buffer.sessions if s.role == "lesson")
+    if lesson.stop - lesson.start != len(played):
+        raise RolloutError(
+            f"{episode}: the lesson has {lesson.stop - lesson.start} frames, the simulator's "
+            f"demonstration {len(played)}"
+        )
+    if not np.array_equal(buffer.states[lesson.start : lesson.stop], played.states):
+        raise RolloutError(f"{episode}: the lesson's states are not the simulator's")
+    for camera in buffer.cameras:
+        if camera not in first.images:
+            continue
+        for chunk in buffer.stream(64, (camera,), lesson.start, lesson.stop):
+            at = chunk.start - lesson.start
+            theirs = played.images[camera][at : at + len(chunk)]
+            differing = (chunk.frames[camera] != theirs).any(axis=(1, 2, 3))
+            if differing.any():
+                raise RolloutError(
+                    f"{episode}: frame {at + int(differing.argmax())} of the lesson's {camera} "
+                    "camera is not what the simulator shows",
+                    "Another renderer or machine made the dataset; the states agree.",
+                )
+        if not np.array_equal(buffer.query_frame(camera), first.images[camera]):
+            raise RolloutError(
+                f"{episode}: the first live {camera} view is not the recorded query frame"
+            )
+
+
+def _lesson_frames(buffer: Buffer, start: int, stop: int) -> int:
+    return sum(
+        max(0, min(stop, s.stop) - max(start, s.start))
+        for s in buffer.sessions
+        if s.role == "lesson"
+    )
+
+
+def _share(buffer: Buffer, start: int, stop: int) -> float:
+    """Return the share of lesson frames in an even sample of a span and the live observation."""
+    sample = even_sample(stop - start)
+    lesson = [s for s in buffer.sessions if s.role == "lesson"]
+    inside = _count(lesson, (start + index for index in sample[:-1]))
+    return inside / len(sample)
+
+
+def _count(sessions: Sequence[Any], indices: Any) -> int:
+    return sum(any(s.start <= index < s.stop for s in sessions) for index in indices)
+
+
+def _retrieval_columns(selector: Selector | None, chosen: Selection | None) -> dict[str, Any]:
+    if selector is None:
+        return {}
+    if chosen is None:
+        return {"retrieval_model": selector.name}
+    return {
+        "retrieval_model": selector.name,
+        "retrieval_start": chosen.start,
+        "retrieval_stop": chosen.stop,
+        "retrieval_selected_lesson_fraction": chosen.lesson_fraction,
+        "retrieval_selected_filler_fraction": chosen.filler_fraction,
+        "retrieval_selected_query_fraction": chosen.query_fraction,
+    }

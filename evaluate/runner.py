@@ -1,0 +1,246 @@
+"""Run an evaluation: check everything, then roll out what is not done yet, and never lose a row."""
+
+import dataclasses
+import datetime
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from robomme_interference_data.evaluate.checks import (
+    applicable,
+    check_plan,
+    check_settings,
+    describe_policy,
+)
+from robomme_interference_data.evaluate.config import (
+    RunConfig,
+    default_system,
+    identity,
+    provenance,
+)
+from robomme_interference_data.evaluate.log import RunLog, open_log, summary
+from robomme_interference_data.evaluate.plan import (
+    WorkItem,
+    parse_episodes,
+    plan_work,
+    select_families,
+)
+from robomme_interference_data.evaluate.rollout import base_row
+from robomme_interference_data.evaluate.rows import KEY_COLUMNS, Rollout
+from robomme_interference_data.evaluate.worker import RolloutWorker, error_row
+from robomme_interference_data.loader import load_split
+from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.workers import Outcome, run_tasks
+
+__all__ = ["Listener", "RunResult", "run_evaluation"]
+
+_TABLES_S = 30.0
+"""Seconds between two writings of the tables while a run goes on."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to.
+
+    Attributes:
+        folder: The run's folder.
+        rows: Rows of all rollouts that were asked for and have ended, in plan order.
+        planned: Rollouts that were asked for.
+        counts: Rows by status.
+        stopped: Why the run ended early, or None.
+    """
+
+    folder: Path
+    rows: tuple[Rollout, ...]
+    planned: int
+    counts: dict[str, int]
+    stopped: str | None
+
+
+class Listener(Protocol):
+    """Hears how a run goes, to show it."""
+
+    def start(self, plan: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
+        """Take the plan, and the rows that an earlier run finished."""
+        ...
+
+    def row(self, row: Rollout) -> None:
+        """Take a row that has just been written."""
+        ...
+
+
+def run_evaluation(
+    policy: str,
+    split: str | Path,
+    out: str | Path,
+    *,
+    simulator: str = "tabletop",
+    conditions: Sequence[str] | None = None,
+    families: Sequence[str] = ("all",),
+    episodes: str = "0-49",
+    episode_split: str = "test",
+    system: str | None = None,
+    memory: str | None = None,
+    model_seed: int = 0,
+    retrieval: str | None = None,
+    retrieval_threshold: float | None = None,
+    robomme_python: str | None = None,
+    check_lesson: bool = False,
+    videos: bool = False,
+    workers: int = 1,
+    rollout_s: float = 3600.0,
+    history_chunk: int = 64,
+    max_errors: int = 10,
+    resume: bool = True,
+    command: Sequence[str] = (),
+    listener: Listener | None = None,
+) -> RunResult:
+    """Roll out a policy under the benchmark's protocol and write one row per rollout.
+
+    Rows are on the disk as rollouts end. Run again with the same `out`, it skips finished
+    rollouts, repeats errors, and adds what is newly asked for.
+
+    Args:
+        policy: `replay`, `oracle`, `guess`, `hold`, `websocket://host:port[,…]`,
+            `lerobot:REPO_OR_PATH` or `python:module:factory`.
+        split: Folder of the split of buffers.
+        out: Folder of the run.
+        simulator: `tabletop`, `robomme`, or `module:function` of your own.
+        conditions: `no-history`, `k0`, `k1`, …; None for all that the split has and the system
+            takes.
+        families: Task families, or `all`.
+        episodes: Indices, such as `0-49` or `0,3,10-12`; ends are included.
+        episode_split: `train`, `val` or `test`.
+        system: Name for the rows; by default the policy's own, `retrieval-…` with retrieval.
+        memory: Memory of `replay`: `full`, `framesamp` or `window`.
+        model_seed: Seed for the policy.
+        retrieval: Encoder of a retrieval step in front of the policy, or None.
+        retrieval_threshold: Cosine below which it cuts; None for the encoder's own rule.
+        robomme_python: Interpreter in which the official simulator is installed.
+        check_lesson: Compare each lesson of the dataset with the simulator's, bit for bit.
+        videos: Write a video of each rollout.
+        workers: Worker processes, each with a simulator and a policy.
+        rollout_s: Seconds that a rollout may take before it is an error.
+        history_chunk: Frames of history that are handed over at a time.
+        max_errors: Errors in a row after which the run stops.
+        resume: Go on with a run that is in `out` already.
+        command: The command line, for the record.
+        listener: Hears how the run goes.
+
+    Raises:
+        UnknownNameError, InvalidOptionError, InvalidIdError: An option is not what it may be.
+        HistoryTooLongError: A buffer exceeds the system's position limit.
+        MissingFileError: The split is not there.
+        RunFolderError: `out` holds another run, or something else.
+        PolicyError: The policy cannot be made, or its server not reached.
+    """
+    opened = load_split(split)
+    label = system or default_system(policy, memory, retrieval is not None)
+    config = RunConfig(
+        system=label,
+        policy=policy,
+        memory=memory,
+        simulator=simulator,
+        split=str(split),
+        split_name=opened.name,
+        revision=opened.revision,
+        episode_split=episode_split,
+        model_seed=model_seed,
+        retrieval=retrieval,
+        retrieval_threshold=retrieval_threshold,
+        robomme_python=robomme_python,
+        check_lesson=check_lesson,
+        videos=videos,
+        workers=workers,
+        rollout_s=rollout_s,
+        history_chunk=history_chunk,
+        max_errors=max_errors,
+    )
+    about = describe_policy(config)
+    check_settings(config, opened, about)
+    plan = plan_work(
+        opened.episode_ids,
+        episode_split=episode_split,
+        families=select_families(families, opened.families),
+        episodes=parse_episodes(episodes),
+        conditions=applicable(config, opened, about) if conditions is None else conditions,
+    )
+    check_plan(config, opened, about, plan)
+    with open_log(Path(out), identity(config), resume) as log:
+        log.write_header(policy=about.metadata, status="running", **provenance(list(command)))
+        log.header["plans"] = [*log.header["plans"], _plan_of(plan)]
+        log.write_header()
+        return _run(config, plan, log, listener)
+
+
+def _run(
+    config: RunConfig, plan: Sequence[WorkItem], log: RunLog, listener: Listener | None
+) -> RunResult:
+    keys = {_key(config, item): item for item in plan}
+    order = {key: number for number, key in enumerate(keys)}
+    finished = log.finished
+    done = [log.rows[key] for key in keys if key in finished]
+    todo = [item for key, item in keys.items() if key not in finished]
+    if listener is not None:
+        listener.start(plan, done)
+    log.write_tables(order)
+    stopped: str | None = "interrupted"
+    written = time.monotonic()
+    errors = 0
+    outcomes = run_tasks(
+        RolloutWorker(config, log.folder), todo, workers=config.workers, time_limit=config.rollout_s
+    )
+    try:
+        for outcome in outcomes:
+            row, traceback = _row(config, outcome, log)
+            log.append(row, traceback)
+            if listener is not None:
+                listener.row(row)
+            errors = errors + 1 if row.status == Status.ERROR else 0
+            if errors >= config.max_errors:
+                stopped = f"{errors} rollouts in a row broke; the last: {row.error}"
+                break
+            if time.monotonic() - written > _TABLES_S:
+                log.write_tables(order)
+                written = time.monotonic()
+        else:
+            stopped = None
+    finally:
+        outcomes.close()
+        log.write_tables(order)
+        rows = tuple(log.rows[key] for key in keys if key in log.rows)
+        counts = summary(rows)
+        status = "complete" if stopped is None and not counts[str(Status.ERROR)] else "incomplete"
+        log.write_header(status=status, stopped=stopped, planned=len(plan), counts=counts)
+    return RunResult(log.folder, rows, len(plan), counts, stopped)
+
+
+def _row(config: RunConfig, outcome: Outcome, log: RunLog) -> tuple[Rollout, str | None]:
+    """Return the row of an outcome, with its attempt and time, and the traceback of an error."""
+    traceback: str | None = None
+    if outcome.error is None:
+        row, traceback = outcome.value
+    else:
+        # The process died or hung: its last words are all there is.
+        row = error_row(config, outcome.task, f"{type(outcome.error).__name__}: {outcome.error}")
+    before = log.rows[row.key].attempt if row.key in log.rows else 0
+    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return (
+        dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=now),
+        traceback,
+    )
+
+
+def _key(config: RunConfig, item: WorkItem) -> tuple[object, ...]:
+    columns = base_row(config, item)
+    return tuple(columns[name] for name in KEY_COLUMNS)
+
+
+def _plan_of(plan: Sequence[WorkItem]) -> dict[str, object]:
+    return {
+        "families": list(dict.fromkeys(item.episode.family for item in plan)),
+        "episodes": sorted({item.episode.index for item in plan}),
+        "conditions": list(dict.fromkeys(item.condition for item in plan)),
+    }

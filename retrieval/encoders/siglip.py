@@ -1,0 +1,188 @@
+"""SigLIP and SigLIP 2, the paper's encoders, through transformers. The only file that imports it.
+
+Nothing is downloaded: weights are read from a folder or from the Hub's cache.
+"""
+
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingExtraError,
+    MissingWeightsError,
+)
+
+__all__ = ["DEFAULT_MODEL", "PAPER_THRESHOLD", "Siglip"]
+
+DEFAULT_MODEL = "google/siglip-so400m-patch14-384"
+
+PAPER_THRESHOLD = 0.923
+"""The paper's cut (section "Adding Retrieval"), made for the default model."""
+
+_FILES = ("*.json", "*.safetensors")
+
+
+class Siglip:
+    """The vision tower of a SigLIP or SigLIP 2 model: its pooled output.
+
+    Args:
+        model: Id on the Hub, with `@revision` if it is not the main branch, or a folder.
+        device: Where to compute, such as `cpu` or `cuda`; None for a GPU if there is one.
+        batch: Images at a time; None for 32 on a GPU and 8 on a CPU.
+
+    Raises:
+        MissingExtraError: torch, transformers or Pillow is not installed.
+        MissingWeightsError: The model is not on this machine.
+        FormatError: It is no SigLIP model.
+        InvalidOptionError: There is no such device.
+    """
+
+    centred = False
+
+    def __init__(
+        self, model: str = DEFAULT_MODEL, *, device: str | None = None, batch: int | None = None
+    ):
+        torch, transformers = _libraries()
+        self.name = "siglip" if model == DEFAULT_MODEL else f"siglip:{model}"
+        self.threshold = PAPER_THRESHOLD if model == DEFAULT_MODEL else None
+        self._torch = torch
+        folder, self._revision = _locate(model)
+        self._model = "/".join(model.partition("@")[0].split("/")[-2:]) if self._revision else None
+        try:
+            self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+            torch.empty(0, device=self._device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).partition("\n")[0]
+            raise InvalidOptionError(
+                f"device {device!r} cannot be used: {reason}", "Try: --device cpu"
+            ) from None
+        self.batch = batch or (32 if self._device.type == "cuda" else 8)
+        self._vision, self._processor = _load(transformers, model, folder)
+        self._weights_sha256 = _weights_digest(self._vision)
+        self._dtype = self._precision()
+        self._vision.to(self._device, self._dtype)
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What determines the features, up to the precision in which they are computed."""
+        settings = self._processor.to_dict()
+        settings = {name: value for name, value in settings.items() if _is_plain(value)}
+        return {
+            "name": "siglip",
+            "model": self._model,
+            "revision": self._revision,
+            "weights_sha256": self._weights_sha256,
+            "preprocessing": settings,
+        }
+
+    @property
+    def computed_in(self) -> str:
+        """Device and precision, such as `cpu, float32`."""
+        return f"{self._device.type}, {str(self._dtype).removeprefix('torch.')}"
+
+    def prepare(self, images: NDArray[np.uint8]) -> Any:
+        """Preprocess images as the model's own image processor does."""
+        return self._processor(images=list(images), return_tensors="pt")
+
+    def features(self, prepared: Any) -> NDArray[np.float32]:
+        """Return the pooled outputs of the vision tower, `(N, D) float32`."""
+        inputs = {
+            name: value.to(self._device, self._dtype if value.is_floating_point() else None)
+            for name, value in prepared.items()
+        }
+        with self._torch.inference_mode():
+            pooled = self._vision(**inputs).pooler_output
+        return pooled.float().cpu().numpy()
+
+    def _precision(self) -> Any:
+        if self._device.type != "cuda":
+            return self._torch.float32
+        supported = self._torch.cuda.is_bf16_supported()
+        return self._torch.bfloat16 if supported else self._torch.float16
+
+
+def _libraries() -> tuple[Any, Any]:
+    try:
+        import PIL  # noqa: F401 - the image processor needs it
+        import torch
+        import transformers
+    except ImportError as error:
+        raise MissingExtraError(
+            f"the encoder siglip needs torch, transformers and Pillow: {error}",
+            'Install them: pip install "robomme-interference-data[retrieval]"',
+        ) from error
+    return torch, transformers
+
+
+def _locate(model: str) -> tuple[Path, str | None]:
+    """Return the folder that holds a model, and its commit if it is from the Hub."""
+    from huggingface_hub import constants, snapshot_download
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
+
+    if Path(model).is_dir():
+        return Path(model), None
+    repository, _, revision = model.partition("@")
+    try:
+        folder = Path(
+            snapshot_download(repository, revision=revision or None, local_files_only=True)
+        )
+    except (LocalEntryNotFoundError, HFValidationError):
+        folder = None
+    if folder is None or not any(folder.glob("*.safetensors")):
+        pinned = f" --revision {revision}" if revision else ""
+        patterns = " ".join(f'--include "{pattern}"' for pattern in _FILES)
+        raise MissingWeightsError(
+            f"the weights of {model} are neither a folder nor in the Hub's cache, "
+            f"{constants.HF_HUB_CACHE}",
+            f"Where there is a network, type: hf download {repository}{pinned} {patterns}",
+        )
+    return folder, folder.name
+
+
+def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
+    """Return the vision tower, in float32 and for inference, and its image processor."""
+    try:
+        kind = transformers.AutoConfig.from_pretrained(folder).model_type
+        classes = {
+            "siglip": transformers.SiglipVisionModel,
+            "siglip_vision_model": transformers.SiglipVisionModel,
+            "siglip2": transformers.Siglip2VisionModel,
+            "siglip2_vision_model": transformers.Siglip2VisionModel,
+        }
+        if kind not in classes:
+            raise FormatError(
+                f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
+                f"For example: --encoder siglip:{DEFAULT_MODEL}",
+            )
+        vision = classes[kind].from_pretrained(folder, dtype="float32", local_files_only=True)
+        # Pillow resizes the same everywhere; the other backend only where torchvision is.
+        processor = transformers.AutoImageProcessor.from_pretrained(
+            folder, backend="pil", local_files_only=True
+        )
+    except (OSError, ValueError) as error:
+        if isinstance(error, FormatError):
+            raise
+        reason = str(error).partition("\n")[0]
+        raise FormatError(
+            f"{model} cannot be loaded from {folder}: {reason}",
+            "The folder is not a whole model: download or save it again.",
+        ) from error
+    return vision.eval(), processor
+
+
+def _weights_digest(vision: Any) -> str:
+    """Return the SHA-256 over the vision tower's weights, by name."""
+    running = sha256()
+    for name, value in sorted(vision.state_dict().items()):
+        running.update(f"{name} {tuple(value.shape)}\n".encode())
+        running.update(value.numpy().tobytes())
+    return running.hexdigest()
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, bool | int | float | str | list | dict)

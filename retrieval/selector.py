@@ -1,0 +1,187 @@
+"""The retrieval step of a rollout: embed what the robot sees, look its session up."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.constants import CAMERA_PREFIX
+from robomme_interference_data.draw import even_sample
+from robomme_interference_data.embeddings import EmbeddingIndex, normalised
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    StaleIndexError,
+    UnknownNameError,
+    nearest,
+)
+from robomme_interference_data.retrieval.encoders import make_encoder
+from robomme_interference_data.retrieval.encoders.base import fingerprint_digest
+from robomme_interference_data.retrieval.segment import Span, adaptive_threshold
+from robomme_interference_data.retrieval.select import METHODS, Choice, choose
+
+__all__ = ["Selection", "Selector", "true_lesson"]
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The span of a history that is handed to the policy, and what it was chosen by.
+
+    Attributes:
+        start: First frame in the buffer.
+        stop: Frame after the last one.
+        choice: Segments, scores and cosines, for the picture.
+        lesson_fraction: Share of lesson frames in an even 32-frame sample of the span and the
+            first live observation, as in the released CSV.
+        filler_fraction: The same for frames of other sessions.
+        query_fraction: The same for the first live observation.
+    """
+
+    start: int
+    stop: int
+    choice: Choice
+    lesson_fraction: float
+    filler_fraction: float
+    query_fraction: float
+
+
+class Selector:
+    """Chooses the span of a history that goes with what the robot sees.
+
+    The history's embeddings are looked up in the index beside the data; only the live image is
+    embedded. True sessions are read after the choice, to grade it, and by `oracle`.
+
+    Args:
+        encoder: Name of the encoder, see `make_encoder`.
+        threshold: Cosine of adjacent frames below which a history is cut; None for the one
+            published for the encoder, or, where there is none, for `adaptive_threshold`.
+        method: One of `select.METHODS` that chooses a segment.
+        device: Where to compute; None for a GPU if there is one.
+
+    Raises:
+        UnknownNameError: There is no such encoder or method.
+        InvalidOptionError: The method chooses single frames, or the threshold is no cosine.
+        MissingExtraError, MissingWeightsError, FormatError: See `make_encoder`.
+    """
+
+    def __init__(
+        self,
+        encoder: str,
+        *,
+        threshold: float | None = None,
+        method: str = "max",
+        device: str | None = None,
+    ):
+        if method not in METHODS:
+            raise UnknownNameError(f"there is no method {method!r}", nearest(method, METHODS))
+        if method == "top32":
+            raise InvalidOptionError(
+                "method 'top32' chooses single frames; a policy is handed a span",
+                "Choose max, mean, last, random or oracle.",
+            )
+        if threshold is not None and not -1 <= threshold <= 1:
+            raise InvalidOptionError(
+                f"threshold {threshold} is no cosine; expected −1 to 1",
+                "Leave it out for the encoder's own.",
+            )
+        self._encoder = make_encoder(encoder, device=device)
+        self._threshold = threshold if threshold is not None else self._encoder.threshold
+        self.method = method
+
+    @property
+    def name(self) -> str:
+        """Encoder and rule, such as `thumbnail/max/adaptive` or `siglip/max/0.923`."""
+        cut = "adaptive" if self._threshold is None else f"{self._threshold:g}"
+        return f"{self._encoder.name}/{self.method}/{cut}"
+
+    @property
+    def camera(self) -> str:
+        """Camera whose frames it compares."""
+        return "front"
+
+    def threshold_for(self, index: EmbeddingIndex) -> float:
+        """Return the cosine below which histories of this index are cut."""
+        if self._threshold is not None:
+            return self._threshold
+        return adaptive_threshold(index.typical_cosine)
+
+    def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Selection:
+        """Choose the span of a buffer that goes with an image.
+
+        Args:
+            buffer: The history.
+            image: The first live observation, `(H, W, 3) uint8` RGB.
+
+        Raises:
+            MissingIndexError: The data has no embeddings of this encoder.
+            StaleIndexError: They were made of other data, or with another version of the encoder.
+            InvalidOptionError: The buffer is empty, or the image has another shape.
+        """
+        index = buffer.query_index(self._encoder.name)
+        self._check(index)
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise InvalidOptionError(
+                f"image of shape {image.shape}, {image.dtype}; expected (H, W, 3) uint8"
+            )
+        features = self._encoder.features(self._encoder.prepare(image[None]))
+        return self._choose(buffer, normalised(features, index.centre)[0])
+
+    def select_stored(self, buffer: Buffer) -> Selection:
+        """Choose with the stored first live observation, whose embedding is looked up too."""
+        return self._choose(buffer, buffer.query_embedding(self._encoder.name))
+
+    def _choose(self, buffer: Buffer, query: NDArray[np.float16]) -> Selection:
+        name = self._encoder.name
+        choice = choose(
+            buffer.embeddings(name),
+            query,
+            threshold=self.threshold_for(buffer.query_index(name)),
+            method=self.method,
+            lesson=true_lesson(buffer) if self.method == "oracle" else None,
+            lot=f"{buffer.episode_id} k{buffer.k}",
+        )
+        start, stop = choice.span
+        return Selection(start, stop, choice, *_fractions(buffer, start, stop))
+
+    def _check(self, index: EmbeddingIndex) -> None:
+        """Check that the index was made with this very encoder and camera."""
+        centre = index.header["files"].get("centre.npy", {}).get("sha256")
+        if index.fingerprint != fingerprint_digest(self._encoder.fingerprint, centre):
+            raise StaleIndexError(
+                f"the embeddings of {self._encoder.name!r} beside the data were made with another "
+                "version of the encoder: its weights, preprocessing or code differ",
+                "Make them again: robomme-interference index --data SPLIT --encoder "
+                f"{self._encoder.name}",
+            )
+        if index.camera != CAMERA_PREFIX + self.camera:
+            raise StaleIndexError(
+                f"the embeddings of {self._encoder.name!r} beside the data are of camera "
+                f"{index.camera.removeprefix(CAMERA_PREFIX)!r}; expected {self.camera!r}",
+                f"Make them again: robomme-interference index --data SPLIT --encoder "
+                f"{self._encoder.name} --camera {self.camera}",
+            )
+
+
+def true_lesson(buffer: Buffer) -> Span:
+    """Return the span of the lesson in a buffer, for grading.
+
+    Raises:
+        InvalidOptionError: The buffer has no lesson, or has it in several parts.
+    """
+    found = [session.span for session in buffer.sessions if session.role == "lesson"]
+    if len(found) != 1:
+        raise InvalidOptionError(
+            f"the buffer of {buffer.episode_id} at k={buffer.k} has {len(found)} lesson sessions; "
+            "expected 1"
+        )
+    return found[0]
+
+
+def _fractions(buffer: Buffer, start: int, stop: int) -> tuple[float, float, float]:
+    """Return the shares of lesson, other sessions and live observation in an even sample."""
+    sample = even_sample(stop - start)
+    lessons = [session.span for session in buffer.sessions if session.role == "lesson"]
+    history = [start + index for index in sample if index < stop - start]
+    lesson = sum(any(first <= frame < last for first, last in lessons) for frame in history)
+    counts = (lesson, len(history) - lesson, len(sample) - len(history))
+    return counts[0] / len(sample), counts[1] / len(sample), counts[2] / len(sample)

@@ -1,0 +1,220 @@
+"""Look up the embeddings of stored frames: the index that lies beside a dataset's frames.
+
+An index is made by `robomme-interference index` (the retrieval area); reading it needs numpy and
+pyarrow only. `docs/format.md` lists its files.
+"""
+
+import re
+from functools import cached_property
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robomme_interference_data import parquet
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    FORMAT_VERSION,
+    INDEX_CENTRE,
+    INDEX_DIR,
+    INDEX_EMBEDDINGS,
+    INDEX_HEADER,
+    INDEX_ROWS,
+)
+from robomme_interference_data.errors import (
+    FormatError,
+    MissingFileError,
+    MissingIndexError,
+    StaleIndexError,
+    UnknownNameError,
+)
+from robomme_interference_data.files import Files, check_names, read_json
+
+__all__ = ["EmbeddingIndex", "index_folder", "normalised"]
+
+_HEADER_KEYS = ("encoder", "camera", "revision", "frames", "size", "typical_cosine", "files")
+
+
+def index_folder(encoder: str) -> str:
+    """Return where the index of an encoder lies inside a dataset.
+
+    Args:
+        encoder: Name of the encoder: `thumbnail`, `siglip`, or `siglip:` and an id or path of a
+            model, of which the last part, without a revision, becomes part of the folder's name.
+
+    Returns:
+        `index/thumbnail`, `index/siglip`, `index/siglip-siglip2-base-patch16-224`, …
+    """
+    kind, _, model = encoder.partition(":")
+    last = PurePath(model.partition("@")[0]).name
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{kind}-{last}" if last else kind)
+    return f"{INDEX_DIR}/{name}"
+
+
+def normalised(
+    features: NDArray[Any], centre: NDArray[np.float32] | None = None
+) -> NDArray[np.float16]:
+    """Turn what an encoder makes of images into embeddings of length 1.
+
+    Args:
+        features: `(T, D)` float.
+        centre: `(D,) float32`, taken off first, or None.
+
+    Returns:
+        `(T, D) float16`; a row of noughts, which resembles nothing, where nothing is left.
+    """
+    values = features.astype(np.float64)
+    if centre is not None:
+        values -= centre
+    lengths = np.sqrt((values * values).sum(axis=1, keepdims=True))
+    return (values / np.where(lengths > 0, lengths, 1)).astype(np.float16)
+
+
+class EmbeddingIndex:
+    """The embeddings of every stored frame of a dataset, of one camera and one encoder.
+
+    Args:
+        files: The dataset's files.
+        revision: The dataset's identity, `Dataset.revision`.
+        encoder: Name of the encoder, see `index_folder`.
+
+    Raises:
+        MissingIndexError: The dataset has no index of this encoder.
+        StaleIndexError: The index was made of other data.
+        FormatError: It is of an unknown version, or damaged.
+    """
+
+    def __init__(self, files: Files, revision: str, encoder: str):
+        self._files = files
+        self._folder = index_folder(encoder)
+        self._remedy = (
+            f"Type: robomme-interference index --data {_data_of(self._root)} --encoder {encoder}"
+        )
+        try:
+            path = files.path(f"{self._folder}/{INDEX_HEADER}")
+        except MissingFileError:
+            raise MissingIndexError(
+                f"{self._root} has no embeddings of encoder {encoder!r}", self._remedy
+            ) from None
+        self.header = read_json(path)
+        if self.header.get("format_version") != FORMAT_VERSION:
+            raise FormatError(
+                f"{path} has format version {self.header.get('format_version')!r}; this package "
+                f"reads {FORMAT_VERSION}",
+                "Install the version of robomme-interference-data that wrote it, or make it "
+                f"again. {self._remedy}",
+            )
+        check_names(path, self.header, _HEADER_KEYS)
+        if self.header["revision"] != revision:
+            raise StaleIndexError(
+                f"the embeddings of encoder {encoder!r} in {self._root} were made of data with "
+                f"revision {str(self.header['revision'])[:12]}…; the data now has {revision[:12]}…",
+                f"Make them again. {self._remedy}",
+            )
+
+    @property
+    def _root(self) -> str:
+        return self._files.describe()
+
+    @property
+    def camera(self) -> str:
+        """Feature name of the camera that was embedded."""
+        return str(self.header["camera"])
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over what determines the encoder's output; equal ones may be compared."""
+        return str(self.header["encoder"]["sha256"])
+
+    @property
+    def size(self) -> int:
+        """Values in an embedding."""
+        return int(self.header["size"])
+
+    @property
+    def typical_cosine(self) -> float:
+        """Median cosine of two frames of the dataset: what the encoder finds in any two."""
+        return float(self.header["typical_cosine"])
+
+    @cached_property
+    def centre(self) -> NDArray[np.float32] | None:
+        """What is taken off the encoder's output before it is normalised, or None."""
+        if INDEX_CENTRE not in self.header["files"]:
+            return None
+        centre = self._array(INDEX_CENTRE, (self.size,), np.float32)
+        return np.array(centre)
+
+    @cached_property
+    def embeddings(self) -> NDArray[np.float16]:
+        """All embeddings, `(frames, size) float16`, each of length 1; a read-only memory map."""
+        return self._array(INDEX_EMBEDDINGS, (int(self.header["frames"]), self.size), np.float16)
+
+    @cached_property
+    def _first_rows(self) -> dict[int, tuple[int, int]]:
+        """For each episode, the row of its first frame and the number of its frames."""
+        path = self._files.path(f"{self._folder}/{INDEX_ROWS}")
+        with parquet.reading(path), pq.ParquetFile(path) as file:
+            names = ("episode_index", "frame", "row")
+            check_names(path, file.schema_arrow.names, names)
+            table = file.read(columns=list(names))
+            episodes, frames, rows = (table[name].to_numpy() for name in names)
+        firsts = np.flatnonzero(np.diff(episodes, prepend=-1))
+        counts = np.diff(firsts, append=len(episodes))
+        expected = np.arange(len(episodes)) - np.repeat(firsts, counts)
+        whole = (
+            len(rows) == self.header["frames"]
+            and len(np.unique(episodes)) == len(firsts)
+            and np.array_equal(frames, expected)
+            and np.array_equal(rows, np.arange(len(rows)))
+        )
+        if not whole:
+            raise FormatError(
+                f"{path} does not list the frames of the episodes, one after the other",
+                f"It is damaged: make it again. {self._remedy}",
+            )
+        starts = zip(episodes[firsts], firsts, counts, strict=True)
+        return {int(episode): (int(first), int(count)) for episode, first, count in starts}
+
+    def span(self, episode_index: int, start: int, stop: int) -> NDArray[np.float16]:
+        """Return the embeddings of stored frames `start` to `stop` (excluded) of an episode.
+
+        Returns:
+            `(stop - start, size) float16`: a view into the memory map.
+
+        Raises:
+            UnknownNameError: The index does not hold these frames.
+            MissingFileError, FormatError: A file of the index is missing or damaged.
+        """
+        first, count = self._first_rows.get(episode_index, (0, 0))
+        if not 0 <= start <= stop <= count:
+            raise UnknownNameError(
+                f"frames {start} to {stop - 1} of episode {episode_index} are not in "
+                f"{self._root}/{self._folder}, which has {count} frames of that episode",
+                f"It is damaged: make it again. {self._remedy}",
+            )
+        return self.embeddings[first + start : first + stop]
+
+    def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        path = self._files.path(f"{self._folder}/{name}")
+        try:
+            array = np.load(path, mmap_mode="r")
+        except (OSError, ValueError, EOFError) as error:
+            raise FormatError(
+                f"{path} cannot be read: {error}", f"It is damaged: make it again. {self._remedy}"
+            ) from None
+        if array.shape != shape or array.dtype != dtype:
+            raise FormatError(
+                f"{path} holds {array.dtype} of shape {array.shape}; expected {np.dtype(dtype)} "
+                f"of shape {shape}",
+                f"It is damaged: make it again. {self._remedy}",
+            )
+        return array
+
+
+def _data_of(root: str) -> str:
+    """Return the split that a dataset belongs to, as both are indexed together; else itself."""
+    path = PurePath(root)
+    return str(path.parent) if path.name in (DEMONSTRATIONS, DISTRACTORS) else root

@@ -1,0 +1,56 @@
+"""Policies as users write them, for `python:own_policies:…`."""
+
+from typing import Any
+
+import numpy as np
+
+
+class Still:
+    """Holds every joint at zero."""
+
+    cameras: Any = ("front",)
+    history_cameras: Any = ()
+    wants_history = False
+    privileged = False
+    every_frame = False
+
+    def __init__(self, gripper: float = 1.0, worker: int = 0):
+        self.action = np.array([[0.0] * 7 + [gripper]], np.float32)
+        self.worker = worker
+
+    def reset(self, info: Any) -> None: ...
+
+    def add_history(self, frames: Any, states: Any, exec_start_idx: int) -> None: ...
+
+    def observe(self, frames: Any, states: Any) -> None: ...
+
+    def act(self, observation: Any, goal: str) -> Any:
+        return self.action
+
+    def metadata(self) -> dict[str, Any]:
+        return {"policy": "still"}
+
+    def close(self) -> None: ...
+
+
+def still(gripper: float) -> Still:
+    return Still(gripper)
+
+
+def nothing() -> object:
+    return object()
+
+
+def all_cameras() -> Still:
+    policy = Still()
+    policy.cameras = ("front", "top")
+    return policy
+
+
+def one_camera() -> Still:
+    policy = Still()
+    policy.cameras = "front"
+    return policy
+
+
+NUMBER = 3

@@ -1,0 +1,146 @@
+"""A simulator without physics over the sample split, and a policy that would cheat."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data import load_split
+from robomme_interference_data.errors import SimulatorCrashError
+from robomme_interference_data.evaluate.policies.base import Frames, RolloutInfo
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import (
+    Demonstration,
+    EpisodeInfo,
+    Observation,
+    Status,
+)
+
+SPLIT = "ROLLOUT_DOUBLES_SPLIT"
+TROUBLE = "ROLLOUT_DOUBLES_TROUBLE"
+PAUSE = "ROLLOUT_DOUBLES_PAUSE"
+ANSWER_FRAME = 3
+STEPS = 40
+
+
+class World:
+    """Episodes of a split, named by an environment variable, as a simulator.
+
+    The answer is the lesson's state at frame 3. An action that equals it succeeds; after 40 steps
+    without it the episode fails. Episodes of index 1 of MoveCube time out instead.
+    `ROLLOUT_DOUBLES_TROUBLE` names a folder: a file `<Family>-<index>` there makes that episode
+    break as the file says (`raise`, `die`, `hang`, `error`), once if the text ends in `once`.
+    """
+
+    def __init__(self) -> None:
+        self.split = load_split(os.environ[SPLIT], threads=1)
+        self.pause = float(os.environ.get(PAUSE, "0"))
+        self.drawn = 0
+
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
+        self.episode = EpisodeId.parse(episode_id)
+        self.trouble = self._trouble()
+        buffer = self.split.load(self.episode, 0)
+        self.answer = buffer.states[ANSWER_FRAME]
+        self.state = buffer.states[-1]
+        self.image = buffer.query_frame("front")
+        self.steps = 0
+        lesson = Demonstration(
+            {name: buffer.frames(name) for name in buffer.cameras} if demonstration else {},
+            buffer.states,
+            np.zeros((len(buffer), 8), np.float32),
+        )
+        made = buffer.manifest
+        info = EpisodeInfo(made.goal, made.goals, str(made.difficulty), made.seed or 0, "world")
+        self.views = {name: buffer.query_frame(name) for name in buffer.cameras}
+        return lesson, Observation(self.views, self.state), info
+
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
+        time.sleep(self.pause)
+        self.steps += 1
+        if self.trouble and self.steps == 5:
+            self._break()
+        status = Status.ONGOING
+        if np.array_equal(action[:7], self.answer[:7]):
+            status = Status.SUCCESS
+        elif self.steps >= STEPS and (self.episode.family, self.episode.index) != ("MoveCube", 1):
+            status = Status.FAIL
+        if self.trouble.startswith("error") and self.steps == 7:
+            status = Status.ERROR
+        self.drawn += observe
+        return Observation(self.views if observe else {}, self.state), status
+
+    def act(self, policy: str) -> NDArray[np.float32]:
+        return np.append(self.answer[:7], np.float32(1.0))
+
+    def close(self) -> None:
+        pass
+
+    def _trouble(self) -> str:
+        folder = os.environ.get(TROUBLE)
+        if folder is None:
+            return ""
+        path = Path(folder) / f"{self.episode.family}-{self.episode.index}"
+        text = path.read_text() if path.exists() else ""
+        if text.endswith("once"):
+            path.unlink()
+        return text
+
+    def _break(self) -> None:
+        if self.trouble.startswith("raise"):
+            raise SimulatorCrashError("the world fell apart", "Pick it up.")
+        if self.trouble.startswith("die"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.trouble.startswith("hang"):
+            time.sleep(3600)
+
+
+class Cheat:
+    """Does what the lesson shows if it can get hold of it, by whatever way; else it holds.
+
+    It looks through all that it is given: history, live frames, and everything that can be
+    reached from the info, simulator included.
+    """
+
+    cameras: tuple[str, ...] = ("front",)
+    history_cameras: tuple[str, ...] = ("front", "wrist")
+    wants_history = True
+    privileged = False
+    every_frame = True
+
+    def reset(self, info: RolloutInfo) -> None:
+        self.info = info
+        self.states: list[NDArray[np.float32]] = []
+        self.live: list[int] = []
+        self.chunks: list[tuple[int, int]] = []
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        assert sorted(frames) == ["front", "wrist"]
+        assert all(len(part) == len(states) for part in frames.values())
+        self.states += list(states)
+        self.chunks.append((len(states), exec_start_idx))
+
+    def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
+        assert list(frames) == ["front"] and len(frames["front"]) == len(states)
+        self.live.append(len(states))
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        assert self.info.simulator is None, "only privileged policies get the simulator"
+        state = self.states[ANSWER_FRAME] if len(self.states) > ANSWER_FRAME else observation.state
+        return np.tile(np.append(state[:7], np.float32(1.0)), (16, 1))
+
+    def metadata(self) -> dict[str, Any]:
+        return {"policy": "cheat"}
+
+    def close(self) -> None:
+        pass
+
+
+def make_cheat() -> Cheat:
+    return Cheat()

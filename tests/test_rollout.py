@@ -1,0 +1,232 @@
+"""One rollout: what the policy gets, when, and what is written of it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import factories
+import numpy as np
+import pytest
+import rollout_doubles
+from rollout_doubles import Cheat, World
+
+from robomme_interference_data import load_split
+from robomme_interference_data.errors import PolicyError, RolloutError, SimulatorCrashError
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.policies.builtin import make_builtin
+from robomme_interference_data.evaluate.rollout import run_rollout
+from robomme_interference_data.evaluate.rows import Rollout
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import Observation, Status
+
+EPISODE = EpisodeId("PatternLock", "test", 1)  # a lesson of 36 frames
+
+
+@pytest.fixture(autouse=True)
+def _world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+
+
+def config(**changes: Any) -> RunConfig:
+    split = load_split(factories.split())
+    made = RunConfig("mine", "cheat", None, "world", str(split.root), split.name, split.revision)
+    return dataclasses.replace(made, **changes)
+
+
+def roll(condition: str, policy: Any, episode: EpisodeId = EPISODE, **changes: Any) -> Rollout:
+    settings = config(**changes)
+    return run_rollout(
+        settings,
+        WorkItem(condition, episode),
+        simulator=World(),
+        policy=policy,
+        split=load_split(settings.split),
+    )
+
+
+def test_with_the_lesson_the_cheat_succeeds_at_once() -> None:
+    row = roll("k0", Cheat())
+    assert (row.status, row.success, row.steps) == ("success", True, 1)
+
+
+def test_without_history_even_a_cheat_sees_nothing_of_the_demonstration() -> None:
+    for check in (False, True):  # also where the simulator is asked for the demonstration
+        row = roll("no-history", Cheat(), check_lesson=check)
+        assert (row.status, row.success, row.steps) == ("fail", False, 40)
+        assert (row.history_frames, row.lesson_frames, row.lesson_share) == (0, 0, None)
+
+
+@pytest.mark.parametrize("chunk", [1, 10, 64, 500])
+def test_the_history_is_the_buffer_in_chunks(chunk: int) -> None:
+    policy = Cheat()
+    roll("k3", policy, history_chunk=chunk)
+    buffer = load_split(factories.split()).load(EPISODE, 3)
+    assert len(buffer) == 36 + 3 * 32
+    np.testing.assert_array_equal(np.stack(policy.states), buffer.states)
+    sizes = [size for size, _ in policy.chunks]
+    assert sum(sizes) == 132 and set(sizes[:-1]) <= {chunk} and sizes[-1] <= chunk
+    assert {total for _, total in policy.chunks} == {132}
+
+
+def test_live_observations_come_once_each_in_chunks_of_16() -> None:
+    policy = Cheat()
+    row = roll("no-history", policy)
+    # The first one, then 16 and 16; the episode ends with the 40th step, in the third chunk.
+    assert (row.steps, policy.live) == (40, [1, 16, 16])
+
+
+def test_a_policy_may_ask_for_the_deciding_observations_only() -> None:
+    policy, world = Cheat(), World()
+    policy.every_frame = False
+    settings = config()
+    run_rollout(
+        settings,
+        WorkItem("no-history", EPISODE),
+        simulator=world,
+        policy=policy,
+        split=load_split(settings.split),
+    )
+    assert policy.live == [1, 1, 1]
+    assert world.drawn == 2  # after 16 and 32 steps; the 40th ends it
+
+
+def test_a_rollout_times_out_after_1300_steps() -> None:
+    row = roll("no-history", Cheat(), EpisodeId("MoveCube", "test", 1))
+    assert (row.status, row.success, row.steps) == ("timeout", False, 1300)
+
+
+def test_the_row_says_what_was_given() -> None:
+    row = roll("k3", Cheat())
+    manifest = load_split(factories.split()).manifest(EPISODE, 3)
+    assert row.key == (
+        *("mine", "world", "split", load_split(factories.split()).revision),
+        *("PatternLock", "k3", "test", 1, 0, 1),
+    )
+    assert (row.seed, row.difficulty, row.goal) == (
+        manifest.seed,
+        manifest.difficulty,
+        manifest.goal,
+    )
+    assert (row.history_frames, row.lesson_frames) == (132, 36)
+    # An even 32-sample of 0 … 132 has index j·132 // 31: those under 36 are j = 0 … 8.
+    assert row.lesson_share == 9 / 32 == manifest.lesson_share
+    assert row.wall_s is not None and row.wall_s >= (row.reset_s or 0) + (row.policy_s or 0) - 0.01
+
+
+def test_the_oracle_gets_the_simulator_and_others_do_not() -> None:
+    row = roll("k1", make_builtin("oracle"))
+    assert row.status == "success"
+    with pytest.raises(PolicyError, match="needs the simulator itself"):
+        policy = make_builtin("oracle")
+        policy.privileged = False
+        roll("k1", policy)
+
+
+def test_hold_does_nothing() -> None:
+    assert roll("k0", make_builtin("hold")).status == "fail"
+
+
+# --- what contradicts each other ---------------------------------------------------------------
+
+
+def test_check_lesson_passes_where_all_is_equal() -> None:
+    assert roll("k0", Cheat(), check_lesson=True).status == "success"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        ("frame", "frame 7 of the lesson's wrist camera is not what the simulator shows"),
+        ("state", "the lesson's states are not the simulator's"),
+        ("length", "the lesson has 36 frames, the simulator's demonstration 35"),
+        ("view", "the first live front view is not the recorded query frame"),
+    ],
+)
+def test_check_lesson_names_what_differs(spoil: str, message: str) -> None:
+    class Other(World):
+        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
+            lesson, first, info = super().reset(episode_id, demonstration)
+            images = {name: frames.copy() for name, frames in lesson.images.items()}
+            states = lesson.states.copy()
+            if spoil == "frame":
+                images["wrist"][7, 0, 0, 0] ^= 1
+            if spoil == "state":
+                states[3, 2] += 1e-6
+            if spoil == "length":
+                states = states[1:]
+            if spoil == "view":
+                first = Observation({**first.images, "front": first.images["front"] ^ 1}, states[0])
+            return dataclasses.replace(lesson, images=images, states=states), first, info
+
+    settings = config(check_lesson=True)
+    with pytest.raises(RolloutError, match=message):
+        run_rollout(
+            settings,
+            WorkItem("k0", EPISODE),
+            simulator=Other(),
+            policy=Cheat(),
+            split=load_split(settings.split),
+        )
+
+
+def test_another_version_of_the_simulator_is_noticed() -> None:
+    class Other(World):
+        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
+            lesson, first, info = super().reset(episode_id, demonstration)
+            return lesson, first, dataclasses.replace(info, seed=info.seed + 1)
+
+    settings = config()
+    with pytest.raises(RolloutError, match=r"seed is \d+ in the dataset, \d+ in the simulator"):
+        run_rollout(
+            settings,
+            WorkItem("k0", EPISODE),
+            simulator=Other(),
+            policy=Cheat(),
+            split=load_split(settings.split),
+        )
+
+
+# --- policies and simulators that break --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((0, 8)), r"shape \(0, 8\); expected \(n, 8\)"),
+        (np.zeros(8), r"shape \(8,\)"),
+        (np.zeros((16, 7)), r"shape \(16, 7\)"),
+        (np.full((16, 8), np.nan), "not finite numbers"),
+    ],
+)
+def test_bad_actions_are_refused(actions: Any, message: str) -> None:
+    policy = Cheat()
+    policy.act = lambda observation, goal: actions  # type: ignore[method-assign]
+    with pytest.raises(PolicyError, match=message):
+        roll("k0", policy)
+
+
+def test_more_than_16_actions_are_cut() -> None:
+    policy = Cheat()
+    hold = policy.act
+    policy.act = lambda o, g: np.tile(hold(o, g), (3, 1))  # type: ignore[method-assign]
+    roll("no-history", policy)
+    assert policy.live == [1, 16, 16]
+
+
+@pytest.mark.parametrize(
+    ("trouble", "raised"), [("raise", SimulatorCrashError), ("error", RolloutError)]
+)
+def test_a_broken_simulator_is_an_error(
+    trouble: str, raised: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(rollout_doubles.TROUBLE, str(tmp_path))
+    (tmp_path / "PatternLock-1").write_text(trouble)
+    with pytest.raises(raised):
+        roll("no-history", Cheat())
+
+
+def test_statuses_are_the_protocols() -> None:
+    assert [str(status) for status in Status if status is not Status.ONGOING] == [
+        *("success", "fail", "timeout", "error")
+    ]
