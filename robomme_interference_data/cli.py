@@ -75,6 +75,7 @@ app.command()(commands.doctor)
 app.command()(simulator_commands.simulate)
 app.command(name="simulate-score")(simulator_commands.simulate_score)
 app.command()(score_commands.score)
+app.command()(score_commands.compare)
 app.command()(evaluate_commands.evaluate)
 
 

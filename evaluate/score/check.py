@@ -67,7 +67,9 @@ class Checker:
         simulators: Names by code, in the order in which they were first seen; so are `systems`
             and `model_seeds`.
         revisions: Simulator to the revision of its rows, as far as rows name one.
-        difficulty: Code by episode, −1 where no row tells; see `episode_code`.
+        difficulty: Code by episode, −1 where no row tells: a row per `episode_group`, a column per
+            index.
+        seeds: Seed of the scene, likewise.
     """
 
     def __init__(self, system: str | None = None):
@@ -78,7 +80,7 @@ class Checker:
         self.revisions: dict[str, str] = {}
         self._width = 0
         self.difficulty = np.zeros((0, 0), np.int8)
-        self._seed = np.zeros((0, 0), np.int64)
+        self.seeds = np.zeros((0, 0), np.int64)
 
     def pack(self, batch: Batch, source: Source) -> tuple[NDArray[np.uint64], dict[int, str]]:
         """Return the packed rows, `REFUSED` for bad ones, and the reason for each bad row."""
@@ -176,7 +178,7 @@ class Checker:
         sound[list(rows.reasons)] = False
         for name, known, given in (
             ("difficulty", self.difficulty, difficulty),
-            ("seed", self._seed, seed),
+            ("seed", self.seeds, seed),
         ):
             said = sound & (given >= 0)
             at = group[said], episode[said]
@@ -195,7 +197,7 @@ class Checker:
         wanted = len(self.simulators) * len(FAMILIES) * len(SPLITS)
         if groups < wanted or width <= episode:
             self._width = max(self._width, 64, 2 ** int(episode).bit_length())
-            for name in ("difficulty", "_seed"):
+            for name in ("difficulty", "seeds"):
                 old = getattr(self, name)
                 new = np.full((wanted, self._width), -1, old.dtype)
                 new[: old.shape[0], : old.shape[1]] = old
@@ -224,7 +226,8 @@ class _Rows:
         """
         column = self.batch.columns.get(name)
         if column is None:
-            values, index = [default], np.zeros(self.batch.rows, np.int64)
+            values = [default]
+            index: Codes = np.zeros(self.batch.rows, np.int64)
         else:
             if not pa.types.is_dictionary(column.type):
                 column = column.dictionary_encode()

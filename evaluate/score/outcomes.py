@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -11,30 +10,19 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.score.check import BITS, STATUSES, field, pack
+from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.rollouts import Rollouts
 from robomme_interference_data.ids import EpisodeId, condition_name
 
 __all__ = [
     "Expected",
-    "Grid",
     "Outcomes",
     "SUCCESS",
     "episode_id",
     "expected_episodes",
+    "families_of",
     "outcomes_of",
 ]
-
-
-class Grid(StrEnum):
-    """Which episodes a complete cell has.
-
-    `benchmark`: the paper's nine families × test episodes 0 to 49; `given`: those episodes that
-    any of the rows of the simulator is of.
-    """
-
-    BENCHMARK = "benchmark"
-    GIVEN = "given"
-
 
 SUCCESS, ERROR = STATUSES.index("success"), STATUSES.index("error")
 TEST_EPISODES = 50
@@ -83,7 +71,7 @@ class Outcomes:
     @property
     def families(self) -> NDArray[np.int64]:
         """Place of each episode's family in `FAMILIES`, `(E,) int64`."""
-        return self.episodes >> _FAMILY_SHIFT
+        return families_of(self.episodes)
 
     def column(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the rates under a condition at the given packed episodes, NaN where none."""
@@ -105,6 +93,11 @@ class Outcomes:
             found[at] = self.repeats[0, self.conditions.index(condition)][there]
         found[found == ERROR] = -1
         return found
+
+
+def families_of(episodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the place in `FAMILIES` of each packed episode's family, `(E,) int64`."""
+    return episodes >> _FAMILY_SHIFT
 
 
 def episode_id(packed: int) -> EpisodeId:
@@ -168,7 +161,7 @@ class Expected:
     @property
     def families(self) -> NDArray[np.int64]:
         """Place of each episode's family in `FAMILIES`, `(E,) int64`."""
-        return self.episodes >> _FAMILY_SHIFT
+        return families_of(self.episodes)
 
 
 def expected_episodes(

@@ -11,15 +11,18 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.evaluate.log import (
+    CSV_NAME,
+    LOG_NAME,
+    LOG_VERSION,
+    PARQUET_NAME,
+    RUN_NAME,
+)
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, ROLLOUT_SCHEMA
 from robomme_interference_data.files import read_json
 from robomme_interference_data.parquet import reading
 
 __all__ = ["COLUMNS", "RELEASED_COLUMNS", "Batch", "Source", "find_sources", "read_batches"]
-
-ROWS_PARQUET = "rollouts.parquet"
-ROWS_CSV = "rollouts.csv"
-RUN_JSON = "run.json"
 
 RELEASED_COLUMNS = (
     "family",
@@ -114,21 +117,35 @@ def _source(path: Path, with_system: bool) -> Source:
     folder, record = None, {}
     if path.is_dir():
         folder = path
-        found = [path / name for name in (ROWS_PARQUET, ROWS_CSV) if (path / name).is_file()]
+        found = [path / name for name in (PARQUET_NAME, CSV_NAME) if (path / name).is_file()]
         if not found:
+            begun = (folder / LOG_NAME).exists()
             raise MissingFileError(
-                f"{path} holds neither {ROWS_PARQUET} nor {ROWS_CSV}",
-                "Give the folder of a run, or a file of rows: robomme-interference score RUN "
-                "--out DIR",
+                f"{path} holds neither {PARQUET_NAME} nor {CSV_NAME}",
+                "The run has not ended: go on with it, with the same robomme-interference evaluate "
+                "command."
+                if begun
+                else "Give the folder of a run, or a file of rows.",
             )
         path = found[0]
     elif not path.is_file():
         raise MissingFileError(f"there is no file or folder {path}", "Check the path.")
-    if (path.parent / RUN_JSON).is_file() and path.name in (ROWS_PARQUET, ROWS_CSV):
-        folder, record = path.parent, read_json(path.parent / RUN_JSON)
+    if (path.parent / RUN_NAME).is_file() and path.name in (PARQUET_NAME, CSV_NAME):
+        folder, record = path.parent, _record(path.parent / RUN_NAME)
     names = _column_names(path)
     released = "simulator" not in names
     return Source(path, folder, record, _match(path, names, released, with_system), released)
+
+
+def _record(path: Path) -> dict[str, Any]:
+    record = read_json(path)
+    version = record.get("format_version", LOG_VERSION)
+    if version != LOG_VERSION:
+        raise FormatError(
+            f"{path} has format version {version!r}; this package reads {LOG_VERSION}",
+            "Install the version of robomme-interference-data that wrote it.",
+        )
+    return record
 
 
 def _column_names(path: Path) -> list[str]:

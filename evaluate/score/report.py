@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import shlex
 from collections.abc import Mapping
 from importlib import metadata, resources
 from itertools import islice
@@ -14,8 +15,8 @@ from robomme_interference_data.evaluate.rows import condition_rank
 from robomme_interference_data.evaluate.score.bootstrap import DRAWS
 from robomme_interference_data.evaluate.score.episodes import episode_rows
 from robomme_interference_data.evaluate.score.figures import FIGURES
+from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.outcomes import Grid
 from robomme_interference_data.evaluate.score.read import Source
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables import Table
@@ -27,7 +28,11 @@ __all__ = ["write_report"]
 MOST_EPISODES = 20_000
 """So many rows of single episodes a page holds at most."""
 
-_RUN_FIELDS = ("command", "split", "revision", "simulator", "system", "policy", "git", "versions")
+_RUN_FIELDS = (
+    *("status", "command", "identity", "split", "revision", "simulator", "system", "policy"),
+    *("versions", "git", "machine", "planned", "counts"),
+)
+"""What is shown of a run's `run.json`, as far as it is there."""
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
     Grid.GIVEN: "those that any of the given rows is of",
@@ -132,11 +137,19 @@ def _episodes(score: Score, folder: Path) -> dict[str, Any]:
 def _source(source: Source) -> dict[str, Any]:
     record = source.record
     shown = {
-        name: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        name: _told(value)
         for name in _RUN_FIELDS
         if (value := record.get(name)) not in (None, "", {})
     }
     return {"path": str(source.path), "sha256": sha256_file(source.path), "run": shown}
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_told(part)}" for name, part in sorted(value.items()))
+    if isinstance(value, list):
+        return shlex.join(map(str, value))
+    return str(value)
 
 
 def _facts(score: Score) -> list[tuple[str, str]]:

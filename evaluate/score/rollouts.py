@@ -50,7 +50,8 @@ class Rollouts:
         simulators: Names by code, sorted.
         systems: Names by code, in the order of tables.
         model_seeds: Seeds by code, ascending.
-        difficulty: By episode, see `Rollouts.difficulty_of`.
+        difficulty: Code by episode, −1 unknown; see `Rollouts.difficulty_of`.
+        seeds: Seed of the scene by episode, −1 unknown, likewise.
         revisions: Simulator to the revision of its split, where rows name one.
         videos: Packed row, its status left out, to the video of it.
         sources: The files that were read.
@@ -63,6 +64,7 @@ class Rollouts:
     systems: tuple[str, ...]
     model_seeds: tuple[int, ...]
     difficulty: NDArray[np.int8]
+    seeds: NDArray[np.int64]
     revisions: dict[str, str]
     videos: dict[int, Path]
     sources: tuple[Source, ...]
@@ -188,16 +190,14 @@ def read_rollouts(
     packed = _recode(packed, orders)
     videos = {int(packed[row] >> _STATUS_BITS): path for row, path in reader.videos}
     packed = reader.refuse_duplicates(packed)
-    groups = len(checker.difficulty) // max(len(checker.simulators), 1)
-    by_simulator = np.argsort(orders["simulator"])
+    by_name = np.argsort(orders["simulator"])
     return Rollouts(
         packed,
         tuple(sorted(checker.simulators)),
         tuple(sorted(checker.systems, key=_table_order)),
         tuple(sorted(checker.model_seeds)),
-        np.concatenate([checker.difficulty[i * groups : (i + 1) * groups] for i in by_simulator])
-        if len(by_simulator)
-        else checker.difficulty,
+        _regrouped(checker.difficulty, by_name),
+        _regrouped(checker.seeds, by_name),
         dict(sorted(checker.revisions.items())),
         videos,
         tuple(sources),
@@ -221,6 +221,13 @@ def _ranks(values: Sequence[Any], key: Callable[[Any], Any]) -> NDArray[np.int64
     ranks = np.zeros(len(values), np.int64)
     ranks[order] = np.arange(len(values))
     return ranks
+
+
+def _regrouped[T: np.generic](known: NDArray[T], order: NDArray[np.int64]) -> NDArray[T]:
+    """Return what is known of episodes with the simulators in another order."""
+    if not len(order):
+        return known
+    return known.reshape(len(order), -1, known.shape[1])[order].reshape(known.shape)
 
 
 def _recode(

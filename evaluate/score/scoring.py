@@ -19,9 +19,9 @@ from robomme_interference_data.evaluate.score.effect_tables import (
     noise_table,
 )
 from robomme_interference_data.evaluate.score.effects import Effects, base_of, effects_of
+from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.outcomes import (
     Expected,
-    Grid,
     Outcomes,
     expected_episodes,
     outcomes_of,

@@ -74,10 +74,17 @@ class Table:
         return "\n\n".join(part for part in (f"# {self.title}", text, self.note) if part) + "\n"
 
 
-def write_tables(tables: Sequence[Table], folder: Path) -> None:
-    """Write each table as `<name>.csv` and `<name>.md`."""
+def write_tables(tables: Sequence[Table], folder: Path, main: str) -> None:
+    """Write each table as `<name>.csv` and `<name>.md`.
+
+    Args:
+        tables: The tables.
+        folder: Where to write.
+        main: Markdown of the table `main`, which is laid out as in the paper.
+    """
     for table in tables:
-        for suffix, text in ((".csv", table.csv()), (".md", table.markdown())):
+        markdown = main if table.name == "main" else table.markdown()
+        for suffix, text in ((".csv", table.csv()), (".md", markdown)):
             with atomic_path(folder / (table.name + suffix)) as partial:
                 partial.write_text(text, encoding="utf-8", newline="\n")
 
