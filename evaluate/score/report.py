@@ -83,7 +83,10 @@ def _table(table: Table) -> dict[str, Any]:
         for place, column in enumerate(table.columns):
             if column.name.endswith("system") or column.name == "no_history_of":
                 shown[place] = display_name(row[place])
-        rows.append([(text, _sortable(value)) for text, value in zip(shown, row, strict=True)])
+            elif column.name == "complete" and not row[place]:
+                shown[place] += "†"
+        cells = [(text, _sortable(value)) for text, value in zip(shown, row, strict=True)]
+        rows.append({"cells": cells, "incomplete": any(text == "no†" for text in shown)})
     return {
         "name": table.name,
         "title": table.title,
