@@ -22,6 +22,7 @@ __all__ = [
     "HashMismatchError",
     "TruncatedVideoError",
     "SourceError",
+    "BadRowsError",
     "MissingIndexError",
     "StaleIndexError",
     "MissingWeightsError",
@@ -99,6 +100,10 @@ class TruncatedVideoError(InterferenceError, ValueError):
 
 class SourceError(InterferenceError, ValueError):
     """Recorded episodes that cannot be used as they are."""
+
+
+class BadRowsError(InterferenceError, ValueError):
+    """Rows of rollouts that contradict themselves, each other or the protocol."""
 
 
 class MissingIndexError(InterferenceError, FileNotFoundError):

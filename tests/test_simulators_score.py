@@ -17,7 +17,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import SIMULATORS, Status, make_simulator
 from robomme_interference_data.simulators.registry import own_simulator
-from robomme_interference_data.simulators.score import Outcome, markdown_table, play_all, wilson
+from robomme_interference_data.simulators.score import Outcome, markdown_table, play_all
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
     episode_ids,
@@ -85,15 +85,6 @@ def test_a_missing_extra_names_the_line_to_type(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "sapien", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'robomme-interference-data\[sim\]'"):
         SIMULATORS["tabletop"]()
-
-
-def test_wilson_interval_by_hand() -> None:
-    # 8 of 10, z = 1.96: middle (0.8 + 1.9208/10)/1.38416 = 0.7167, half 0.2266
-    low, high = wilson(8, 10, z=1.96)
-    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
-    assert wilson(0, 0) == (0.0, 1.0)
-    assert wilson(0, 50)[0] == 0.0
-    assert wilson(50, 50)[1] == pytest.approx(1.0)
 
 
 def outcome(family: str, difficulty: str, status: Status, chance: float, steps: int) -> Outcome:

@@ -1,6 +1,5 @@
 """How often a built-in policy succeeds: the suite's own check that it is solvable and fair."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,11 +12,12 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.intervals import wilson
 from robomme_interference_data.simulators.base import Simulator, Status
 from robomme_interference_data.simulators.registry import own_simulator
 from robomme_interference_data.workers import run_tasks
 
-__all__ = ["Outcome", "markdown_table", "play_all", "wilson"]
+__all__ = ["Outcome", "markdown_table", "play_all"]
 
 _BROKEN = (SimulatorCrashError, MotionError)
 """Errors that are one episode's, not the run's."""
@@ -96,17 +96,6 @@ def _play(simulator: str, policy: str, episode: EpisodeId) -> Outcome:
         _, status = running.step(running.act(policy), observe=False)
         steps += 1
     return Outcome(episode, info.difficulty, status, len(lesson), steps, chance)
-
-
-def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson score interval of a rate, by default at 95%; `(0, 1)` without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    rate = successes / trials
-    middle = rate + z * z / (2 * trials)
-    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    scale = 1 + z * z / trials
-    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
 def markdown_table(outcomes: Iterable[Outcome]) -> str:
