@@ -168,7 +168,7 @@ def main_markdown(cells: Sequence[Cell]) -> str:
             lines.append(f"| {display_name(system)} | {' | '.join(shown)} |")
         lines.append("")
     errors = sum(cell.counts[ERROR] for cell in cells)
-    broke = f" {errors} rollouts broke." if errors else " No rollout broke."
+    broke = f" Rollouts that broke: {errors}." if errors else " No rollout broke."
     return "\n".join([*lines, NOTE + broke]) + "\n"
 
 
@@ -180,7 +180,7 @@ def _shown(cell: Cell | None, several: bool) -> str:
     low, high = cell.interval
     rate = f"**{percent(cell.rate)}**" if several and cell.rank == 1 else percent(cell.rate)
     mark = "" if cell.complete else "†"
-    errors = f", {cell.counts[ERROR]} errors" if cell.counts[ERROR] else ""
+    errors = f", errors: {cell.counts[ERROR]}" if cell.counts[ERROR] else ""
     return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}] n={cell.n}{errors}"
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from urllib.parse import quote
 
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.check import BITS, DIFFICULTIES, STATUSES, pack
@@ -31,7 +32,7 @@ class EpisodeRow:
         difficulty: `easy`, `medium`, `hard` or empty.
         outcomes: Condition to its status, or, with repeats, successes and rollouts as `2/3`.
         flips: Where the outcome changes from one condition with history to the next.
-        videos: Condition to the path of a video, from the page's folder.
+        videos: Condition to the address of a video, relative to the page.
     """
 
     simulator: str
@@ -73,7 +74,7 @@ def episode_rows(
                     found[condition] = text
                 video = rollouts.videos.get(_key(rollouts, one, condition, packed))
                 if video is not None and video.is_file():
-                    videos[condition] = Path(os.path.relpath(video, page_folder)).as_posix()
+                    videos[condition] = _link(video, page_folder)
             yield EpisodeRow(
                 one.simulator,
                 one.system,
@@ -83,6 +84,10 @@ def episode_rows(
                 flips(names, one.rates[histories, place].tolist()),
                 videos,
             )
+
+
+def _link(video: Path, page_folder: Path) -> str:
+    return quote(Path(os.path.relpath(video, page_folder)).as_posix())
 
 
 def _outcome(counts: list[int]) -> str:
