@@ -124,7 +124,7 @@ def test_play_all_plays_an_episode_again_in_a_fresh_worker(
 ) -> None:
     monkeypatch.setenv("DOUBLE_MARKS", str(tmp_path))
     episodes = [double(index) for index in (0, 1, 2, 5)]  # 1 dies and 2 hangs, once each
-    outcomes = play_all("oracle", episodes, "simulator_doubles:make_once", 2, time_limit=8)
+    outcomes = play_all("oracle", episodes, "simulator_doubles:make_once", 2, time_limit=20)
     assert {o.episode: o.status for o in outcomes} == dict.fromkeys(episodes, Status.SUCCESS)
 
 
