@@ -27,6 +27,7 @@ from robomme_interference_data.simulators.base import Status
 __all__ = [
     "CSV_NAME",
     "LOG_NAME",
+    "LOG_VERSION",
     "PARQUET_NAME",
     "RUN_NAME",
     "RunLog",

@@ -15,6 +15,7 @@ from robomme_interference_data.build_dataset import check_commands
 from robomme_interference_data.build_dataset import commands as build_commands
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluate_commands
+from robomme_interference_data.evaluate.score import commands as score_commands
 from robomme_interference_data.retrieval import commands as retrieval_commands
 from robomme_interference_data.simulators import commands as simulator_commands
 
@@ -73,6 +74,8 @@ app.command()(retrieval_commands.index)
 app.command()(commands.doctor)
 app.command()(simulator_commands.simulate)
 app.command(name="simulate-score")(simulator_commands.simulate_score)
+app.command()(score_commands.score)
+app.command()(score_commands.compare)
 app.command()(evaluate_commands.evaluate)
 
 

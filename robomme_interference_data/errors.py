@@ -22,6 +22,7 @@ __all__ = [
     "HashMismatchError",
     "TruncatedVideoError",
     "SourceError",
+    "BadRowsError",
     "MissingIndexError",
     "StaleIndexError",
     "MissingWeightsError",
@@ -101,6 +102,10 @@ class SourceError(InterferenceError, ValueError):
     """Recorded episodes that cannot be used as they are."""
 
 
+class BadRowsError(InterferenceError, ValueError):
+    """Rows of rollouts that contradict themselves, each other or the protocol."""
+
+
 class MissingIndexError(InterferenceError, FileNotFoundError):
     """A dataset without the embeddings that are asked for."""
 
@@ -134,7 +139,7 @@ class MotionError(InterferenceError, RuntimeError):
 
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
-    """A simulator's worker process died, or did not answer in time."""
+    """A simulator broke: its process died or did not answer in time, or it says so itself."""
 
 
 class PolicyError(InterferenceError, RuntimeError):

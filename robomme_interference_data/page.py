@@ -1,7 +1,7 @@
-"""A figure to draw on by inches, saved as PNG or SVG with the same bytes each time.
+"""Figures saved as PNG or SVG with the same bytes each time, and a page to draw on by inches.
 
-The only file that imports matplotlib for pictures. Lengths are inches from the upper left corner,
-y going down; font sizes and line widths are points.
+`open_figure` is the one place where matplotlib is set up. On a page, lengths are inches from the
+upper left corner, y going down; font sizes and line widths are points.
 """
 
 import warnings
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
 from robomme_interference_data.files import atomic_path
 
-__all__ = ["Page", "ink_on", "open_page", "tint"]
+__all__ = ["Page", "ink_on", "open_figure", "open_page", "save_figure", "tint"]
 
 _DPI = 180
 _METADATA = {".png": ("Software",), ".svg": ("Creator", "Date", "Format", "Type")}
@@ -38,15 +38,24 @@ def open_page(out: Path, width: float) -> Iterator["Page"]:
         InvalidOptionError: `out` has another suffix or cannot be written.
         MissingExtraError: matplotlib is not installed.
     """
-    suffix = out.suffix.lower()
-    if suffix not in _METADATA:
-        raise InvalidOptionError(
-            f"a picture cannot be written to {str(out)!r}; expected a name that ends in "
-            f"{' or '.join(_METADATA)}",
-            f"For example: {out.with_suffix('.png') if out.name else out / 'strip.png'}",
-        )
-    if out.is_dir():
-        raise InvalidOptionError(f"{out} is a folder; expected the name of a file to write")
+    _check(out)
+    with open_figure() as figure:
+        page = Page(figure, width)
+        yield page
+        page.figure.set_size_inches(width, page.height)
+        page.axes.set(xlim=(0, width), ylim=(page.height, 0))
+        save_figure(page.figure, out)
+
+
+@contextmanager
+def open_figure() -> Iterator[Any]:
+    """Give an empty white matplotlib `Figure`; the reader's own settings have no effect.
+
+    It is drawn, and saved with `save_figure`, inside the block.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
     try:
         import matplotlib.style
         from matplotlib.figure import Figure
@@ -62,18 +71,36 @@ def open_page(out: Path, width: float) -> Iterator["Page"]:
         warnings.catch_warnings(),
     ):
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
-        page = Page(Figure(facecolor="white"), width)
-        yield page
-        page.figure.set_size_inches(width, page.height)
-        page.axes.set(xlim=(0, width), ylim=(page.height, 0))
-        try:
-            with atomic_path(out) as partial:
-                metadata = dict.fromkeys(_METADATA[suffix])
-                page.figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=metadata)
-        except OSError as error:
-            raise InvalidOptionError(
-                f"{out} cannot be written: {error.strerror or error}", "Choose another file."
-            ) from error
+        yield Figure(facecolor="white")
+
+
+def save_figure(figure: Any, out: Path) -> None:
+    """Write a figure to `.png` or `.svg`, atomically, without the date and the version.
+
+    Raises:
+        InvalidOptionError: `out` has another suffix or cannot be written.
+    """
+    _check(out)
+    suffix = out.suffix.lower()
+    try:
+        with atomic_path(out) as partial:
+            metadata = dict.fromkeys(_METADATA[suffix])
+            figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=metadata)
+    except OSError as error:
+        raise InvalidOptionError(
+            f"{out} cannot be written: {error.strerror or error}", "Choose another file."
+        ) from error
+
+
+def _check(out: Path) -> None:
+    if out.suffix.lower() not in _METADATA:
+        raise InvalidOptionError(
+            f"a picture cannot be written to {str(out)!r}; expected a name that ends in "
+            f"{' or '.join(_METADATA)}",
+            f"For example: {out.with_suffix('.png') if out.name else out / 'strip.png'}",
+        )
+    if out.is_dir():
+        raise InvalidOptionError(f"{out} is a folder; expected the name of a file to write")
 
 
 class Page:

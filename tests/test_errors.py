@@ -27,6 +27,7 @@ BUILTINS = {
     "HashMismatchError": ValueError,
     "TruncatedVideoError": ValueError,
     "SourceError": ValueError,
+    "BadRowsError": ValueError,
     "MissingIndexError": FileNotFoundError,
     "StaleIndexError": ValueError,
     "MissingWeightsError": FileNotFoundError,

@@ -125,8 +125,7 @@ def wrong_imports(module: str, source: str) -> Iterator[str]:
     for line in visitor.relative:
         yield f"{module}:{line} relative import"
     for name, inside_function, line in visitor.found:
-        area = f"{PACKAGE}.{area_of(name)}"
-        commands = name in (f"{area}.commands", f"{area}.check_commands")
+        commands = name.rpartition(".")[2] in ("commands", "check_commands")
         from_cli = module == f"{PACKAGE}.cli" and (inside_function or commands)
         if area_of(name) not in MAY_IMPORT[area_of(module)] and not from_cli:
             yield f"{module}:{line} imports {name}"

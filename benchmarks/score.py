@@ -1,0 +1,260 @@
+"""How fast rows are scored, against a straightforward pandas version of the same tables.
+
+    python benchmarks/score.py              # the full grid, then ten million rows; minutes
+    python benchmarks/score.py --repeats 20 # fewer repeats in the second part
+
+The pandas version reads the rows, checks them, and computes the same rates, intervals, exact tests
+and bootstrap intervals, the latter by drawing episodes: all statistics of a system share its
+draws, as they do here. pandas is no dependency of the package: install it for this.
+"""
+
+import argparse
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA
+from robomme_interference_data.evaluate.score.cells import main_markdown
+from robomme_interference_data.evaluate.score.scoring import score
+from robomme_interference_data.evaluate.score.tables import write_tables
+
+CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
+KS = (0, 1, 3, 7)
+SYSTEMS = 11
+EPISODES = 50
+DRAWS = 10_000
+GRID = SYSTEMS * len(CONDITIONS) * len(FAMILIES) * EPISODES
+
+
+@dataclass(frozen=True)
+class Run:
+    """Seconds of one scoring, and bytes of memory over what the process held before."""
+
+    seconds: float
+    memory: int
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=positive, default=3, help="repetitions of the full grid")
+    parser.add_argument(
+        "--repeats", type=positive, default=405, help="repeats of the grid in the second part"
+    )
+    options = parser.parse_args()
+    ways: dict[str, Callable[[Path, Path], None]] = {"score": ours, "pandas": with_pandas}
+    print(machine("pyarrow", "pandas", "numpy"), end="\n\n")
+    with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
+        folder = Path(name)
+        rows = write_rows(folder / "grid.parquet", 1)
+        calls = {way: lambda call=call: call(rows, folder / "out") for way, call in ways.items()}
+        times = interleave(calls, options.rounds)
+        lines = [
+            [f"{GRID:,}", way, f"{times.median(way):.2f}", f"{times.ratio(way, 'score'):.1f}"]
+            for way in ways
+        ]
+        print(
+            table(
+                f"The full grid, all tables, {DRAWS:,} bootstrap draws; medians of "
+                f"{options.rounds} rounds.",
+                [">rows", "<way", ">s", ">× score"],
+                lines,
+            ),
+            end="\n\n",
+        )
+        rows = write_rows(folder / "many.parquet", options.repeats)
+        runs = {way: in_fresh_process(measure, way, rows, folder / "out") for way in ways}
+        lines = [
+            [
+                f"{GRID * options.repeats:,}",
+                way,
+                f"{run.seconds:.1f}",
+                f"{run.seconds / runs['score'].seconds:.1f}",
+                megabytes(run.memory),
+                f"{run.memory / runs['score'].memory:.1f}",
+            ]
+            for way, run in runs.items()
+        ]
+        print(
+            table(
+                f"{options.repeats} repeats of it, each way once in a process of its own.",
+                [">rows", "<way", ">s", ">× score", ">peak MB", ">× score"],
+                lines,
+            )
+        )
+
+
+def measure(way: str, rows: Path, out: Path) -> Run:
+    """Score once, libraries loaded beforehand, and say what it took."""
+    call = {"score": ours, "pandas": with_pandas}[way]
+    warm = rows.parent / "grid.parquet"
+    call(warm, out)
+    before = peak_memory()
+    began = time.perf_counter()
+    call(rows, out)
+    return Run(time.perf_counter() - began, peak_memory() - before)
+
+
+def write_rows(path: Path, repeats: int) -> Path:
+    """Write made-up rows of the grid, in the columns of a run, a row group per repeat or more."""
+    numbers = np.random.default_rng(0)
+    skill = numbers.random((SYSTEMS, len(CONDITIONS), 1, 1)) * 0.5
+    ease = numbers.random((1, 1, len(FAMILIES), EPISODES)) * 0.5
+    system, condition, family, episode = np.indices(
+        (SYSTEMS, len(CONDITIONS), len(FAMILIES), EPISODES)
+    ).reshape(4, -1)
+    chance = (skill + ease).ravel()
+    texts = {
+        "system": ([f"memory-{number}" for number in range(SYSTEMS)], system),
+        "simulator": (["tabletop"], np.zeros(GRID, int)),
+        "split": (["made-up"], np.zeros(GRID, int)),
+        "revision": (["ab" * 32], np.zeros(GRID, int)),
+        "family": (list(FAMILIES), family),
+        "condition": (list(CONDITIONS), condition),
+        "episode_split": (["test"], np.zeros(GRID, int)),
+        "difficulty": (["easy", "medium", "hard"], episode % 3),
+        "goal": (["do it"], np.zeros(GRID, int)),
+    }
+    with pq.ParquetWriter(path, ROLLOUT_SCHEMA, compression="zstd") as writer:
+        for repeat in range(repeats):
+            won = numbers.random(GRID) < chance
+            columns: dict[str, Any] = {
+                name: pa.DictionaryArray.from_arrays(
+                    pa.array(codes.astype(np.int32)), pa.array(values)
+                ).cast(pa.string())
+                for name, (values, codes) in texts.items()
+            }
+            columns |= {
+                "episode": episode,
+                "model_seed": np.full(GRID, repeat),
+                "protocol_version": np.ones(GRID),
+                "seed": family * EPISODES + episode,
+                "status": pa.array(np.where(won, "success", "fail")),
+                "success": won,
+                "steps": np.full(GRID, 200),
+                "history_frames": np.full(GRID, 300),
+                "lesson_frames": np.full(GRID, 100),
+                "lesson_share": np.full(GRID, 0.5),
+                "attempt": np.ones(GRID),
+            }
+            arrays = [
+                pa.array(columns[f.name]).cast(f.type)
+                if f.name in columns
+                else pa.nulls(GRID, f.type)
+                for f in ROLLOUT_SCHEMA
+            ]
+            writer.write_table(pa.table(arrays, schema=ROLLOUT_SCHEMA))
+    return path
+
+
+def ours(rows: Path, out: Path) -> None:
+    """Score with the package."""
+    found = score([rows])
+    write_tables(list(found.tables.values()), out, main_markdown(found.cells))
+
+
+def with_pandas(rows: Path, out: Path) -> None:
+    """Score with pandas."""
+    import pandas as pd
+    from scipy.stats import binomtest, norm
+
+    out.mkdir(exist_ok=True)
+    frame = pd.read_parquet(
+        rows,
+        columns=[
+            *("system", "simulator", "revision", "family", "condition", "episode_split"),
+            *("episode", "model_seed", "seed", "difficulty", "status", "success", "steps"),
+        ],
+    )
+    key = ["simulator", "system", "condition", "family", "episode_split", "episode", "model_seed"]
+    assert not frame.duplicated(key).any()
+    assert frame["family"].isin(FAMILIES).all() and frame["condition"].isin(CONDITIONS).all()
+    assert frame["status"].isin(["success", "fail", "timeout", "error"]).all()
+    assert (frame["success"] == (frame["status"] == "success")).all()
+    assert frame.groupby("simulator")["revision"].nunique().max() == 1
+    assert frame["steps"].between(0, 1300).all()
+    scenes = frame.groupby(["simulator", "family", "episode_split", "episode"])
+    assert scenes[["seed", "difficulty"]].nunique().max().max() == 1
+
+    episode = ["system", "condition", "family", "difficulty", "episode"]
+    means = frame.groupby(episode)["success"].mean().reset_index()
+    for name, by in (("main", []), ("family", ["family"]), ("difficulty", ["difficulty"])):
+        cells = means.groupby(["system", "condition", *by])["success"].agg(["mean", "count"])
+        z, p, n = norm.ppf(0.975), cells["mean"], cells["count"]
+        middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        cells["low"] = (middle - half) / (1 + z * z / n)
+        cells["high"] = (middle + half) / (1 + z * z / n)
+        cells.to_csv(out / f"{name}.csv")
+    coverage = frame.groupby(["system", "condition", "family", "status"]).size()
+    coverage.unstack(fill_value=0).to_csv(out / "coverage.csv")
+
+    first = frame[frame["model_seed"] == frame["model_seed"].min()]
+    x = np.log2(np.array(KS) + 1)
+    weights = (x - x.mean()) / ((x - x.mean()) ** 2).sum()
+    records = []
+    for system, group in means.groupby("system"):
+        wide = group.pivot_table(index=["family", "episode"], columns="condition", values="success")
+        once = first[first["system"] == system].pivot_table(
+            index=["family", "episode"], columns="condition", values="success"
+        )
+        values = wide[list(CONDITIONS)].to_numpy()
+        count = len(values)
+        picked = np.random.default_rng(0).integers(0, count, (DRAWS, count))
+        drawn = np.stack([column[picked].mean(axis=1) for column in values.T], axis=1)
+        left = (values.sum(axis=0) - values) / (count - 1)
+
+        def bca(
+            compute: Callable[[Any], Any],
+            values: Any = values,
+            drawn: Any = drawn,
+            left: Any = left,
+        ) -> tuple[float, float, float]:
+            value, draws, jack = (
+                compute(values.mean(axis=0)[None])[0],
+                compute(drawn),
+                compute(left),
+            )
+            bias = norm.ppf(((draws < value).mean() + (draws <= value).mean()) / 2)
+            shift = jack.mean() - jack
+            skew = (shift**3).sum() / (6 * (shift**2).sum() ** 1.5)
+            zs = bias + norm.ppf([0.025, 0.975])
+            low, high = np.quantile(draws, norm.cdf(bias + zs / (1 - skew * zs)))
+            return float(value), float(low), float(high)
+
+        pairs = [(k, 0) for k in range(1, 5)] + [(k, 1) for k in range(2, 5)]
+        for here, there in pairs:
+            a, b = once[CONDITIONS[here]] > 0, once[CONDITIONS[there]] > 0
+            gained, lost = int((a & ~b).sum()), int((~a & b).sum())
+            p = binomtest(gained, gained + lost).pvalue if gained + lost else 1.0
+            interval = bca(lambda m, h=here, t=there: m[:, h] - m[:, t])
+            records.append((system, CONDITIONS[here], CONDITIONS[there], *interval, p))
+        for k in range(2, 5):
+            interval = bca(lambda m, k=k: (m[:, k] - m[:, 0]) / (m[:, 1] - m[:, 0]))
+            records.append((system, CONDITIONS[k], "retention", *interval, math.nan))
+        records.append((system, "", "slope", *bca(lambda m: m[:, 1:] @ weights), math.nan))
+    columns = ["system", "condition", "against", "value", "low", "high", "p"]
+    effects = pd.DataFrame(records, columns=columns)
+    ordered = effects["p"].dropna().sort_values()
+    effects["p_holm"] = (
+        (ordered * np.arange(len(ordered), 0, -1)).clip(upper=1).cummax().reindex(effects.index)
+    )
+    effects.to_csv(out / "effects.csv", index=False)
+
+
+if __name__ == "__main__":
+    try:
+        import pandas  # noqa: F401
+    except ImportError:
+        sys.exit("pandas is needed to compare with: pip install pandas")
+    main()

@@ -1,0 +1,236 @@
+"""Rates of cells: system × condition, and the same by family and by difficulty."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.rows import condition_rank
+from robomme_interference_data.evaluate.score.check import DIFFICULTIES
+from robomme_interference_data.evaluate.score.outcomes import ERROR, Expected, Outcomes, episode_id
+from robomme_interference_data.evaluate.score.tables import Column, Table, percent
+from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.intervals import wilson
+
+__all__ = ["Cell", "Part", "cells_by", "coverage_table", "main_markdown", "rate_table"]
+
+Part = Literal["", "family", "difficulty"]
+
+NOTE = (
+    "Rates with 95% Wilson intervals. n is the number of episodes that count: an error is neither "
+    "success nor failure. A cell marked † lacks episodes, or has others than the grid, and is not "
+    "ranked."
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What came of one system under one condition, in all or in a part of the episodes.
+
+    Attributes:
+        simulator: Name of the simulator.
+        system: Name of the system.
+        condition: Name of the condition.
+        part: Family or difficulty; empty for all episodes.
+        n: Episodes that count: at least one rollout that is no error.
+        rate: Mean over them of the success of their repeats; NaN if n is 0.
+        counts: Rollouts by status, as `STATUSES`.
+        missing: Expected episodes that do not count.
+        other: Episodes that count without being expected.
+        rank: Place among the complete cells of this simulator, condition and part, 1 for the
+            highest rate; None for an incomplete cell.
+    """
+
+    simulator: str
+    system: str
+    condition: str
+    part: str
+    n: int
+    rate: float
+    counts: tuple[int, int, int, int]
+    missing: int
+    other: int
+    rank: int | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether exactly the expected episodes count."""
+        return self.n > 0 and not self.missing and not self.other
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95% Wilson interval; `(0, 1)` if n is 0."""
+        return wilson(0 if self.n == 0 else self.rate * self.n, self.n)
+
+
+def cells_by(
+    outcomes: Sequence[Outcomes], expected: Mapping[str, Expected], part: Part = ""
+) -> list[Cell]:
+    """Return the cells of every system and condition.
+
+    Args:
+        outcomes: By system and simulator.
+        expected: Simulator to the episodes of a complete cell.
+        part: `family` or `difficulty` for a cell of each; empty for all episodes together. An
+            expected episode of unknown difficulty is missing in all three.
+    """
+    cells: list[Cell] = []
+    for one in outcomes:
+        wanted = expected[one.simulator]
+        parts = _parts(part, one, unknown=False)
+        wanted_parts = _parts(part, wanted, unknown=True)
+        for place, condition in enumerate(one.conditions):
+            counts = one.scored[place] > 0
+            missing = ~np.isin(wanted.episodes, one.episodes[counts], assume_unique=True)
+            other = counts & ~np.isin(one.episodes, wanted.episodes, assume_unique=True)
+            for name, here in parts.items():
+                if not here.any() and not wanted_parts[name].any():
+                    continue
+                rates = one.rates[place][here & counts]
+                cells.append(
+                    Cell(
+                        one.simulator,
+                        one.system,
+                        condition,
+                        name,
+                        len(rates),
+                        float(rates.sum() / len(rates)) if len(rates) else math.nan,
+                        tuple(one.counts[place][here].sum(axis=0).tolist()),
+                        int((wanted_parts[name] & missing).sum()),
+                        int((here & other).sum()),
+                    )
+                )
+    return _ranked(cells)
+
+
+def _parts(part: Part, what: Outcomes | Expected, unknown: bool) -> dict[str, NDArray[np.bool_]]:
+    if part == "family":
+        return {name: what.families == place for place, name in enumerate(FAMILIES)}
+    if part == "difficulty":
+        also = (what.difficulty < 0) & unknown
+        return {n: (what.difficulty == p) | also for p, n in enumerate(DIFFICULTIES)}
+    return {"": np.ones(len(what.episodes), bool)}
+
+
+def _ranked(cells: list[Cell]) -> list[Cell]:
+    rates: dict[tuple[str, str, str], list[float]] = {}
+    for cell in cells:
+        if cell.complete:
+            rates.setdefault((cell.simulator, cell.condition, cell.part), []).append(cell.rate)
+    return [
+        replace(cell, rank=1 + sum(rate > cell.rate for rate in rates[key]))
+        if cell.complete and (key := (cell.simulator, cell.condition, cell.part))
+        else cell
+        for cell in cells
+    ]
+
+
+def rate_table(cells: Sequence[Cell], name: str, title: str, part: Part = "") -> Table:
+    """Return cells as a table, a row each."""
+    columns = [Column("simulator"), Column("system"), Column("condition")]
+    columns += [Column(part)] if part else []
+    columns += [Column("n", "count")]
+    columns += [Column(bound, "rate") for bound in ("rate", "low", "high")]
+    columns += [Column(name, "count") for name in ("successes", "fails", "timeouts", "errors")]
+    columns += [Column("complete", "flag"), Column("missing", "count"), Column("rank", "count")]
+    rows = []
+    for cell in cells:
+        low, high = cell.interval if cell.n else (math.nan, math.nan)
+        own = [cell.simulator, cell.system, cell.condition] + ([cell.part] if part else [])
+        rates = (cell.n, cell.rate, low, high, *cell.counts)
+        rows.append((*own, *rates, cell.complete, cell.missing, cell.rank))
+    return Table(name, title, tuple(columns), tuple(rows), NOTE)
+
+
+def main_markdown(cells: Sequence[Cell]) -> str:
+    """Return the paper's main table in Markdown: a row per system, a column per condition.
+
+    The highest rate of each condition among several complete cells is bold, as in the paper.
+    """
+    lines = []
+    for simulator in dict.fromkeys(cell.simulator for cell in cells):
+        found = [cell for cell in cells if cell.simulator == simulator]
+        conditions = sorted({cell.condition for cell in found}, key=condition_rank)
+        at = {(cell.system, cell.condition): cell for cell in found}
+        lines += [
+            f"| {simulator} | {' | '.join(conditions)} |",
+            "| --- |" + " --- |" * len(conditions),
+        ]
+        for system in dict.fromkeys(cell.system for cell in found):
+            several = {
+                c: sum(a.condition == c and a.complete for a in found) > 1 for c in conditions
+            }
+            shown = [_shown(at.get((system, c)), several[c]) for c in conditions]
+            lines.append(f"| {display_name(system)} | {' | '.join(shown)} |")
+        lines.append("")
+    errors = sum(cell.counts[ERROR] for cell in cells)
+    broke = f" Rollouts that broke: {errors}." if errors else " No rollout broke."
+    return "\n".join([*lines, NOTE + broke]) + "\n"
+
+
+def _shown(cell: Cell | None, several: bool) -> str:
+    if cell is None:
+        return "–"
+    if not cell.n:
+        return "no result†"
+    low, high = cell.interval
+    rate = f"**{percent(cell.rate)}**" if several and cell.rank == 1 else percent(cell.rate)
+    mark = "" if cell.complete else "†"
+    errors = f", errors: {cell.counts[ERROR]}" if cell.counts[ERROR] else ""
+    return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}] n={cell.n}{errors}"
+
+
+def coverage_table(outcomes: Sequence[Outcomes], expected: Mapping[str, Expected]) -> Table:
+    """Return which episodes each cell of a family lacks, and in which the rollout broke."""
+    columns = [Column(name) for name in ("simulator", "system", "condition", "family")]
+    columns += [Column(name, "count") for name in ("expected", "n", "errors")]
+    columns += [Column("complete", "flag"), Column("missing_episodes"), Column("error_episodes")]
+    columns += [Column("other_episodes")]
+    rows = []
+    for one in outcomes:
+        wanted = expected[one.simulator]
+        for place, condition in enumerate(one.conditions):
+            counts = one.scored[place] > 0
+            broke = one.counts[place, :, ERROR] > 0
+            scored = one.episodes[counts]
+            for rank, family in enumerate(FAMILIES):
+                here = one.families == rank
+                due = wanted.episodes[wanted.families == rank]
+                if not len(due) and not here.any():
+                    continue
+                missing = np.setdiff1d(due, scored, assume_unique=True)
+                other = np.setdiff1d(one.episodes[here & counts], due, assume_unique=True)
+                n, errors = int((here & counts).sum()), int(one.counts[place, here, ERROR].sum())
+                lists = (missing, one.episodes[here & broke], other)
+                complete = n > 0 and not len(missing) and not len(other)
+                rows.append(
+                    (
+                        *(one.simulator, one.system, condition, family),
+                        *(len(due), n, errors, complete),
+                        *map(_spans, lists),
+                    )
+                )
+    note = (
+        "Episodes by split and index. An episode counts if one of its rollouts is no error; one "
+        "whose rollouts all broke is missing."
+    )
+    return Table("coverage", "Which episodes count", tuple(columns), tuple(rows), note)
+
+
+def _spans(episodes: NDArray[np.int64]) -> str:
+    """Return packed episodes of one family as text, such as `test 0-3 7`."""
+    spans: dict[str, list[list[int]]] = {}
+    for episode in map(episode_id, episodes.tolist()):
+        known = spans.setdefault(episode.split, [])
+        if known and known[-1][1] == episode.index - 1:
+            known[-1][1] = episode.index
+        else:
+            known.append([episode.index, episode.index])
+    return "; ".join(
+        f"{split} " + " ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in found)
+        for split, found in spans.items()
+    )

@@ -1,0 +1,372 @@
+"""Judge rows, and pack each into one 64-bit number."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FAMILIES, MAX_STEPS, SPLITS
+from robomme_interference_data.errors import InterferenceError, nearest
+from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_rank
+from robomme_interference_data.evaluate.score.read import Batch, Source
+from robomme_interference_data.evaluate.systems import name_system
+
+__all__ = ["BITS", "DIFFICULTIES", "REFUSED", "STATUSES", "Checker", "field", "pack"]
+
+STATUSES = ("success", "fail", "timeout", "error")
+"""By their codes in packed rows."""
+
+DIFFICULTIES = ("easy", "medium", "hard")
+_UNSAID = len(DIFFICULTIES)
+
+BITS = {
+    "simulator": 4,
+    "system": 10,
+    "condition": 7,
+    "family": 4,
+    "episode_split": 2,
+    "episode": 17,
+    "model_seed": 17,
+    "status": 2,
+}
+"""Fields of a packed row from the highest bits down: 63 in all. Sorting sorts by them in turn."""
+
+REFUSED = np.uint64(2**64 - 1)
+"""Stands where a row was refused."""
+
+_SHIFTS = {name: sum(list(BITS.values())[place + 1 :]) for place, name in enumerate(BITS)}
+_SUCCESS = {True: 1, False: 0, None: 2}
+_EXPECTED = np.array([1, 0, 0, 2])  # success by status
+_WORDS: dict[Any, bool | None] = {"": None, "none": None, "nan": None}
+_WORDS |= dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
+
+Codes = NDArray[np.int64]
+
+
+def pack(**codes: Codes | int) -> NDArray[np.uint64]:
+    """Pack codes into numbers; fields that are not given are zero."""
+    packed: Any = np.uint64(0)
+    for name, code in codes.items():
+        packed = packed | (np.asarray(code).astype(np.uint64) << np.uint64(_SHIFTS[name]))
+    return packed
+
+
+def field(packed: NDArray[np.uint64], name: str) -> Codes:
+    """Return one field of packed rows."""
+    mask = np.uint64(2 ** BITS[name] - 1)
+    return ((packed >> np.uint64(_SHIFTS[name])) & mask).astype(np.int64)
+
+
+class Checker:
+    """Packs the rows of one source after another, and says what is wrong with a row.
+
+    Attributes:
+        simulators: Names by code, in the order in which they were first seen; so are `systems`
+            and `model_seeds`.
+        revisions: Simulator to the revision of its rows, as far as rows name one.
+        difficulty: Code by episode, −1 where no row tells: a row per `episode_group`, a column per
+            index.
+        seeds: Seed of the scene, likewise.
+    """
+
+    def __init__(self, system: str | None = None):
+        self._system = system
+        self.simulators: list[str] = []
+        self.systems: list[str] = []
+        self.model_seeds: list[int] = []
+        self.revisions: dict[str, str] = {}
+        self._width = 0
+        self.difficulty = np.zeros((0, 0), np.int8)
+        self.seeds = np.zeros((0, 0), np.int64)
+
+    def pack(self, batch: Batch, source: Source) -> tuple[NDArray[np.uint64], dict[int, str]]:
+        """Return the packed rows, `REFUSED` for bad ones, and the reason for each bad row."""
+        rows = _Rows(batch)
+        default = None if "system" in source.columns else self._system
+        codes = {
+            "simulator": rows.text(
+                "simulator", self._named(self.simulators, "simulator"), "robomme"
+            ),
+            "system": rows.text("system", self._named_system, default),
+            "condition": rows.text("condition", _condition),
+            "family": rows.text("family", _family),
+            "episode_split": rows.text("episode_split", _split, "test"),
+            "episode": rows.number("episode", 2 ** BITS["episode"] - 1),
+            "model_seed": self._seeds(rows),
+            "status": rows.text("status", _status),
+        }
+        success = rows.text("success", _success)
+        rows.refuse(
+            (success >= 0) & (codes["status"] >= 0) & (success != _EXPECTED[codes["status"]]),
+            lambda row: (
+                f"success {rows.shown('success', row)} contradicts status "
+                f"{rows.shown('status', row)}"
+            ),
+        )
+        rows.number("steps", MAX_STEPS, default=0)
+        if "protocol_version" in batch.columns:
+            version = rows.number("protocol_version", 2**31)
+            rows.refuse(
+                version != PROTOCOL_VERSION,
+                lambda row: (
+                    f"protocol version {rows.shown('protocol_version', row)}; expected "
+                    f"{PROTOCOL_VERSION}"
+                ),
+            )
+        if "revision" in batch.columns:
+            self._check_revisions(rows, codes["simulator"])
+        self._check_episodes(rows, codes)
+        packed = pack(**{name: np.maximum(code, 0) for name, code in codes.items()})
+        packed = np.broadcast_to(packed, batch.rows).copy()
+        packed[list(rows.reasons)] = REFUSED
+        return packed, rows.reasons
+
+    def _named(self, names: list[str], what: str) -> Callable[[Any], int]:
+        def code(value: Any) -> int:
+            if not value:
+                raise ValueError(f"{what} is empty")
+            if value not in names:
+                if len(names) == 2 ** BITS[what]:
+                    raise ValueError(f"more than {2 ** BITS[what]} values of {what}")
+                names.append(value)
+            return names.index(value)
+
+        return code
+
+    def _named_system(self, value: Any) -> int:
+        return self._named(self.systems, "system")(name_system(value or "").name)
+
+    def _seeds(self, rows: "_Rows") -> Codes:
+        seeds = rows.number("model_seed", 2**62, default=0)
+        values, place = np.unique(seeds, return_inverse=True)
+        codes = np.zeros(len(values), np.int64)
+        for index, value in enumerate(values.tolist()):
+            if value not in self.model_seeds:
+                self.model_seeds.append(value)
+            codes[index] = self.model_seeds.index(value)
+        most = 2 ** BITS["model_seed"]
+        rows.refuse(codes[place] >= most, lambda row: f"more than {most:,} model seeds")
+        return codes[place]
+
+    def _check_revisions(self, rows: "_Rows", simulator: Codes) -> None:
+        revisions: list[str] = []
+        code = rows.text("revision", lambda v: _add(revisions, v or ""))
+        for pair in np.unique(simulator * len(revisions) + code).tolist():
+            number, place = divmod(pair, max(len(revisions), 1))
+            if number < 0 or not revisions[place]:
+                continue
+            name = self.simulators[number]
+            known = self.revisions.setdefault(name, revisions[place])
+            if known != revisions[place]:
+                rows.refuse(
+                    (simulator == number) & (code == place),
+                    _beside(rows, known),
+                )
+
+    def _check_episodes(self, rows: "_Rows", codes: dict[str, Codes]) -> None:
+        """Hold seed and difficulty against what other rows of the same episode say."""
+        difficulty = rows.text("difficulty", _difficulty, default="")
+        difficulty = np.where(difficulty == _UNSAID, -1, difficulty)
+        seed = rows.number("seed", 2**62, default=-1)
+        episode = np.maximum(codes["episode"], 0)
+        self._grow(int(episode.max(initial=0)))
+        group = episode_group(*(np.maximum(codes[n], 0) for n in _GROUP))
+        sound = np.ones(len(episode), bool)
+        sound[list(rows.reasons)] = False
+        for name, known, given in (
+            ("difficulty", self.difficulty, difficulty),
+            ("seed", self.seeds, seed),
+        ):
+            said = sound & (given >= 0)
+            at = group[said], episode[said]
+            before = known[at]
+            # Of several rows the first one counts: what is assigned last stays.
+            known[at[0][::-1], at[1][::-1]] = np.where(before >= 0, before, given[said])[::-1]
+            wrong = np.zeros(len(episode), bool)
+            wrong[said] = known[at] != given[said]
+            rows.refuse(
+                wrong,
+                _differs(rows, name),
+            )
+
+    def _grow(self, episode: int) -> None:
+        groups, width = self.difficulty.shape
+        wanted = len(self.simulators) * len(FAMILIES) * len(SPLITS)
+        if groups < wanted or width <= episode:
+            self._width = max(self._width, 64, 2 ** int(episode).bit_length())
+            for name in ("difficulty", "seeds"):
+                old = getattr(self, name)
+                new = np.full((wanted, self._width), -1, old.dtype)
+                new[: old.shape[0], : old.shape[1]] = old
+                setattr(self, name, new)
+
+
+_GROUP = ("simulator", "family", "episode_split")
+
+
+def episode_group(simulator: Any, family: Any, split: Any) -> Any:
+    """Return the row of `Checker.difficulty` for codes of simulator, family and split."""
+    return (simulator * len(FAMILIES) + family) * len(SPLITS) + split
+
+
+class _Rows:
+    """The columns of a batch as codes, and the first reason against each bad row."""
+
+    def __init__(self, batch: Batch):
+        self.batch = batch
+        self.reasons: dict[int, str] = {}
+
+    def text(self, name: str, parse: Callable[[Any], int], default: Any = None) -> Codes:
+        """Return the code of each row's value, −1 where `parse` refuses it.
+
+        `parse` is asked once for each distinct value. `default` stands for a missing column.
+        """
+        column = self.batch.columns.get(name)
+        if column is None:
+            values = [default]
+            index: Codes = np.zeros(self.batch.rows, np.int64)
+        else:
+            if not pa.types.is_dictionary(column.type):
+                column = column.dictionary_encode()
+            values = [*column.dictionary.to_pylist(), None]
+            index = _numbers(column.indices, len(values) - 1)
+        codes = np.zeros(len(values), np.int64)
+        reasons = {}
+        for place in np.unique(index).tolist():
+            try:
+                codes[place] = parse(values[place])
+            except InterferenceError as error:
+                codes[place], reasons[place] = -1, f"{error.message}. {error.hint or ''}".strip()
+            except ValueError as error:
+                codes[place], reasons[place] = -1, str(error)
+        found = codes[index]
+        self.refuse(found < 0, lambda row: reasons[int(index[row])])
+        return found
+
+    def number(self, name: str, most: int, default: int | None = None) -> Codes:
+        """Return whole numbers from 0 to `most`, −1 where there is something else.
+
+        With a default that stands for a missing column and for an empty cell.
+        """
+        column = self.batch.columns.get(name)
+        if column is None:
+            return np.full(self.batch.rows, -1 if default is None else default, np.int64)
+        if pa.types.is_dictionary(column.type):
+            numbers = _whole(column.dictionary)
+            column = pc.take(numbers, column.indices)
+        elif not pa.types.is_int64(column.type):
+            column = _whole(column)
+        empty = self.batch.columns[name].is_null().to_numpy(zero_copy_only=False)
+        found = _numbers(column, -1)
+        found = np.where((found < 0) | (found > most), -1, found)
+        refused = found < 0
+        if default is not None:
+            found = np.where(empty, default, found)
+            refused &= ~empty
+        self.refuse(
+            refused,
+            lambda row: (
+                f"{name} {self.shown(name, row)}; expected a whole number from 0"
+                + (f" to {most}" if most < 2**31 else "")
+            ),
+        )
+        return found
+
+    def refuse(self, bad: NDArray[np.bool_], reason: Callable[[int], str]) -> None:
+        """Note why rows are bad, unless something else is known against them."""
+        for row in np.flatnonzero(bad).tolist():
+            if row not in self.reasons:
+                self.reasons[row] = reason(row)
+
+    def shown(self, name: str, row: int) -> str:
+        value = self.batch.columns[name][row].as_py()
+        return "(empty)" if value is None else repr(value)
+
+
+def _beside(rows: _Rows, known: str) -> Callable[[int], str]:
+    return lambda row: (
+        f"revision {rows.shown('revision', row)} beside {known!r}: rows of different splits do "
+        "not mix"
+    )
+
+
+def _differs(rows: _Rows, name: str) -> Callable[[int], str]:
+    return lambda row: (
+        f"{name} {rows.shown(name, row)} differs from that of other rows of the same episode"
+    )
+
+
+def _numbers(array: Any, null: int) -> Codes:
+    """Return an Arrow array of whole numbers as numpy's, with a number for null.
+
+    `fill_null` would import pandas wherever that is installed, which takes seconds.
+    """
+    if not array.null_count:
+        return array.to_numpy().astype(np.int64, copy=False)
+    empty = array.is_null().to_numpy(zero_copy_only=False)
+    data = np.frombuffer(array.buffers()[1], array.type.to_pandas_dtype())
+    return np.where(empty, null, data[array.offset : array.offset + len(array)])
+
+
+def _whole(values: Any) -> Any:
+    """Read values as int64, null where one is no whole number."""
+    try:
+        return values.cast(pa.int64())
+    except pa.ArrowInvalid:
+        return pa.array([_whole_number(value) for value in values.to_pylist()], pa.int64())
+
+
+def _whole_number(value: Any) -> int | None:
+    try:
+        number = int(str(value))
+    except ValueError:
+        return None
+    return number if 0 <= number < 2**62 else None
+
+
+def _add(names: list[str], value: str) -> int:
+    if value not in names:
+        names.append(value)
+    return names.index(value)
+
+
+def _family(value: Any) -> int:
+    if value not in FAMILIES:
+        raise ValueError(f"unknown family {value or ''!r}. {nearest(value or '', FAMILIES)}")
+    return FAMILIES.index(value)
+
+
+def _condition(value: Any) -> int:
+    return condition_rank(value or "") + 1
+
+
+def _split(value: Any) -> int:
+    if value not in SPLITS:
+        raise ValueError(f"unknown split {value or ''!r}. {nearest(value or '', SPLITS)}")
+    return SPLITS.index(value)
+
+
+def _status(value: Any) -> int:
+    value = "timeout" if value == "ongoing" else value or ""  # as the released rows have it
+    if value not in STATUSES:
+        raise ValueError(f"unknown status {value!r}. {nearest(value, STATUSES)}")
+    return STATUSES.index(value)
+
+
+def _success(value: Any) -> int:
+    if isinstance(value, bool) or value is None:
+        return _SUCCESS[value]
+    if str(value).lower() not in _WORDS:
+        raise ValueError(f"success {value!r}; expected 1, 0, true, false or nothing")
+    return _SUCCESS[_WORDS[str(value).lower()]]
+
+
+def _difficulty(value: Any) -> int:
+    if not value:
+        return _UNSAID
+    if value not in DIFFICULTIES:
+        raise ValueError(f"unknown difficulty {value!r}. {nearest(value, DIFFICULTIES)}")
+    return DIFFICULTIES.index(value)

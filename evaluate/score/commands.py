@@ -1,0 +1,124 @@
+"""The commands `score` and `compare`."""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from robomme_interference_data.evaluate.score.grid import Grid
+
+if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.score.scoring import Score
+
+__all__ = ["compare", "score"]
+
+_ERR = Console(stderr=True, markup=False, emoji=False, highlight=False)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
+
+
+class Against(StrEnum):
+    """What rates can be set against."""
+
+    PAPER = "paper"
+
+
+def score(
+    rows: Annotated[list[Path], typer.Argument(help="Folders of runs, or CSV or parquet files.")],
+    out: Annotated[Path, typer.Option(help="Folder for tables, figures and the report.")],
+    system: Annotated[
+        str | None, typer.Option(help="Name of the system of rows that name none.")
+    ] = None,
+    against: Annotated[
+        Against | None, typer.Option(help="Put the published rates beside these.")
+    ] = None,
+    grid: Annotated[
+        Grid,
+        typer.Option(
+            help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to "
+            "49 each), or those that any of the given rows is of."
+        ),
+    ] = Grid.BENCHMARK,
+    lenient: Annotated[bool, typer.Option("--lenient", help="Skip and count bad rows.")] = False,
+    export_to: Annotated[
+        Path | None,
+        typer.Option("--export", help="Also write the rows here as the released CSVs have them."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score rollout rows: tables, statistics, figures and one report.
+
+    Reads rows only, never a simulator, and can be run again at any time.
+
+    Examples:
+    robomme-interference score my-run another-run --out my-score
+
+    robomme-interference score rollouts.csv --system retrieval-framesamp-modul --against paper
+    --out my-score
+    """
+    from robomme_interference_data.evaluate.score.cells import main_markdown
+    from robomme_interference_data.evaluate.score.export import export
+    from robomme_interference_data.evaluate.score.figures import draw_figures
+    from robomme_interference_data.evaluate.score.report import write_report
+    from robomme_interference_data.evaluate.score.scoring import score as compute
+    from robomme_interference_data.evaluate.score.tables import write_tables
+
+    found = compute(rows, system, lenient, grid, against is Against.PAPER)
+    for refusal in found.rollouts.refusals:
+        _ERR.print(f"left out: {refusal}", soft_wrap=True)
+    if found.rollouts.refused:
+        _ERR.print(f"{found.rollouts.refused:,} bad rows left out")
+    write_tables(list(found.tables.values()), out / "tables", main_markdown(found.cells))
+    with _ERR.status("Drawing the figures"):
+        figures = draw_figures(found, out / "figures")
+        write_report(found, figures, out / "report.html")
+    if export_to is not None:
+        for path in export(found.rollouts, export_to, system):
+            _ERR.print(f"{path} written", soft_wrap=True)
+    if as_json:
+        typer.echo(json.dumps(_as_dict(found), indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        typer.echo(main_markdown(found.cells))
+    _ERR.print(f"Report: {out / 'report.html'}", soft_wrap=True)
+
+
+def _as_dict(found: "Score") -> dict[str, Any]:
+    from robomme_interference_data.evaluate.score.headline import headline
+
+    return {
+        "headlines": {simulator: headline(found, simulator) for simulator in found.expected},
+        "rows": len(found.rollouts.packed),
+        "bad_rows": found.rollouts.refused,
+        "grid": found.grid,
+        "tables": {name: table.records() for name, table in found.tables.items()},
+    }
+
+
+def compare(
+    run_a: Annotated[Path, typer.Argument(help="Folder of a run, or file of rows.")],
+    run_b: Annotated[Path, typer.Argument(help="The other one.")],
+    system_a: Annotated[
+        str | None, typer.Option(help="Name of the system of rows of A that name none.")
+    ] = None,
+    system_b: Annotated[
+        str | None, typer.Option(help="Name of the system of rows of B that name none.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two runs, paired over the episodes that both have.
+
+    Example: robomme-interference compare my-run my-run-with-retrieval
+    """
+    from robomme_interference_data.evaluate.score.compare import compare as compute
+
+    found = compute(run_a, run_b, (system_a, system_b))
+    for note in found.notes:
+        _ERR.print(note, soft_wrap=True)
+    if as_json:
+        value = {"notes": list(found.notes), "rows": found.table.records()}
+        typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        typer.echo(found.table.markdown())

@@ -1,0 +1,181 @@
+"""What each system did on each episode under each condition."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FAMILIES, SPLITS
+from robomme_interference_data.evaluate.rows import NO_HISTORY
+from robomme_interference_data.evaluate.score.check import BITS, STATUSES, field, pack
+from robomme_interference_data.evaluate.score.grid import Grid
+from robomme_interference_data.evaluate.score.rollouts import Rollouts
+from robomme_interference_data.ids import EpisodeId, condition_name
+
+__all__ = [
+    "Expected",
+    "Outcomes",
+    "SUCCESS",
+    "episode_id",
+    "expected_episodes",
+    "families_of",
+    "outcomes_of",
+]
+
+SUCCESS, ERROR = STATUSES.index("success"), STATUSES.index("error")
+TEST_EPISODES = 50
+_EPISODE_BITS = BITS["family"] + BITS["episode_split"] + BITS["episode"]
+_EPISODE_SHIFT = BITS["model_seed"] + BITS["status"]
+_SYSTEM_SHIFT = BITS["condition"] + _EPISODE_BITS + _EPISODE_SHIFT
+_FAMILY_SHIFT = _EPISODE_BITS - BITS["family"]
+_INDEX = 2 ** BITS["episode"]
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """One system in one simulator: C conditions, E episodes.
+
+    Attributes:
+        simulator: Name of the simulator.
+        system: Name of the system.
+        conditions: Their names, in the order of tables.
+        episodes: Packed family, split and index, ascending, `(E,) int64` (see `episode_id`).
+        difficulty: Code of each episode, −1 unknown, `(E,) int8`.
+        counts: Rollouts by condition, episode and status, `(C, E, 4) int32`; more than one where
+            there are repeats with other model seeds.
+        repeats: Status of the rollouts with the two lowest model seeds, −1 for none,
+            `(2, C, E) int8`.
+    """
+
+    simulator: str
+    system: str
+    conditions: tuple[str, ...]
+    episodes: NDArray[np.int64]
+    difficulty: NDArray[np.int8]
+    counts: NDArray[np.int32]
+    repeats: NDArray[np.int8]
+
+    @cached_property
+    def scored(self) -> NDArray[np.int64]:
+        """Rollouts that count, errors left out, `(C, E) int64`."""
+        return self.counts[..., :ERROR].sum(axis=-1, dtype=np.int64)
+
+    @cached_property
+    def rates(self) -> NDArray[np.float64]:
+        """Mean success of the repeats, NaN where nothing counts, `(C, E) float64`."""
+        with np.errstate(invalid="ignore"):
+            return self.counts[..., SUCCESS] / self.scored
+
+    @property
+    def families(self) -> NDArray[np.int64]:
+        """Place of each episode's family in `FAMILIES`, `(E,) int64`."""
+        return families_of(self.episodes)
+
+    def column(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the rates under a condition at the given packed episodes, NaN where none."""
+        found = np.full(len(episodes), np.nan)
+        if condition in self.conditions:
+            _, there, at = np.intersect1d(
+                self.episodes, episodes, assume_unique=True, return_indices=True
+            )
+            found[at] = self.rates[self.conditions.index(condition)][there]
+        return found
+
+    def first(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.int8]:
+        """Return the status with the lowest model seed at the episodes, −1 where none counts."""
+        found = np.full(len(episodes), -1, np.int8)
+        if condition in self.conditions:
+            _, there, at = np.intersect1d(
+                self.episodes, episodes, assume_unique=True, return_indices=True
+            )
+            found[at] = self.repeats[0, self.conditions.index(condition)][there]
+        found[found == ERROR] = -1
+        return found
+
+
+def families_of(episodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the place in `FAMILIES` of each packed episode's family, `(E,) int64`."""
+    return episodes >> _FAMILY_SHIFT
+
+
+def episode_id(packed: int) -> EpisodeId:
+    """Return the episode that a packed number stands for."""
+    rest, index = divmod(int(packed), _INDEX)
+    family, split = divmod(rest, 2 ** BITS["episode_split"])
+    return EpisodeId(FAMILIES[family], SPLITS[split], index)
+
+
+def outcomes_of(rollouts: Rollouts) -> Iterator[Outcomes]:
+    """Yield the outcomes of each system, simulator by simulator, in the order of tables."""
+    for code, simulator in enumerate(rollouts.simulators):
+        for number, system in enumerate(rollouts.systems):
+            begin = pack(simulator=code, system=number)
+            end = begin | np.uint64(2**_SYSTEM_SHIFT - 1)
+            start = np.searchsorted(rollouts.packed, begin)
+            stop = np.searchsorted(rollouts.packed, end, side="right")
+            if start < stop:
+                yield _outcomes(rollouts, code, simulator, system, rollouts.packed[start:stop])
+
+
+def _outcomes(
+    rollouts: Rollouts, code: int, simulator: str, system: str, packed: NDArray[np.uint64]
+) -> Outcomes:
+    conditions, row = np.unique(field(packed, "condition"), return_inverse=True)
+    keys = (packed >> np.uint64(_EPISODE_SHIFT)).astype(np.int64) & (2**_EPISODE_BITS - 1)
+    episodes, column = np.unique(keys, return_inverse=True)
+    status = field(packed, "status")
+    shape = (len(conditions), len(episodes))
+    cell = row * len(episodes) + column
+    counts = np.bincount(cell * len(STATUSES) + status, minlength=shape[0] * shape[1] * 4)
+    # Rows are sorted by model seed within a cell: the first two of each are the lowest seeds.
+    begins = np.flatnonzero(np.diff(cell, prepend=-1))
+    repeats = np.full((2, shape[0] * shape[1]), -1, np.int8)
+    repeats[0, cell[begins]] = status[begins]
+    again = begins[np.diff(begins, append=len(cell)) > 1]
+    repeats[1, cell[again]] = status[again + 1]
+    return Outcomes(
+        simulator,
+        system,
+        tuple(NO_HISTORY if c == 0 else condition_name(int(c) - 1) for c in conditions),
+        episodes,
+        rollouts.difficulty_of(code, episodes),
+        counts.reshape(*shape, len(STATUSES)).astype(np.int32),
+        repeats.reshape(2, *shape),
+    )
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The episodes that a complete cell has.
+
+    Attributes:
+        episodes: Packed, ascending, `(E,) int64`.
+        difficulty: Code of each, −1 where no row tells, `(E,) int8`.
+    """
+
+    episodes: NDArray[np.int64]
+    difficulty: NDArray[np.int8]
+
+    @property
+    def families(self) -> NDArray[np.int64]:
+        """Place of each episode's family in `FAMILIES`, `(E,) int64`."""
+        return families_of(self.episodes)
+
+
+def expected_episodes(
+    rollouts: Rollouts, outcomes: Sequence[Outcomes], grid: Grid
+) -> dict[str, Expected]:
+    """Return for each simulator what a complete cell has (see `Grid`)."""
+    expected = {}
+    for code, simulator in enumerate(rollouts.simulators):
+        if grid is Grid.GIVEN:
+            parts = [one.episodes for one in outcomes if one.simulator == simulator]
+            episodes = np.unique(np.concatenate([*parts, np.zeros(0, np.int64)]))
+        else:
+            family, index = np.divmod(np.arange(len(FAMILIES) * TEST_EPISODES), TEST_EPISODES)
+            place = family << BITS["episode_split"] | SPLITS.index("test")
+            episodes = place << BITS["episode"] | index
+        expected[simulator] = Expected(episodes, rollouts.difficulty_of(code, episodes))
+    return expected

@@ -1,0 +1,120 @@
+"""The rates that the paper reports, and how ours compare."""
+
+import csv
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from robomme_interference_data.evaluate.score.cells import Cell
+from robomme_interference_data.evaluate.score.effects import base_of
+from robomme_interference_data.evaluate.score.tables import Column, Table
+from robomme_interference_data.intervals import newcombe, wilson
+
+__all__ = ["SOURCE", "Published", "comparable", "paper_table", "published"]
+
+SOURCE = (
+    "RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August 2026), "
+    "Tables 3 and 4"
+)
+"""Where the rates of `data/published.csv` stand: the main table, and the one on retrieval."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published rate.
+
+    Attributes:
+        table: Number of the paper's table.
+        simulator: `robomme`, always: the paper has no other.
+        system: Name of the system.
+        condition: Name of the condition.
+        percent: The rate as printed, to a tenth of a percent.
+        episodes: Episodes that it is over.
+    """
+
+    table: int
+    simulator: str
+    system: str
+    condition: str
+    percent: float
+    episodes: int
+
+    @property
+    def successes(self) -> int:
+        """The count behind the rate: of 450 episodes only one rounds to it."""
+        return round(self.percent * self.episodes / 100)
+
+    @property
+    def rate(self) -> float:
+        """The rate before rounding."""
+        return self.successes / self.episodes
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95% Wilson interval."""
+        return wilson(self.successes, self.episodes)
+
+
+@cache
+def published() -> tuple[Published, ...]:
+    """Return all published rates, in the paper's order."""
+    file = resources.files(__package__).joinpath("data", "published.csv")
+    rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+    return tuple(
+        Published(
+            int(row["table"]),
+            row["simulator"],
+            row["system"],
+            row["condition"],
+            float(row["percent"]),
+            int(row["episodes"]),
+        )
+        for row in rows
+    )
+
+
+def comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Published]]:
+    """Yield the cells that the paper has, each with the published one.
+
+    A system with retrieval comes a second time, with the published one without. The simulator is
+    compared too: rows of another simulator have no published counterpart.
+    """
+    known = {(one.simulator, one.system, one.condition): one for one in published()}
+    for cell in cells:
+        for system in (cell.system, base_of(cell.system)):
+            found = known.get((cell.simulator, system or "", cell.condition))
+            if found is not None and cell.n:
+                yield cell, found
+
+
+def paper_table(cells: Sequence[Cell]) -> Table:
+    """Return our rates beside the published ones."""
+    columns = (
+        *(Column("system"), Column("condition"), Column("published_system"), Column("n", "count")),
+        *(Column("rate", "rate"), Column("low", "rate"), Column("high", "rate")),
+        *(Column("published_n", "count"), Column("published_rate", "rate")),
+        *(Column("published_low", "rate"), Column("published_high", "rate")),
+        *(Column("difference", "points"), Column("difference_low", "points")),
+        *(Column("difference_high", "points"), Column("complete", "flag")),
+    )
+    rows = []
+    for cell, paper in comparable(cells):
+        bounds = newcombe(cell.rate * cell.n, cell.n, paper.successes, paper.episodes)
+        rows.append(
+            (
+                *(cell.system, cell.condition, paper.system, cell.n, cell.rate, *cell.interval),
+                *(paper.episodes, paper.rate, *paper.interval),
+                *(cell.rate - paper.rate, *bounds, cell.complete),
+            )
+        )
+    others = sorted({cell.simulator for cell in cells} - {one.simulator for one in published()})
+    left = (
+        f" Rows of {', '.join(others)} are not set against the paper's RoboMME." if others else ""
+    )
+    note = (
+        f"Published: {SOURCE}. 95% intervals: Wilson for rates; Newcombe's hybrid score for "
+        "differences, which takes both sides as independent samples: the paper's rows are not at "
+        f"hand to be paired.{left}"
+    )
+    return Table("paper", "Beside the published rates", columns, tuple(rows), note)

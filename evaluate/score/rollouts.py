@@ -1,0 +1,247 @@
+"""All rows of a scoring, checked, eight bytes each."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.evaluate.score.check import (
+    BITS,
+    REFUSED,
+    Checker,
+    episode_group,
+    field,
+    pack,
+)
+from robomme_interference_data.evaluate.score.read import Source, find_sources, read_batches
+from robomme_interference_data.evaluate.systems import SYSTEMS
+
+__all__ = ["Refusal", "Rollouts", "read_rollouts"]
+
+_SHOWN = 10
+"""So many bad rows are named; the others are counted."""
+
+_STEP = 2**18
+_STATUS_BITS = np.uint64(BITS["status"])
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A row that was refused: its file, its line (of a CSV, or row of a parquet file), why."""
+
+    path: Path
+    line: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{_place(self.path, self.line)}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Rows that passed every check.
+
+    Attributes:
+        packed: One number a row, sorted, no two of the same rollout, `(N,) uint64` (see `check`).
+        simulators: Names by code, sorted.
+        systems: Names by code, in the order of tables.
+        model_seeds: Seeds by code, ascending.
+        difficulty: Code by episode, −1 unknown; see `Rollouts.difficulty_of`.
+        seeds: Seed of the scene by episode, −1 unknown, likewise.
+        revisions: Simulator to the revision of its split, where rows name one.
+        videos: Packed row, its status left out, to the video of it.
+        sources: The files that were read.
+        refusals: The first bad rows that were skipped.
+        refused: How many were.
+    """
+
+    packed: NDArray[np.uint64]
+    simulators: tuple[str, ...]
+    systems: tuple[str, ...]
+    model_seeds: tuple[int, ...]
+    difficulty: NDArray[np.int8]
+    seeds: NDArray[np.int64]
+    revisions: dict[str, str]
+    videos: dict[int, Path]
+    sources: tuple[Source, ...]
+    refusals: tuple[Refusal, ...] = ()
+    refused: int = 0
+
+    def difficulty_of(self, simulator: int, episodes: NDArray[np.int64]) -> NDArray[np.int8]:
+        """Return the difficulty code of each packed episode (family, split, index), −1 unknown."""
+        packed = episodes.astype(np.uint64) << np.uint64(BITS["model_seed"] + BITS["status"])
+        family, split = field(packed, "family"), field(packed, "episode_split")
+        group = episode_group(simulator, family, split)
+        index = field(packed, "episode")
+        known = np.full(len(episodes), -1, np.int8)
+        inside = (index < self.difficulty.shape[1]) & (group < len(self.difficulty))
+        known[inside] = self.difficulty[group[inside], index[inside]]
+        return known
+
+
+class _Reader:
+    """Collects packed rows in reading order, and remembers where each stands."""
+
+    def __init__(self, lenient: bool):
+        self.lenient = lenient
+        self.chunks: list[NDArray[np.uint64]] = []
+        self.starts: list[tuple[int, Path, int]] = []  # row number, its file, its line
+        self.refusals: list[Refusal] = []
+        self.refused = 0
+        self.videos: list[tuple[int, Path]] = []
+        self.rows = 0
+
+    def read(self, source: Source, checker: Checker) -> None:
+        for batch in read_batches(source):
+            packed, reasons = checker.pack(batch, source)
+            for line, reason in batch.malformed:
+                self.refuse(source.path, line, reason)
+            for row in sorted(reasons):
+                # Lines are worked out for those that are shown.
+                line = batch.line(row) if len(self.refusals) < _SHOWN else 0
+                self.refuse(source.path, line, reasons[row])
+            self.give_up_if_strict()
+            self.starts.append((self.rows, source.path, batch.first))
+            if "video" in batch.columns and source.folder is not None:
+                video = batch.columns["video"]
+                for row in np.flatnonzero(video.is_valid().to_numpy(zero_copy_only=False)).tolist():
+                    self.videos.append((self.rows + row, source.folder / video[row].as_py()))
+            self.chunks.append(packed)
+            self.rows += batch.rows
+
+    def refuse(self, path: Path, line: int, reason: str) -> None:
+        self.refused += 1
+        if len(self.refusals) < _SHOWN:
+            self.refusals.append(Refusal(path, line, reason))
+
+    def give_up_if_strict(self) -> None:
+        if self.refused and not self.lenient:
+            more = self.refused - len(self.refusals)
+            lines = [str(refusal) for refusal in self.refusals]
+            lines += [f"… and {more:,} more so far"] if more else []
+            raise BadRowsError(
+                "\n".join([f"{self.refused:,} bad rows:", *lines]),
+                "Mend them, or leave them out with --lenient.",
+            )
+
+    def where(self, row: int) -> tuple[Path, int]:
+        """Return file and line of a row by its number; exact where nothing was malformed."""
+        place = np.searchsorted([start for start, _, _ in self.starts], row, side="right") - 1
+        start, path, line = self.starts[int(place)]
+        return path, line + row - start
+
+    def refuse_duplicates(self, packed: NDArray[np.uint64]) -> NDArray[np.uint64]:
+        """Return the rows, sorted, of each rollout only the first that was read."""
+        ordered = np.sort(packed)
+        keys = ordered >> _STATUS_BITS
+        twice = keys[1:] == keys[:-1]
+        twice &= ordered[1:] != REFUSED
+        if not twice.any():
+            return ordered[ordered != REFUSED]
+        keys = packed >> _STATUS_BITS
+        order = np.argsort(keys, kind="stable")
+        keys = keys[order]
+        later = 1 + np.flatnonzero((keys[1:] == keys[:-1]) & (packed[order[1:]] != REFUSED))
+        first = np.searchsorted(keys, keys[later], side="left")
+        for one, other in sorted(zip(order[later].tolist(), order[first].tolist(), strict=True)):
+            path, line = self.where(one)
+            self.refuse(path, line, f"the same rollout as {_place(*self.where(other))}")
+        self.give_up_if_strict()
+        kept = np.ones(len(packed), bool)
+        kept[order[later]] = False
+        kept &= packed != REFUSED
+        return np.sort(packed[kept])
+
+
+def read_rollouts(
+    paths: Sequence[Path], system: str | None = None, lenient: bool = False
+) -> Rollouts:
+    """Read rows from files and folders of runs, and check each of them.
+
+    Memory grows by 8 bytes a row, three times that while rows are sorted.
+
+    Args:
+        paths: Folders of runs, CSVs and parquet files.
+        system: Name of the system of rows that name none.
+        lenient: Skip and count bad rows.
+
+    Raises:
+        BadRowsError: A row is bad: unknown family, condition, status or system, numbers out of
+            range, a success that contradicts the status, the same rollout twice, rows of
+            different splits, or an episode with two seeds or difficulties.
+        MissingFileError: There is no such file.
+        FormatError: A file cannot be read or lacks columns.
+    """
+    sources = find_sources(paths, with_system=system is not None)
+    checker, reader = Checker(system), _Reader(lenient)
+    for source in sources:
+        reader.read(source, checker)
+    packed = np.concatenate(reader.chunks) if reader.chunks else np.zeros(0, np.uint64)
+    reader.chunks.clear()
+    orders = {
+        "simulator": _ranks(checker.simulators, lambda name: name),
+        "system": _ranks(checker.systems, _table_order),
+        "model_seed": _ranks(checker.model_seeds, lambda seed: seed),
+    }
+    packed = _recode(packed, orders)
+    videos = {int(packed[row] >> _STATUS_BITS): path for row, path in reader.videos}
+    packed = reader.refuse_duplicates(packed)
+    by_name = np.argsort(orders["simulator"])
+    return Rollouts(
+        packed,
+        tuple(sorted(checker.simulators)),
+        tuple(sorted(checker.systems, key=_table_order)),
+        tuple(sorted(checker.model_seeds)),
+        _regrouped(checker.difficulty, by_name),
+        _regrouped(checker.seeds, by_name),
+        dict(sorted(checker.revisions.items())),
+        videos,
+        tuple(sources),
+        tuple(reader.refusals),
+        reader.refused,
+    )
+
+
+def _place(path: Path, line: int) -> str:
+    return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
+
+
+def _table_order(system: str) -> tuple[int, str]:
+    known = list(SYSTEMS)
+    return (known.index(system) if system in SYSTEMS else len(known), system)
+
+
+def _ranks(values: Sequence[Any], key: Callable[[Any], Any]) -> NDArray[np.int64]:
+    """Return the place of each value among the sorted values."""
+    order = sorted(range(len(values)), key=lambda index: key(values[index]))
+    ranks = np.zeros(len(values), np.int64)
+    ranks[order] = np.arange(len(values))
+    return ranks
+
+
+def _regrouped[T: np.generic](known: NDArray[T], order: NDArray[np.int64]) -> NDArray[T]:
+    """Return what is known of episodes with the simulators in another order."""
+    if not len(order):
+        return known
+    return known.reshape(len(order), -1, known.shape[1])[order].reshape(known.shape)
+
+
+def _recode(
+    packed: NDArray[np.uint64], ranks: Mapping[str, NDArray[np.int64]]
+) -> NDArray[np.uint64]:
+    """Replace codes in reading order by ranks, so that the order of files makes no difference."""
+    changed = {name: rank for name, rank in ranks.items() if (np.diff(rank) != 1).any()}
+    if not changed:
+        return packed
+    result = packed.copy()
+    for start in range(0, len(packed), _STEP):
+        part = packed[start : start + _STEP]
+        sound = part != REFUSED
+        codes = {name: field(part[sound], name) for name in BITS}
+        codes |= {name: rank[codes[name]] for name, rank in changed.items()}
+        result[start : start + _STEP][sound] = pack(**codes)
+    return result

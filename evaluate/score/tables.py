@@ -1,0 +1,130 @@
+"""Tables as data, and as CSV and Markdown. Rules for what stands in them are elsewhere."""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from robomme_interference_data.files import atomic_path
+
+__all__ = ["Column", "Kind", "Table", "percent", "points", "write_tables"]
+
+Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column.
+
+    Attributes:
+        name: Its name.
+        kind: How values are shown. `rate` and `points` are fractions: Markdown shows percent and
+            percentage points, CSV the fraction with six digits after the point.
+    """
+
+    name: str
+    kind: Kind = "text"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under columns; None and NaN are empty cells.
+
+    Attributes:
+        name: Name of its files.
+        title: What it shows, in a line.
+        columns: The columns.
+        rows: A tuple of values a row.
+        note: How to read it, in a sentence or two.
+    """
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    note: str = ""
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return the rows by column name, NaN as None, for JSON."""
+        names = [column.name for column in self.columns]
+        return [dict(zip(names, map(_known, row), strict=True)) for row in self.rows]
+
+    def csv(self) -> str:
+        """Return the table as CSV."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow([column.name for column in self.columns])
+        for row in self.rows:
+            writer.writerow([_plain(v, c.kind) for v, c in zip(row, self.columns, strict=True)])
+        return out.getvalue()
+
+    def cells(self, row: Sequence[Any]) -> list[str]:
+        """Return a row as a reader sees it."""
+        return [_shown(v, c.kind) for v, c in zip(row, self.columns, strict=True)]
+
+    def markdown(self) -> str:
+        """Return the table as Markdown, under its title."""
+        rule = ["---" if column.kind in ("text", "flag") else "---:" for column in self.columns]
+        heads = [column.name.replace("_", " ") for column in self.columns]
+        lines = [heads, rule, *(self.cells(row) for row in self.rows)]
+        text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        return "\n\n".join(part for part in (f"# {self.title}", text, self.note) if part) + "\n"
+
+
+def write_tables(tables: Sequence[Table], folder: Path, main: str) -> None:
+    """Write each table as `<name>.csv` and `<name>.md`.
+
+    Args:
+        tables: The tables.
+        folder: Where to write.
+        main: Markdown of the table `main`, which is laid out as in the paper.
+    """
+    for table in tables:
+        markdown = main if table.name == "main" else table.markdown()
+        for suffix, text in ((".csv", table.csv()), (".md", markdown)):
+            with atomic_path(folder / (table.name + suffix)) as partial:
+                partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+def percent(value: float) -> str:
+    """Return a fraction as percent, `44.9%`."""
+    return f"{100 * value:.1f}%"
+
+
+def points(value: float) -> str:
+    """Return a difference of fractions in percentage points, `+27.1` or `−3.0`."""
+    text = f"{100 * value:+.1f}"
+    return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _plain(value: Any, kind: Kind) -> str:
+    value = _known(value)
+    if value is None:
+        return ""
+    if kind == "flag":
+        return "yes" if value else "no"
+    if kind in ("rate", "points", "ratio"):
+        text = f"{value:.6f}"
+        return "0.000000" if text == "-0.000000" else text
+    return f"{value:.6g}" if kind == "p" else str(value)
+
+
+def _shown(value: Any, kind: Kind) -> str:
+    value = _known(value)
+    if value is None:
+        return ""
+    shapes: dict[str, Callable[[Any], str]] = {
+        "rate": percent,
+        "points": points,
+        "ratio": lambda v: f"{round(v, 2) + 0.0:.2f}".replace("-", "−"),
+        "p": lambda v: "< 0.001" if v < 0.001 else f"{v:.3f}",
+        "count": lambda v: f"{v:,}",
+    }
+    return shapes.get(kind, lambda v: _plain(v, kind).replace("|", "\\|"))(value)

@@ -1,0 +1,92 @@
+"""Made-up rollout rows for the tests of scoring: few enough to be worked out by hand."""
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from robomme_interference_data.evaluate.rows import NO_HISTORY, ROLLOUT_SCHEMA, Rollout
+
+BASE, RETRIEVAL, OWN = "perceptual-framesamp-modul", "retrieval-framesamp-modul", "my-memory"
+FAMILIES = ("MoveCube", "InsertPeg")
+EPISODES = 6
+REVISION = "ab" * 32
+
+# Outcomes of MoveCube 0-5, then InsertPeg 0-5: s success, f fail, t timeout, e error, - no row.
+OUTCOMES = {
+    (BASE, NO_HISTORY): "sfffffffffff",  # 1 of 12
+    (BASE, "k0"): "sssssfssffff",  # 7 of 12
+    (BASE, "k1"): "ssssffsfftff",  # 5 of 12
+    (BASE, "k3"): "sssfffffffff",  # 3 of 12
+    (BASE, "k7"): "ssffffffffff",  # 2 of 12
+    (RETRIEVAL, "k0"): "sssssfsfsfff",  # 7 of 12
+    (RETRIEVAL, "k7"): "sssssfssffft",  # 7 of 12
+    (OWN, NO_HISTORY): "sfffffffffff",  # 1 of 12
+    (OWN, "k0"): "sseff-ffffff",  # 2 of 10: an error and a missing row
+}
+STATUS = {"s": "success", "f": "fail", "t": "timeout", "e": "error"}
+
+
+def row(system: str, condition: str, family: str, episode: int, letter: str) -> Rollout:
+    status = STATUS[letter]
+    return Rollout(
+        system=system,
+        simulator="tabletop",
+        split="made-up",
+        revision=REVISION,
+        family=family,
+        condition=condition,
+        episode_split="test",
+        episode=episode,
+        model_seed=0,
+        protocol_version=1,
+        seed=1000 * FAMILIES.index(family) + episode,
+        difficulty=("easy", "medium", "hard")[episode // 2],
+        goal="do it",
+        status=status,
+        success=None if letter == "e" else letter == "s",
+        steps=1300 if letter == "t" else 100,
+        history_frames=0 if condition == NO_HISTORY else 100,
+        lesson_frames=0 if condition == NO_HISTORY else 50,
+        lesson_share=None if condition == NO_HISTORY else 0.5,
+        error="it broke" if letter == "e" else None,
+    )
+
+
+def rows() -> list[Rollout]:
+    """All rows of `OUTCOMES`."""
+    return [
+        row(system, condition, FAMILIES[place // EPISODES], place % EPISODES, letter)
+        for (system, condition), letters in OUTCOMES.items()
+        for place, letter in enumerate(letters)
+        if letter != "-"
+    ]
+
+
+def repeat(given: Iterable[Rollout], seed: int) -> list[Rollout]:
+    """The same rollouts with another model seed."""
+    return [replace(one, model_seed=seed) for one in given]
+
+
+def write_csv(path: Path, given: Sequence[Rollout]) -> Path:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(ROLLOUT_SCHEMA.names)
+        for one in given:
+            writer.writerow(["" if v is None else v for v in one.as_dict().values()])
+    return path
+
+
+def write_parquet(path: Path, given: Sequence[Rollout]) -> Path:
+    pq.write_table(pa.Table.from_pylist([r.as_dict() for r in given], ROLLOUT_SCHEMA), path)
+    return path
+
+
+def released(path: Path, lines: Sequence[str]) -> Path:
+    """A file in the layout of the released rows, without what scoring does not need."""
+    header = "system,family,condition,episode,seed,difficulty,status,success,steps"
+    path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+    return path

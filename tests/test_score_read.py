@@ -1,0 +1,306 @@
+"""Rows are read from CSV, parquet and folders alike, and bad ones are named and refused."""
+
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import score_rows as made
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robomme_interference_data.errors import BadRowsError, FormatError, MissingFileError
+from robomme_interference_data.evaluate.score import read, rollouts
+from robomme_interference_data.evaluate.score.check import BITS, REFUSED, field, pack
+from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
+
+GOOD = "my-memory,MoveCube,k0,0,7,easy,success,1,100"
+
+
+def codes(found: Rollouts) -> set[tuple[str, ...]]:
+    names = ("system", "condition", "family", "episode", "model_seed", "status")
+    columns = [field(found.packed, name).tolist() for name in names]
+    return {(found.systems[one[0]], *one[1:]) for one in zip(*columns, strict=True)}
+
+
+def test_csv_parquet_and_folders_are_read_alike(tmp_path: Path) -> None:
+    rows = made.rows()
+    by_csv = read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    by_parquet = read_rollouts([made.write_parquet(tmp_path / "a.parquet", rows)])
+    (tmp_path / "run").mkdir()
+    made.write_parquet(tmp_path / "run" / "rollouts.parquet", rows)
+    (tmp_path / "run" / "run.json").write_text('{"format_version": 1, "status": "done"}')
+    by_folder = read_rollouts([tmp_path / "run"])
+    for other in (by_parquet, by_folder):
+        assert np.array_equal(by_csv.packed, other.packed)
+        assert by_csv.systems == other.systems == (made.BASE, made.RETRIEVAL, made.OWN)
+        assert by_csv.revisions == other.revisions == {"tabletop": made.REVISION}
+    assert len(by_csv.packed) == 107  # 9 cells of 12, one row missing
+    assert by_folder.sources[0].record["status"] == "done"
+
+
+@settings(max_examples=15)
+@given(st.randoms(use_true_random=False), st.integers(1, 3))
+def test_the_order_of_rows_and_files_makes_no_difference(
+    tmp_path_factory: pytest.TempPathFactory, order: random.Random, files: int
+) -> None:
+    folder = tmp_path_factory.mktemp("shuffled")
+    rows = [*made.rows(), *made.repeat(made.rows()[:20], 5), *made.repeat(made.rows()[:9], 3)]
+    expected = read_rollouts([made.write_parquet(folder / "all.parquet", rows)])
+    order.shuffle(rows)
+    paths = [
+        made.write_parquet(folder / f"{part}.parquet", rows[part::files]) for part in range(files)
+    ]
+    found = read_rollouts(paths)
+    assert np.array_equal(found.packed, expected.packed)
+    assert found.model_seeds == expected.model_seeds == (0, 3, 5)
+    assert np.array_equal(found.difficulty, expected.difficulty)
+    assert np.array_equal(found.seeds, expected.seeds)
+
+
+def test_the_released_layout(tmp_path: Path) -> None:
+    lines = [
+        GOOD,
+        "my-memory,MoveCube,k0,1,8,hard,ongoing,False,1300",
+        "my-memory,MoveCube,no-history,1,8,hard,error,,0",
+    ]
+    found = read_rollouts([made.released(tmp_path / "a.csv", lines)])
+    assert found.simulators == ("robomme",)
+    family = 5  # MoveCube
+    assert codes(found) == {
+        ("my-memory", 1, family, 0, 0, 0),
+        ("my-memory", 1, family, 1, 0, 2),
+        ("my-memory", 0, family, 1, 0, 3),
+    }
+    # Its own tables call a system a variant.
+    path = tmp_path / "a.csv"
+    path.write_text(path.read_text().replace("system", "variant", 1))
+    assert codes(read_rollouts([path])) == codes(found)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (
+            "my-memory,MoveCub,k0,0,7,easy,fail,0,9",
+            "unknown family 'MoveCub'. Did you mean 'MoveCube'?",
+        ),
+        ("my-memory,,k0,0,7,easy,fail,0,9", "unknown family ''"),
+        ("my-memory,MoveCube,k64,0,7,easy,fail,0,9", "'k64' is not a condition"),
+        (
+            "my-memory,MoveCube,k0,0,7,easy,failed,0,9",
+            "unknown status 'failed'. Did you mean 'fail'?",
+        ),
+        ("my-memory,MoveCube,k0,0,7,easy,fail,1,9", "success '1' contradicts status 'fail'"),
+        ("my-memory,MoveCube,k0,0,7,easy,error,0,9", "success '0' contradicts status 'error'"),
+        (
+            "my-memory,MoveCube,k0,0,7,easy,success,,9",
+            "success (empty) contradicts status 'success'",
+        ),
+        ("my-memory,MoveCube,k0,0,7,easy,fail,maybe,9", "success 'maybe'; expected 1, 0, true"),
+        (
+            "my-memory,MoveCube,k0,-1,7,easy,fail,0,9",
+            "episode '-1'; expected a whole number from 0 to",
+        ),
+        ("my-memory,MoveCube,k0,1.5,7,easy,fail,0,9", "episode '1.5'; expected a whole number"),
+        (
+            "my-memory,MoveCube,k0,131072,7,easy,fail,0,9",
+            "episode '131072'; expected a whole number",
+        ),
+        ("my-memory,MoveCube,k0,,7,easy,fail,0,9", "episode (empty); expected a whole number"),
+        (
+            "my-memory,MoveCube,k0,0,7,easy,fail,0,1301",
+            "steps '1301'; expected a whole number from 0 to 1300",
+        ),
+        ("my-memory,MoveCube,k0,0,x,easy,fail,0,9", "seed 'x'; expected a whole number from 0"),
+        ("my-memory,MoveCube,k0,0,7,tough,fail,0,9", "unknown difficulty 'tough'"),
+        (
+            "my-memory,MoveCube,k1,0,7,hard,fail,0,9",
+            "difficulty 'hard' differs from that of other rows",
+        ),
+        ("my-memory,MoveCube,k1,0,9,easy,fail,0,9", "seed '9' differs from that of other rows"),
+        ("pi05-baseline,MoveCube,k0,0,7,easy,fail,0,9", "reads like the system 'pi05_baseline'"),
+        (",MoveCube,k0,0,7,easy,fail,0,9", "'' is not the name of a system"),
+        ("my-memory,MoveCube,k0,1,7,easy,fail,0", "the line has 8 fields; expected 9"),
+        (GOOD, "the same rollout as"),
+        ("", "is not the name of a system"),
+    ],
+)
+def test_bad_rows_are_refused_with_file_line_and_reason(
+    tmp_path: Path, line: str, reason: str
+) -> None:
+    path = made.released(tmp_path / "rows.csv", [GOOD, line, GOOD.replace("k0", "k3")])
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([path])
+    assert raised.value.message.startswith(f"1 bad rows:\n{path}, line 3: ")
+    assert reason in raised.value.message
+    assert raised.value.hint is not None and "--lenient" in raised.value.hint
+    # Leniently it is left out and counted; the others stay.
+    found = read_rollouts([path], lenient=True)
+    assert (found.refused, len(found.packed)) == (1, 2)
+    assert (found.refusals[0].line, found.refusals[0].path) == (3, path)
+    assert reason in found.refusals[0].reason
+
+
+def test_lines_are_right_in_every_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(read, "_BLOCK", 150)  # about three rows
+    lines = [f"my-memory,MoveCube,k0,{number},{number},easy,fail,0,9" for number in range(40)]
+    for broken in (4, 11, 25):
+        lines[broken] = "only,three,fields"
+    lines[30] = lines[30].replace("fail", "bad")
+    path = made.released(tmp_path / "rows.csv", lines)
+    found = read_rollouts([path], lenient=True)
+    assert {refusal.line for refusal in found.refusals} == {6, 13, 27, 32}
+    assert (found.refused, len(found.packed)) == (4, 36)
+
+
+def test_rows_of_parquet_are_counted_from_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(read, "_BATCH", 10)
+    table = pa.Table.from_pylist([row.as_dict() for row in made.rows()])
+    names = table["family"].to_pylist()
+    names[17] = "Unknown"
+    place = table.schema.get_field_index("family")
+    pq.write_table(table.set_column(place, "family", pa.array(names)), tmp_path / "x.parquet")
+    with pytest.raises(BadRowsError, match=r"x\.parquet, row 18: unknown family 'Unknown'"):
+        read_rollouts([tmp_path / "x.parquet"])
+
+
+def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
+    lines = [f"my-memory,MoveCube,k0,{n},{n},easy,fail,1,9" for n in range(25)]
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([made.released(tmp_path / "rows.csv", lines)])
+    shown = raised.value.message.splitlines()
+    assert shown[0] == "25 bad rows:"
+    assert len(shown) == 12 and shown[-1] == "… and 15 more so far"
+
+
+def test_a_duplicate_in_another_file_names_both_places(tmp_path: Path) -> None:
+    rows = made.rows()
+    paths = [
+        made.write_csv(tmp_path / "one.csv", rows[:50]),
+        made.write_csv(
+            tmp_path / "two.csv", [rows[60], replace(rows[8], status="timeout", success=False)]
+        ),
+    ]
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts(paths)
+    assert f"{paths[1]}, line 3: the same rollout as {paths[0]}, line 10" in str(raised.value)
+    found = read_rollouts(paths, lenient=True)
+    assert (len(found.packed), found.refused) == (51, 1)
+    # The first one stays.
+    expected = read_rollouts([paths[0]])
+    assert set(expected.packed.tolist()) < set(found.packed.tolist())
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"revision": "cd" * 32}, "rows of different splits do not mix"),
+        ({"protocol_version": 2}, "protocol version '2'; expected 1"),
+        ({"seed": 5}, "seed '5' differs from that of other rows of the same episode"),
+    ],
+)
+def test_rows_of_different_data_do_not_mix(
+    tmp_path: Path, change: dict[str, object], reason: str
+) -> None:
+    rows = made.rows()
+    rows[20] = replace(rows[20], **change)  # type: ignore[arg-type]
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    first = raised.value.message.splitlines()[1]
+    assert first.startswith(f"{tmp_path / 'a.csv'}, line 22: ") and reason in first
+
+
+def test_simulators_have_revisions_and_scenes_of_their_own(tmp_path: Path) -> None:
+    rows = made.rows()
+    other = [
+        replace(one, simulator="robomme", revision="cd" * 32, seed=9, difficulty="hard")
+        for one in rows
+    ]
+    found = read_rollouts([made.write_parquet(tmp_path / "a.parquet", rows + other)])
+    assert found.simulators == ("robomme", "tabletop")
+    assert found.revisions == {"robomme": "cd" * 32, "tabletop": made.REVISION}
+    cube = field(found.packed, "family") == 5
+    episodes = np.unique((found.packed[cube] >> np.uint64(19)).astype(np.int64) & (2**23 - 1))
+    assert found.difficulty_of(0, episodes).tolist() == [2] * 6
+    assert found.difficulty_of(1, episodes).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("family,condition,episode,status", "lacks the columns success"),
+        ("family,condition,episode,status,success", "names no system"),
+        ("system,simulatr,family,condition,episode,status,success", "has the column 'simulatr'"),
+        ("system,family,family,condition,episode,status,success", "two columns of one name"),
+        (
+            "system,simulator,family,condition,episode,status,success",
+            "lacks the columns split, rev",
+        ),
+    ],
+)
+def test_files_without_what_is_needed_are_refused(
+    tmp_path: Path, header: str, message: str
+) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text(header + "\n")
+    with pytest.raises(FormatError) as raised:
+        read_rollouts([path])
+    assert message in raised.value.message and str(path) in raised.value.message
+    assert raised.value.hint
+
+
+def test_missing_and_damaged_files(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match="there is no file or folder"):
+        read_rollouts([tmp_path / "nowhere"])
+    with pytest.raises(
+        MissingFileError, match=r"holds neither rollouts\.parquet nor rollouts\.csv"
+    ):
+        read_rollouts([tmp_path])
+    (tmp_path / "rollouts.jsonl").touch()
+    with pytest.raises(MissingFileError, match="go on with it"):
+        read_rollouts([tmp_path])
+    (tmp_path / "rows.txt").touch()
+    with pytest.raises(FormatError, match=r"neither \.csv nor \.parquet"):
+        read_rollouts([tmp_path / "rows.txt"])
+    for name in ("rows.csv", "rows.parquet"):
+        (tmp_path / name).write_bytes(b"")
+        with pytest.raises(FormatError, match="cannot be read"):
+            read_rollouts([tmp_path / name])
+    whole = made.write_parquet(tmp_path / "rows.parquet", made.rows()).read_bytes()
+    (tmp_path / "rows.parquet").write_bytes(whole[:200] + bytes(100) + whole[300:])
+    with pytest.raises(FormatError, match="cannot be read"):
+        read_rollouts([tmp_path / "rows.parquet"])
+    made.write_csv(tmp_path / "rollouts.csv", made.rows())
+    (tmp_path / "run.json").write_text('{"format_version": 99}')
+    with pytest.raises(FormatError, match="format version 99"):
+        read_rollouts([tmp_path])
+
+
+@given(st.lists(st.tuples(*(st.integers(0, 2**bits - 1) for bits in BITS.values())), max_size=20))
+def test_packing_keeps_every_field_and_sorts_by_them(rows: list[tuple[int, ...]]) -> None:
+    columns = [np.array([row[i] for row in rows], np.int64) for i in range(len(BITS))]
+    packed = np.broadcast_to(pack(**dict(zip(BITS, columns, strict=True))), len(rows))
+    assert all(field(packed, n).tolist() == c.tolist() for n, c in zip(BITS, columns, strict=True))
+    assert sorted(rows) == [rows[i] for i in np.argsort(packed, kind="stable")]
+    assert (packed < REFUSED).all()
+
+
+def test_memory_is_eight_bytes_a_row(tmp_path: Path) -> None:
+    found = read_rollouts([made.write_parquet(tmp_path / "a.parquet", made.rows())])
+    assert found.packed.nbytes == 8 * 107
+
+
+def test_recoding_in_steps_is_recoding_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = made.rows()[::-1]
+    path = made.write_parquet(tmp_path / "a.parquet", rows)
+    expected = read_rollouts([path])
+    monkeypatch.setattr(rollouts, "_STEP", 7)
+    assert np.array_equal(read_rollouts([path]).packed, expected.packed)
