@@ -9,15 +9,14 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.progress import MESSAGES
 from robomme_interference_data.simulators.base import Observation, Status
 
 __all__ = ["simulate", "simulate_score"]
 
-_messages = Console(stderr=True)
 
 POLICIES = ("oracle", "guess")
 
@@ -118,14 +117,14 @@ def simulate_score(
     _check(policy, POLICIES)
     episodes, outcomes = episode_ids(family, split), []
     with Progress(
-        *Progress.get_default_columns(), MofNCompleteColumn(), console=_messages
+        *Progress.get_default_columns(), MofNCompleteColumn(), console=MESSAGES
     ) as progress:
         bar = progress.add_task("episodes", total=len(episodes))
         for outcome in play_all(policy, episodes, workers=workers):
             outcomes.append(outcome)
             progress.advance(bar)
             if outcome.why or (policy == "oracle" and outcome.status is not Status.SUCCESS):
-                _messages.print(f"{outcome.episode}: {outcome.status} {outcome.why}")
+                MESSAGES.print(f"{outcome.episode}: {outcome.status} {outcome.why}")
     outcomes.sort(key=lambda outcome: episodes.index(outcome.episode))
     if as_json:
         rows = [{**vars(o), "episode": str(o.episode), "status": str(o.status)} for o in outcomes]
