@@ -43,25 +43,14 @@ DIES, HANGS, RAISES, BREAKS, SMALL_WRIST = 40, 41, 42, 43, 44
 ENDS = {45: Status.SUCCESS, 46: Status.FAIL, 47: Status.TIMEOUT}
 
 
-@pytest.fixture(scope="session")
-def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with numpy < 2 and nothing else."""
-    folder = tmp_path_factory.mktemp("robomme") / "venv"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
-    site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}"
-    command = [sys.executable, "-m", "pip", "--no-input", "install", "--quiet", "--no-deps"]
-    command += ["--only-binary", ":all:", "--target", str(site / "site-packages"), "numpy<2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"no package index gives numpy < 2: {done.stderr.strip()[-500:]}")
-    return folder / "bin" / "python"
+@pytest.fixture
+def bare(bare_python: Path) -> Path:
+    return bare_python
 
 
 @pytest.fixture
-def python(bare: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """That interpreter with the stand-in."""
-    monkeypatch.setenv("PYTHONPATH", str(STAND_IN))
-    return bare
+def python(robomme_python: Path) -> Path:
+    return robomme_python
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import robomme_worker
 from robomme_interference_data.simulators.base import (
+    CAMERAS,
     Demonstration,
     EpisodeInfo,
     Observation,
@@ -36,8 +37,6 @@ __all__ = ["PYTHON_VARIABLE", "RoboMMESimulator"]
 
 PYTHON_VARIABLE = "ROBOMME_PYTHON"
 """Environment variable with the path of RoboMME's interpreter."""
-
-CAMERAS = ("front", "wrist")
 
 FRAME_SHAPE = (256, 256, 3)
 
