@@ -21,6 +21,7 @@ from robomme_interference_data.errors import (
     InvalidIdError,
     InvalidOptionError,
     MissingFileError,
+    PolicyError,
     RunFolderError,
     UnknownNameError,
 )
@@ -60,6 +61,16 @@ def untimed(rows: tuple[Rollout, ...]) -> list[dict[str, Any]]:
         {name: value for name, value in row.as_dict().items() if name not in TIMING_COLUMNS}
         for row in rows
     ]
+
+
+def test_what_a_policy_says_of_itself_is_on_record(tmp_path: Path) -> None:
+    changes = {"conditions": ["no-history"], "families": ["MoveCube"], "episodes": "0"}
+    run(tmp_path / "run", policy="python:own_policies:with_array", **changes)
+    header = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert header["policy"] == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
+    with pytest.raises(PolicyError, match=r"metadata\(\) returned a str"):
+        run(tmp_path / "other", policy="python:own_policies:with_text", **changes)
+    assert not (tmp_path / "other").exists()
 
 
 # --- a run -------------------------------------------------------------------------------------
