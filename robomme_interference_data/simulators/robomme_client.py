@@ -53,7 +53,8 @@ class RoboMMESimulator:
         cameras: Names of the cameras whose images are wanted: `front`, `wrist`.
         start_s: Seconds that the worker may take to start and import RoboMME.
         reset_s: Seconds that a reset may take.
-        step_s: Seconds that a step may take.
+        step_s: Seconds that a step may take. It takes a fraction of one, but on a machine with
+            too much to do it was once over 120.
 
     Raises:
         InvalidOptionError: No interpreter is given, or there is none at that path.
@@ -70,7 +71,7 @@ class RoboMMESimulator:
         cameras: Sequence[str] = CAMERAS,
         start_s: float = 300.0,
         reset_s: float = 900.0,
-        step_s: float = 120.0,
+        step_s: float = 600.0,
     ):
         for camera in cameras:
             if camera not in CAMERAS:
