@@ -65,6 +65,9 @@ def evaluate(
         float,
         typer.Option(help="Seconds a reset, or 16 steps, may take before the simulator hung."),
     ] = 600.0,
+    cache: Annotated[
+        bool, typer.Option(help="Keep decoded history frames on disk: a second run is faster.")
+    ] = False,
     history_chunk: Annotated[
         int, typer.Option(min=1, help="Frames of history handed over at a time.")
     ] = 64,
@@ -125,6 +128,7 @@ def evaluate(
                 workers=workers,
                 rollout_s=rollout_timeout,
                 simulator_s=simulator_timeout,
+                cache=cache,
                 history_chunk=history_chunk,
                 max_errors=max_errors,
                 resume=resume,

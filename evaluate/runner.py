@@ -97,6 +97,7 @@ def run_evaluation(
     workers: int = 1,
     rollout_s: float = 3600.0,
     simulator_s: float = 600.0,
+    cache: bool = False,
     history_chunk: int = 64,
     max_errors: int = 10,
     resume: bool = True,
@@ -132,6 +133,8 @@ def run_evaluation(
         rollout_s: Seconds that a rollout may take before it is an error.
         simulator_s: Seconds that a reset, or up to 16 steps, may take before the simulator counts
             as hung: its process is replaced, and the rollout tried once more.
+        cache: Keep decoded history frames on disk (20 GiB at most): later conditions and runs
+            need not decode them again.
         history_chunk: Frames of history that are handed over at a time.
         max_errors: Errors in a row after which the run stops.
         resume: Go on with a run that is in `out` already.
@@ -165,6 +168,7 @@ def run_evaluation(
         workers=workers,
         rollout_s=rollout_s,
         simulator_s=simulator_s,
+        cache=cache,
         history_chunk=history_chunk,
         max_errors=max_errors,
     )

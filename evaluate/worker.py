@@ -76,7 +76,7 @@ class RolloutWorker:
         if self._watchdog is None:
             self._watchdog = Watchdog(config.simulator_s, self._out)
         if self._split is None:
-            self._split = load_split(config.split, threads=1)
+            self._split = load_split(config.split, cache=config.cache, threads=1)
         if self._policy is None:
             options: dict[str, Any] = {}
             if config.memory is not None:

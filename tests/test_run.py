@@ -219,7 +219,7 @@ def test_every_setting_is_classed() -> None:
     """A new setting either makes another run of it, or does not: somebody has to say which."""
     assert set(IDENTITY) | {
         *("split", "robomme_python", "check_lesson", "videos", "workers", "rollout_s"),
-        *("simulator_s", "history_chunk", "max_errors"),
+        *("simulator_s", "cache", "history_chunk", "max_errors"),
     } == {field.name for field in dataclasses.fields(RunConfig)}
     assert not set(IDENTITY) & set(EXECUTION)
     assert config_module.IDENTITY is IDENTITY
