@@ -78,7 +78,7 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
     name = config.simulator
     if name not in SIMULATORS and ":" not in name:
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
-    for setting in ("workers", "history_chunk", "max_errors", "rollout_s"):
+    for setting in ("workers", "history_chunk", "max_errors", "rollout_s", "simulator_s"):
         if getattr(config, setting) <= 0:
             raise InvalidOptionError(
                 f"{setting} {getattr(config, setting)}; expected more than 0",
