@@ -150,7 +150,10 @@ def simulator_options(
         wanted |= {"front"}
     cameras = tuple(name for name in ("front", "wrist") if name in wanted)
     if config.simulator == "robomme":
-        return {"python": config.robomme_python, "cameras": cameras}
+        # Its own limits end a little before the watchdog's: its error shows what RoboMME printed.
+        limit = 0.9 * config.simulator_s
+        options = {"cameras": cameras, "reset_s": limit, "step_s": limit}
+        return {"python": config.robomme_python, **options}
     if config.simulator != "tabletop" or config.check_lesson:
         return {}
     return {"cameras": cameras}

@@ -19,6 +19,9 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate import run_evaluation
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.worker import simulator_options
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.simulators.robomme_client import EPISODES
 
@@ -117,3 +120,23 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     ]
     assert len(result.rows) > EPISODES  # so RoboMME's interpreter was started anew in between
     assert {row.seed for row in result.rows} == {640_045, 640_046, 640_047}
+
+
+def test_the_time_limit_of_a_run_is_the_simulators() -> None:
+    config = RunConfig(
+        system="hold",
+        policy="hold",
+        memory=None,
+        simulator="robomme",
+        split="s",
+        split_name="s",
+        revision="r",
+        robomme_python="python",
+        simulator_s=1000.0,
+    )
+    assert simulator_options(config, make_policy("hold"), None) == {
+        "python": "python",
+        "cameras": (),
+        "reset_s": 900.0,
+        "step_s": 900.0,
+    }
