@@ -64,7 +64,7 @@ def evaluate(
     simulator_timeout: Annotated[
         float,
         typer.Option(help="Seconds a reset, or 16 steps, may take before the simulator hung."),
-    ] = 600.0,
+    ] = 1800.0,
     cache: Annotated[
         bool, typer.Option(help="Keep decoded history frames on disk: a second run is faster.")
     ] = False,

@@ -79,7 +79,7 @@ class RunConfig:
     videos: bool = False
     workers: int = 1
     rollout_s: float = 3600.0
-    simulator_s: float = 600.0
+    simulator_s: float = 1800.0
     cache: bool = False
     history_chunk: int = 64
     max_errors: int = 10
