@@ -137,6 +137,8 @@ class Checker:
         return code
 
     def _named_system(self, value: Any) -> int:
+        if value in self.systems:
+            return self.systems.index(value)
         return self._named(self.systems, "system")(name_system(value or "").name)
 
     def _seeds(self, rows: "_Rows") -> Codes:

@@ -164,7 +164,7 @@ def _facts(score: Score) -> list[tuple[str, str]]:
         ),
         ("rows", f"{len(rollouts.packed):,}"),
         ("episodes of a complete cell", _GRIDS[score.grid]),
-        ("bootstrap", f"{DRAWS:,} draws, seeded by simulator and system, clustered by episode"),
+        ("bootstrap", f"{DRAWS:,} draws, seeded by the simulator, clustered by episode"),
     ]
     if len(rollouts.model_seeds) > 1:
         facts.append(("model seeds", ", ".join(map(str, rollouts.model_seeds[:20]))))
