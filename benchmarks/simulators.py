@@ -22,8 +22,8 @@ import numpy as np
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.pool import map_episodes
-from robomme_interference_data.simulators.worker import RemoteSimulator
+from robomme_interference_data.simulators.registry import own_simulator
+from robomme_interference_data.workers import run_tasks
 
 EPISODE = "MoveCube/test/0"
 
@@ -107,11 +107,11 @@ def resets() -> None:
         print(f"| {family} | {' | '.join(seconds)} | {', '.join(frames)} |", flush=True)
 
 
-def _play(remote: RemoteSimulator, episode: EpisodeId) -> int:
-    remote.reset(str(episode))
+def _play(episode: EpisodeId) -> None:
+    simulator = own_simulator("tabletop")
+    simulator.reset(str(episode))
     for _ in range(100):
-        remote.step(remote.act("oracle"))
-    return 100
+        simulator.step(simulator.act("oracle"))
 
 
 def workers(episodes: int = 12) -> None:
@@ -120,7 +120,7 @@ def workers(episodes: int = 12) -> None:
     todo = [EpisodeId("MoveCube", "train", index) for index in range(episodes)]
     for count in (1, 2):
         started = 0.0
-        for number, _ in enumerate(map_episodes(_play, todo, workers=count)):
+        for number, _ in enumerate(run_tasks(_play, todo, workers=count)):
             if number == count - 1:  # by then every worker has started
                 started = time.perf_counter()
         taken.append((time.perf_counter() - started) / (episodes - count))
@@ -139,9 +139,8 @@ def leaks(episodes: int = 100) -> None:
     simulator = TabletopSimulator()
     print("| episodes | resident MiB | open files |\n| --- | --- | --- |")
     for number in range(episodes + 1):
-        simulator._env.drawing = False
-        simulator.reset(f"{FAMILIES[number % len(FAMILIES)]}/train/{number // 9 % 100}")
-        simulator._env.drawing = True
+        episode = f"{FAMILIES[number % len(FAMILIES)]}/train/{number // 9 % 100}"
+        simulator.reset(episode, demonstration=False)
         for _ in range(10):
             simulator.step(simulator.act("oracle"))
         if number % max(episodes // 10, 1) == 0:

@@ -8,9 +8,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from robomme_interference_data.progress import MESSAGES
+
 __all__ = ["audit", "verify"]
 
-_ERR = Console(stderr=True)
 _OUT = Console()
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
@@ -39,7 +40,7 @@ def verify(
         for violation in violations:
             _OUT.print(f"{violation.where}: {violation.what}", soft_wrap=True, highlight=False)
         what = "hashes and rules" if decode else "tables and rules (frames not decoded)"
-        _ERR.print(
+        MESSAGES.print(
             f"{len(violations)} violations" if violations else f"All {what} of {split} hold."
         )
     if violations:
@@ -84,7 +85,7 @@ def audit(
         _OUT.print(mix)
         for leak in report.leaks:
             _OUT.print(f"LEAK, {leak.kind}: {leak.where}", soft_wrap=True, highlight=False)
-        _ERR.print(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
+        MESSAGES.print(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
     if report.leaks:
         raise typer.Exit(1)
 

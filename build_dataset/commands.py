@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from robomme_interference_data.constants import (
     DEFAULT_K,
@@ -19,6 +18,7 @@ from robomme_interference_data.constants import (
     POSITION_LIMIT,
 )
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.progress import MESSAGES
 
 if TYPE_CHECKING:
     from robomme_interference_data.build_dataset.build import Filters, Settings
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-_ERR = Console(stderr=True)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -208,7 +207,7 @@ def build_all(
         position_limit,
         as_json=False,
     )
-    _ERR.print(f"Next: robomme-interference verify {out}")
+    MESSAGES.print(f"Next: robomme-interference verify {out}")
 
 
 @app.command()
@@ -226,7 +225,7 @@ def sample(
         progress.start("Recording the sample", len(FAMILIES) * (train + test))
         for _ in write_sample(out, train=train, test=test):
             progress.advance(1)
-    _ERR.print(f"Next: robomme-interference build all --source frames:{out} --out my-split")
+    MESSAGES.print(f"Next: robomme-interference build all --source frames:{out} --out my-split")
 
 
 def _build(
@@ -268,7 +267,7 @@ def _build(
             if text in SIMULATORS:
                 played = _record(text, kind, out, recordings / text, wanted, chosen)
                 if played is None:
-                    _ERR.print(f"{out}: was built before")
+                    MESSAGES.print(f"{out}: was built before")
                     return
                 opened.append(played)
             else:
@@ -290,11 +289,11 @@ def _build(
         )
         return
     done = "was built before" if result.existed else "built"
-    _ERR.print(f"{out}: {done}, {result.episodes} episodes, {result.frames:,} frames")
+    MESSAGES.print(f"{out}: {done}, {result.episodes} episodes, {result.frames:,} frames")
     for item in result.skipped[:10]:
-        _ERR.print(f"  left out {item.episode_id}: {item.reason}", highlight=False)
+        MESSAGES.print(f"  left out {item.episode_id}: {item.reason}")
     if len(result.skipped) > 10:
-        _ERR.print(f"  … {len(result.skipped)} left out in all: {out}/meta/build_report.json")
+        MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/meta/build_report.json")
 
 
 def _record(
@@ -362,7 +361,7 @@ def _manifests(
     if as_json:
         _print_json({"out": str(out), **counts})
     else:
-        _ERR.print(f"{out}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
+        MESSAGES.print(f"{out}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
 
 
 def _limit(text: str) -> int | None:
@@ -393,7 +392,7 @@ def _resumable() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        _ERR.print("Stopped. Finished episodes are kept: run the same command again to go on.")
+        MESSAGES.print("Stopped. Finished episodes are kept: run the same command again to go on.")
         raise typer.Exit(130) from None
 
 

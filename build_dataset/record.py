@@ -23,7 +23,7 @@ from robomme_interference_data.errors import BuildError
 from robomme_interference_data.files import LocalFiles, atomic_path, read_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.base import EpisodeInfo, Simulator, Status
-from robomme_interference_data.simulators.registry import make_simulator
+from robomme_interference_data.simulators.registry import own_simulator
 from robomme_interference_data.workers import run_tasks
 
 __all__ = ["RecordedSource", "check_unbuilt", "record_episodes"]
@@ -45,9 +45,6 @@ SCHEMA = pa.schema(
     ]
 )
 """Columns of the table in a frames folder, see docs/sources.md."""
-
-_running: dict[str, Simulator] = {}
-"""The simulator of this worker process: one is made, and kept for all episodes."""
 
 
 class RecordedSource(FramesSource):
@@ -145,9 +142,7 @@ def _part(folder: Path, episode: EpisodeId) -> Path:
 
 def _record(name: str, live: bool, folder: Path, episode: EpisodeId) -> None:
     """Play and record one episode; its rows come last, and say that it is complete."""
-    if name not in _running:
-        _running[name] = make_simulator(name)
-    frames, info = _play(_running[name], episode, live)
+    frames, info = _play(own_simulator(name), episode, live)
     first = next(frames)
     partial_folder = folder / f".{episode.family}.{episode.split}.{episode.index}.partial"
     shutil.rmtree(partial_folder, ignore_errors=True)

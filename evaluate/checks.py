@@ -27,7 +27,7 @@ from robomme_interference_data.evaluate.systems import (
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.ids import condition_name
 from robomme_interference_data.loader import Split
-from robomme_interference_data.simulators.registry import SIMULATORS
+from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
 
 __all__ = ["PolicyTraits", "applicable", "check_plan", "check_settings", "describe_policy"]
 
@@ -122,6 +122,7 @@ def check_plan(
         InvalidOptionError: A condition does not apply, or the split is of another simulator.
         UnknownNameError: The split has no buffers for a condition.
         HistoryTooLongError: A buffer exceeds the system's position limit.
+        MissingExtraError: RoboMME's interpreter does not have it.
     """
     system = name_system(config.system)
     known = [NO_HISTORY, *(condition_name(k) for k in split.k_values)]
@@ -144,6 +145,8 @@ def check_plan(
             )
         if item.k is not None and config.retrieval is None:
             check_history(system, manifest.history_frames)
+    if config.simulator == "robomme":  # its interpreter may be missing, or lack RoboMME
+        make_simulator("robomme", python=config.robomme_python).close()
 
 
 def _refusal(system: System, policy: PolicyTraits, condition: str) -> InterferenceError | None:

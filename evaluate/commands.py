@@ -10,10 +10,9 @@ import typer
 from rich.console import Console
 
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.progress import MESSAGES
 
 __all__ = ["evaluate"]
-
-_messages = Console(stderr=True)
 
 
 def evaluate(
@@ -122,8 +121,8 @@ def evaluate(
                 listener=progress,
             )
     except KeyboardInterrupt:
-        _messages.print(f"\nStopped. Finished rollouts are in {out}; go on with:", markup=False)
-        _messages.print(command, markup=False, soft_wrap=True)
+        MESSAGES.print(f"\nStopped. Finished rollouts are in {out}; go on with:")
+        MESSAGES.print(command)
         raise typer.Exit(130) from None
     if as_json:
         typer.echo(json.dumps([row.as_dict() for row in result.rows], ensure_ascii=False))
@@ -132,11 +131,10 @@ def evaluate(
         typer.echo(f"{len(result.rows)} of {result.planned} rollouts in {out}/rollouts.csv")
     broken = result.counts[str(Status.ERROR)]
     if result.stopped is not None:
-        _messages.print(f"Stopped: {result.stopped}", style="red", markup=False)
+        MESSAGES.print(f"Stopped: {result.stopped}", style="red")
     if broken:
-        _messages.print(
+        MESSAGES.print(
             f"{broken} rollouts broke (see {out}/errors.log); the same command runs them again:",
-            markup=False,
         )
-        _messages.print(command, markup=False, soft_wrap=True)
+        MESSAGES.print(command)
         raise typer.Exit(1)

@@ -143,7 +143,7 @@ def _lettered(canvas: NDArray[np.uint8], lines: list[str], colour: str) -> NDArr
     except ImportError as error:
         raise MissingExtraError(
             "videos need pillow, which is not installed",
-            "pip install 'robomme-interference-data[score]'",
+            "pip install 'robomme-interference-data[evaluate]'",
         ) from error
     image = Image.fromarray(canvas)
     draw = ImageDraw.Draw(image)

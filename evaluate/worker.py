@@ -138,13 +138,14 @@ def simulator_options(
     config: RunConfig, policy: Policy, selector: Selector | None
 ) -> dict[str, Any]:
     """Return the options of a run's simulator: it draws only what somebody looks at."""
-    if config.simulator == "robomme":
-        return {"python": config.robomme_python}
-    if config.simulator != "tabletop":
-        return {}
-    if config.check_lesson:
-        return {}
     wanted = {*policy.cameras, *([selector.camera] if selector else [])}
     if config.videos:
         wanted |= {"front", "wrist"}
-    return {"cameras": tuple(sorted(wanted))}
+    if config.check_lesson:
+        wanted |= {"front"}
+    cameras = tuple(name for name in ("front", "wrist") if name in wanted)
+    if config.simulator == "robomme":
+        return {"python": config.robomme_python, "cameras": cameras}
+    if config.simulator != "tabletop" or config.check_lesson:
+        return {}
+    return {"cameras": cameras}

@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, INFO_PATH
 from robomme_interference_data.errors import MissingFileError
 
 __all__ = ["index"]
 
-_messages = Console(stderr=True, markup=False, emoji=False)
 
 Encoder = Annotated[
     str,

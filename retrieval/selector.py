@@ -1,14 +1,15 @@
 """The retrieval step of a rollout: embed what the robot sees, look its session up."""
 
 from dataclasses import dataclass
+from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.constants import CAMERA_PREFIX
+from robomme_interference_data.constants import CAMERA_PREFIX, INDEX_CENTRE
 from robomme_interference_data.draw import even_sample
-from robomme_interference_data.embeddings import EmbeddingIndex, normalised
+from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
 from robomme_interference_data.errors import (
     InvalidOptionError,
     StaleIndexError,
@@ -92,7 +93,8 @@ class Selector:
     def name(self) -> str:
         """Encoder and rule, such as `thumbnail/max/adaptive` or `siglip/max/0.923`."""
         cut = "adaptive" if self._threshold is None else f"{self._threshold:g}"
-        return f"{self._encoder.name}/{self.method}/{cut}"
+        encoder = PurePath(index_folder(self._encoder.name)).name
+        return f"{encoder}/{self.method}/{cut}"
 
     @property
     def camera(self) -> str:
@@ -145,7 +147,7 @@ class Selector:
 
     def _check(self, index: EmbeddingIndex) -> None:
         """Check that the index was made with this very encoder and camera."""
-        centre = index.header["files"].get("centre.npy", {}).get("sha256")
+        centre = index.header["files"].get(INDEX_CENTRE, {}).get("sha256")
         if index.fingerprint != fingerprint_digest(self._encoder.fingerprint, centre):
             raise StaleIndexError(
                 f"the embeddings of {self._encoder.name!r} beside the data were made with another "

@@ -8,10 +8,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from robomme_interference_data.progress import MESSAGES
+
 __all__ = ["doctor", "list_buffers", "show"]
 
 # Goals and paths are shown as they are, whatever brackets and colons they hold.
-_ERR = Console(stderr=True, markup=False, emoji=False)
 _OUT = Console(markup=False, emoji=False)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
@@ -66,7 +67,7 @@ def show(
         from robomme_interference_data.strip import draw_strip
 
         draw_strip(buffer, out, camera=camera)
-        _ERR.print(f"{out} written")
+        MESSAGES.print(f"{out} written")
     if as_json:
         typer.echo(json.dumps(buffer.manifest.as_dict(), indent=2, ensure_ascii=False))
         return

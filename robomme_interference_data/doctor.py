@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -32,9 +33,12 @@ _CODECS = (("libaom-av1", "w"), ("libsvtav1", "w"), ("libdav1d", "r"))
 _LIBAVUTIL_VERSIONS = range(60, 55, -1)
 """Versions of libavutil in FFmpeg 8 to 4, which torchcodec can load."""
 
+_ROBOMME_TIMEOUT_S = 120
+
 _EXTRAS = {
     "build": "Build datasets",
     "sim": "Simulator",
+    "evaluate": "Evaluate",
     "retrieval": "Retrieval",
     "score": "Score",
 }
@@ -69,6 +73,8 @@ def checks() -> list[Check]:
         _opencv(),
         _extra("sim"),
         _vulkan(),
+        _robomme(),
+        _extra("evaluate"),
         _extra("retrieval"),
         _extra("score"),
         _hub_token(),
@@ -234,6 +240,32 @@ def _vulkan() -> Check:
         f"{report.problem}; only simulators need it",
         "sudo make vulkan (in a checkout, on Debian), or install your GPU's Vulkan driver",
     )
+
+
+def _robomme() -> Check:
+    name = "Official simulator"
+    fix = "export ROBOMME_PYTHON=PATH, the Python of an environment that RoboMME is installed in"
+    python = os.environ.get("ROBOMME_PYTHON")
+    if not python:
+        return Check(
+            name, None, "ROBOMME_PYTHON is not set; only --simulator robomme needs it", fix
+        )
+    try:
+        done = subprocess.run(
+            [python, Path(__file__).parent / "simulators" / "robomme_worker.py"],
+            env={**os.environ, "PYTHONSAFEPATH": "1"},
+            capture_output=True,
+            text=True,
+            timeout=_ROBOMME_TIMEOUT_S,
+            check=True,
+        )
+        found = json.loads(done.stdout.splitlines()[-1])
+    except (OSError, subprocess.SubprocessError, ValueError, IndexError) as error:
+        return Check(name, False, f"{python} cannot be asked: {error}", fix)
+    if "problem" in found:
+        return Check(name, False, f"{python}: {found['problem']}", fix)
+    versions = f"Python {found['python']}, numpy {found['numpy']}"
+    return Check(name, True, f"{python}: {versions}, {len(found['families'])} families")
 
 
 def _hub_token() -> Check:

@@ -139,7 +139,7 @@ class MotionError(InterferenceError, RuntimeError):
 
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
-    """A simulator's worker process died, or did not answer in time."""
+    """A simulator broke: its process died or did not answer in time, or it says so itself."""
 
 
 class PolicyError(InterferenceError, RuntimeError):

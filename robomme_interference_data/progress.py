@@ -1,4 +1,4 @@
-"""Show how far work is: frames done, frames per second, time left."""
+"""What commands tell on stderr: messages, and how far work is."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +17,10 @@ from rich.progress import (
 )
 from rich.text import Text
 
-__all__ = ["BuildProgress"]
+__all__ = ["MESSAGES", "BuildProgress"]
+
+MESSAGES = Console(stderr=True, soft_wrap=True, markup=False, emoji=False, highlight=False)
+"""What commands say beside their output: lines are never wrapped, so that paths can be copied."""
 
 
 class _Speed(ProgressColumn):

@@ -3,8 +3,8 @@
 Where RoboMME's recordings lie beside the project (../shared/data), the demonstrations are the
 nine families' first test episodes and the distractors come from its training episodes, filled up
 with made-up sessions; elsewhere, all of it is a sample that the project records itself. Then the
-embedded simulator plays all nine families. Everything lands in demo/; what is there already is not
-made again.
+embedded simulator plays all nine families, and the controls are evaluated on it. Everything lands
+in demo/; what is there already is not made again.
 """
 
 import shlex
@@ -43,6 +43,7 @@ def main() -> None:
     run(f"audit {SPLIT}")
     run(f"verify {SPLIT}")
     simulate()
+    evaluate()
     say(f"\nDone in {time.monotonic() - began:.0f} s. Look at the pictures in {DEMO}/")
 
 
@@ -58,6 +59,28 @@ def simulate() -> None:
         f"--out {out}/manifests",
     )
     run(f"show PatternLock/test/0 --split {out} --k 7 --out {DEMO}/tabletop.png")
+
+
+def evaluate() -> None:
+    """Roll out the controls on a handful of episodes under all conditions, and print the rates."""
+    from robomme_interference_data.evaluate.log import read_log
+
+    memories = ("full", "framesamp", "window")
+    policies = {f"replay-{memory}": f"replay --memory {memory}" for memory in memories}
+    policies |= {"guess": "guess", "oracle": "oracle"}
+    conditions = ("no-history", "k0", "k1", "k3", "k7")
+    table = [f"{'success on 4 families':24}" + "".join(f"{name:>12}" for name in conditions)]
+    for system, policy in policies.items():
+        out = DEMO / "runs" / system
+        run(
+            f"evaluate --policy {policy} --split {DEMO}/tabletop --out {out} --episodes 0",
+            "--families MoveCube PatternLock RouteStick VideoUnmask --workers 2",
+        )
+        rows = read_log(ROOT / out).values()
+        cells = [[row.success for row in rows if row.condition == name] for name in conditions]
+        counts = [f"{sum(map(bool, cell))}/{len(cell)}" for cell in cells]
+        table.append(f"{system:24}" + "".join(f"{count:>12}" for count in counts))
+    say("\n" + "\n".join(table))
 
 
 def recorded_here() -> tuple[list[str], list[str]]:

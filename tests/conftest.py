@@ -24,6 +24,7 @@ _REMOVED = (
     "HF_TOKEN_PATH",
     "HF_XET_CACHE",
     "HUGGING_FACE_HUB_TOKEN",
+    "ROBOMME_PYTHON",
 )
 _SET = {
     "COLUMNS": "120",  # tables and help texts are laid out alike everywhere

@@ -39,7 +39,7 @@ class Double:
         if episode.index in (1, 2) and self._first_time(episode.index):
             if episode.index == 1:
                 os._exit(7)  # dies
-            time.sleep(60)  # hangs
+            time.sleep(600)  # hangs
         if episode.index == 3:
             raise UnknownNameError("no such episode", "Take another.")
         self.left = STEPS
@@ -79,6 +79,6 @@ def make(**options: Any) -> Double:
     return Double(**options)
 
 
-def make_once() -> Double:
+def make_once(**options: Any) -> Double:
     """Make one that behaves badly once for each index; marks go where `DOUBLE_MARKS` says."""
-    return Double(os.environ["DOUBLE_MARKS"])
+    return Double(os.environ["DOUBLE_MARKS"], **options)

@@ -104,6 +104,23 @@ def test_manifests_prints_how_cost_grows() -> None:
     assert float(rows[1][2]) > 0
 
 
+def test_policies_prints_the_rate_and_the_ratio_to_a_bare_send() -> None:
+    (rows,) = printed("policies", "--lesson", "10", "--rounds", "1")
+    assert [row[0] for row in rows] == [
+        "bare send of the same bytes",
+        "WebsocketPolicy",
+        "WebsocketPolicy, server unpacks",
+    ]
+    assert rows[0][3] == "1.00"
+    # 10 + 7 × 32 + 1 frames of 256 × 256 × 3 bytes, and a little around them.
+    size = 235 * 256 * 256 * 3 / 1e6
+    for _, milliseconds, rate, ratio in rows:
+        assert float(rate.replace(",", "")) == pytest.approx(
+            size / float(milliseconds) * 1e3, rel=0.05
+        )
+        assert float(ratio) > 0
+
+
 @pytest.mark.slow
 def test_made_up_episode_tables_have_the_columns_of_real_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -120,7 +137,7 @@ def test_made_up_episode_tables_have_the_columns_of_real_ones(
         assert len(list(made_up.records())) == 11
 
 
-@pytest.mark.parametrize("name", ["load", "build", "manifests"])
+@pytest.mark.parametrize("name", ["load", "build", "manifests", "policies"])
 def test_help_and_refusals(name: str) -> None:
     shown = run(name, "--help")
     assert shown.returncode == 0 and "--rounds" in shown.stdout

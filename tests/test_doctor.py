@@ -80,6 +80,8 @@ def test_this_environment_has_all_that_is_needed() -> None:
         "OpenCV",
         "Simulator [sim]",
         "Vulkan",
+        "Official simulator",
+        "Evaluate [evaluate]",
         "Retrieval [retrieval]",
         "Score [score]",
         "Hub token",

@@ -75,7 +75,7 @@ def test_a_worker_that_dies_or_hangs_is_replaced(
     (tmp_path / "marks").mkdir()
     monkeypatch.setenv("DOUBLE_MARKS", str(tmp_path / "marks"))
     ids = [episode(index) for index in (0, 1, 2, 5)]  # 1 dies and 2 hangs, once each
-    done = list(record_episodes(ONCE, ids, tmp_path / "r", live=False, workers=2, time_limit=8))
+    done = list(record_episodes(ONCE, ids, tmp_path / "r", live=False, workers=2, time_limit=20))
     assert sorted(done) == ids
 
 

@@ -1,6 +1,7 @@
 """Outcomes, their table, the episodes' seeds and the command line: all without a simulator."""
 
 import json
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -15,6 +16,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import SIMULATORS, Status, make_simulator
+from robomme_interference_data.simulators.registry import own_simulator
 from robomme_interference_data.simulators.score import Outcome, markdown_table, play_all
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
@@ -105,11 +107,36 @@ def test_the_table_counts_by_difficulty_and_leaves_errors_out() -> None:
     assert len(table) == 4
 
 
+def double(index: int) -> EpisodeId:
+    return EpisodeId("MoveCube", "test", index)
+
+
 def test_play_all_reports_a_broken_simulator_as_error() -> None:
-    episodes = [EpisodeId("MoveCube", "test", index) for index in (0, 1)]
-    good, bad = play_all("oracle", episodes, "simulator_doubles:make")
-    assert (good.status, good.steps, good.lesson, good.chance) == (Status.SUCCESS, 3, 5, 0.25)
-    assert (bad.status, bad.steps) == (Status.ERROR, 0)
+    outcomes = play_all("oracle", [double(0), double(1)], "simulator_doubles:make")
+    good, bad = sorted(outcomes, key=lambda outcome: outcome.episode)
+    assert good == Outcome(double(0), "easy", Status.SUCCESS, lesson=5, steps=3, chance=0.25)
+    why = "the worker process died (exit code 7)"
+    assert bad == Outcome(double(1), "", Status.ERROR, 0, 0, 0.0, why)
+
+
+def test_play_all_plays_an_episode_again_in_a_fresh_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOUBLE_MARKS", str(tmp_path))
+    episodes = [double(index) for index in (0, 1, 2, 5)]  # 1 dies and 2 hangs, once each
+    outcomes = play_all("oracle", episodes, "simulator_doubles:make_once", 2, time_limit=20)
+    assert {o.episode: o.status for o in outcomes} == dict.fromkeys(episodes, Status.SUCCESS)
+
+
+def test_play_all_stops_where_the_simulator_refuses_an_episode() -> None:
+    with pytest.raises(UnknownNameError, match="no such episode"):
+        list(play_all("oracle", [double(3), double(0)], "simulator_doubles:make"))
+
+
+def test_a_process_keeps_one_simulator_of_a_name_and_options() -> None:
+    kept = own_simulator("simulator_doubles:make")
+    assert own_simulator("simulator_doubles:make") is kept
+    assert own_simulator("simulator_doubles:make", render=False) is not kept
 
 
 def test_simulate_prints_what_came_of_it_as_json() -> None:

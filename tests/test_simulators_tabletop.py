@@ -5,9 +5,11 @@ import math
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import combinations, product
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
@@ -192,6 +194,66 @@ def test_bad_input_is_refused(blind: TabletopSimulator) -> None:
         blind.act("orakle")
 
 
+Steps = list[tuple[Observation, Status]]
+
+
+def played(
+    simulator: TabletopSimulator | RemoteSimulator, demonstration: bool, drawn: range
+) -> tuple[Demonstration, Observation, Steps]:
+    """An episode's demonstration, first observation and 20 steps; those in `drawn` are drawn."""
+    lesson, first, _ = simulator.reset("MoveCube/test/0", demonstration=demonstration)
+    steps = [simulator.step(simulator.act("oracle"), observe=n in drawn) for n in range(20)]
+    return lesson, first, steps
+
+
+def test_what_is_drawn_changes_nothing_else(simulator: TabletopSimulator) -> None:
+    lesson, first, steps = played(simulator, True, range(20))
+    assert set(lesson.images) == {"front", "wrist"}
+    few = range(4, 20, 5)
+    with (
+        RemoteSimulator("tabletop", cameras=("front",)) as front,
+        RemoteSimulator("tabletop", render=False) as blind,
+    ):
+        for other, demonstration, cameras in (
+            (simulator, False, {"front", "wrist"}),
+            (front, True, {"front"}),
+            (blind, True, set[str]()),
+        ):
+            shown, start, made = played(other, demonstration, few)
+            assert np.array_equal(shown.states, lesson.states)
+            assert np.array_equal(shown.actions, lesson.actions)
+            assert set(shown.images) == (cameras if demonstration else set())
+            for name, frames in shown.images.items():
+                assert np.array_equal(frames, lesson.images[name])
+            assert set(start.images) == cameras
+            assert [status for _, status in made] == [status for _, status in steps]
+            assert [bool(seen.images) for seen, _ in made] == [
+                bool(cameras) and number in few for number in range(20)
+            ]
+            pairs = zip(
+                [start, *(s for s, _ in made)], [first, *(s for s, _ in steps)], strict=True
+            )
+            for seen, reference in pairs:
+                assert np.array_equal(seen.state, reference.state)
+                for name, image in seen.images.items():
+                    assert np.array_equal(image, reference.images[name])
+
+
+def test_an_unknown_camera_is_named() -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'front'"):
+        TabletopSimulator(cameras=("fornt",))
+
+
+def test_pictures_are_lit_by_the_scenes_own_lights(simulator: TabletopSimulator) -> None:
+    """The table's colour by hand: ambient 0.45, two lights at their angles to the vertical."""
+    _, first, _ = simulator.reset("PatternLock/test/0", demonstration=False)
+    light = np.array([0.45] * 3)
+    light += np.array([0.75, 0.75, 0.72]) / math.sqrt(0.5**2 + 0.4**2 + 1) / math.pi
+    light += 0.6 * np.array([0.25, 0.25, 0.28]) / math.sqrt(0.4**2 + 0.7**2 + 0.6**2) / math.pi
+    expected = (np.array([0.16, 0.34, 0.34]) * light) ** (1 / 2.2) * 255
+    assert np.abs(first.images["front"][250, 5] - expected).max() < 1
+
+
 def test_a_failed_reset_leaves_no_episode_to_step(blind: TabletopSimulator) -> None:
     blind.reset(SHORT)
     with pytest.raises(UnknownNameError):
@@ -211,13 +273,35 @@ def test_motion_out_of_reach_is_an_error(blind: TabletopSimulator) -> None:
         list(arm.move((-0.3, 0.28, 0.02), -math.pi / 2))
 
 
+def first_views(simulator: TabletopSimulator, family: str) -> NDArray[np.int16]:
+    """First live front views of two episodes of each difficulty, `(6, 256, 256, 3)`."""
+    env, views = simulator._env, []
+    env.family, env._demonstrating = family, False
+    try:
+        for index in (0, 1, 2, 27, 28, 29):
+            env.reset(seed=seed_of(EpisodeId(family, "test", index)))
+            views.append(env.observe(("front",)).images["front"])
+    finally:
+        env._demonstrating = True
+    return np.stack(views).astype(np.int16)
+
+
 def test_no_two_families_could_be_mistaken_for_one_another(simulator: TabletopSimulator) -> None:
-    views = {f: live(simulator, EpisodeId(f, "test", 0), 0)[2].images["front"] for f in FAMILIES}
-    for one in FAMILIES:
-        for other in FAMILIES:
-            if one < other and (one, other) != ("VideoUnmask", "VideoUnmaskSwap"):
-                away = np.abs(views[one].astype(int) - views[other]).max(axis=2)
-                assert (away > 12).mean() > 0.3, (one, other)
+    views = {family: first_views(simulator, family) for family in FAMILIES}
+    for one, other in combinations(FAMILIES, 2):
+        if {one, other} == {"VideoUnmask", "VideoUnmaskSwap"}:
+            continue
+        for a, b in product(views[one], views[other]):
+            assert (np.abs(a - b).max(axis=2) > 12).mean() > 0.3, (one, other)
+
+
+def test_first_views_without_a_demonstration_are_those_with_it(
+    simulator: TabletopSimulator,
+) -> None:
+    """So that the comparison above compares what a policy sees."""
+    for family in ("PatternLock", "MoveCube"):
+        _, first, _ = simulator.reset(f"{family}/test/0", demonstration=False)
+        assert np.array_equal(first_views(simulator, family)[0], first.images["front"])
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -265,6 +349,21 @@ def test_without_a_vulkan_device_there_is_one_error() -> None:
     )
     assert "no Vulkan device on this machine can render" in done.stdout, done.stderr
     assert "sudo make vulkan" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "shortest", ["VideoUnmask/train/42", "MoveCube/train/78", "PatternLock/train/60"]
+)
+def test_the_shortest_episodes_are_long_enough_for_a_distractor_unit(
+    blind: TabletopSimulator, shortest: str
+) -> None:
+    lesson, _, _ = blind.reset(shortest)
+    steps, status = 0, Status.ONGOING
+    while status is Status.ONGOING:
+        _, status = blind.step(blind.act("oracle"))
+        steps += 1
+    assert status is Status.SUCCESS
+    assert len(lesson) + steps >= 249
 
 
 @pytest.mark.slow

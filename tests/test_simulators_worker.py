@@ -1,22 +1,15 @@
 """Worker processes: a crash, a hang or an error there never takes us along."""
 
 import os
-import time
 
 import numpy as np
 import pytest
 
 from robomme_interference_data.errors import SimulatorCrashError, UnknownNameError
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import Status
-from robomme_interference_data.simulators.pool import map_episodes
 from robomme_interference_data.simulators.worker import RemoteSimulator
 
 DOUBLE = "simulator_doubles:make"
-
-
-def episode(index: int) -> EpisodeId:
-    return EpisodeId("MoveCube", "test", index)
 
 
 def test_serves_what_the_simulator_serves() -> None:
@@ -60,12 +53,11 @@ def test_a_dead_worker_is_an_error_and_the_next_reset_starts_another() -> None:
 
 
 def test_a_hanging_worker_is_ended_in_time() -> None:
-    with RemoteSimulator(DOUBLE, episode_s=8.0) as remote:
+    with RemoteSimulator(DOUBLE, episode_s=20.0) as remote:
         remote.reset("MoveCube/test/0")
-        pid, started = remote.pid, time.monotonic()
-        with pytest.raises(SimulatorCrashError, match="more than 8 s"):
+        pid = remote.pid
+        with pytest.raises(SimulatorCrashError, match="more than 20 s"):
             remote.reset("MoveCube/test/2")
-        assert 7 < time.monotonic() - started < 20
         with pytest.raises(ProcessLookupError):
             os.kill(pid or 0, 0)
 
@@ -86,30 +78,3 @@ def test_an_unknown_simulator_is_told_by_the_worker() -> None:
         pytest.raises(UnknownNameError, match="tabletop"),
     ):
         remote.reset("MoveCube/test/0")
-
-
-def play(remote: RemoteSimulator, which: EpisodeId) -> int:
-    return int(remote.reset(str(which))[2].seed)
-
-
-def test_episodes_come_in_order_whatever_worker_plays_them() -> None:
-    episodes = [episode(i) for i in (9, 5, 8, 6, 7, 0)]
-    found = list(map_episodes(play, episodes, DOUBLE, workers=2))
-    assert found == [(e, e.index) for e in episodes]
-
-
-def test_an_episode_is_tried_again_in_a_fresh_worker(tmp_path) -> None:
-    episodes = [episode(i) for i in (0, 1, 2, 5)]
-    found = list(map_episodes(play, episodes, DOUBLE, episode_s=8.0, marks=str(tmp_path)))
-    assert found == [(e, e.index) for e in episodes]
-
-
-def test_an_episode_that_always_kills_its_worker_is_reported() -> None:
-    found = dict(map_episodes(play, [episode(0), episode(1), episode(5)], DOUBLE, tries=2))
-    assert isinstance(found[episode(1)], SimulatorCrashError)
-    assert (found[episode(0)], found[episode(5)]) == (0, 5)
-
-
-def test_other_errors_stop_the_run() -> None:
-    with pytest.raises(UnknownNameError, match="no such episode"):
-        list(map_episodes(play, [episode(0), episode(3)], DOUBLE))

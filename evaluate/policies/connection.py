@@ -58,6 +58,7 @@ class ServerConnection:
         self._attempts, self._backoff_s = attempts, backoff_s
         self._connection: ClientConnection | None = None
         self._stack = ExitStack()
+        self._sent = b""
 
     @property
     def is_open(self) -> bool:
@@ -107,7 +108,10 @@ class ServerConnection:
             PolicyServerError: The server reports an error, is gone, is too slow, or gives another
                 answer.
         """
-        answer = self._read(self._exchange(pack(message), self._response_s))
+        # Kept until the next one is packed: given back each time, the memory of messages of
+        # megabytes goes back to the system, and getting it anew took as long as all the rest.
+        self._sent = pack(message)
+        answer = self._read(self._exchange(self._sent, self._response_s))
         found = answer.get(expected)
         if found is None or found is False:
             self.close()

@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from robomme_interference_data.evaluate.score.grid import Grid
+from robomme_interference_data.progress import MESSAGES
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.score.scoring import Score
 
 __all__ = ["compare", "score"]
 
-_ERR = Console(stderr=True, markup=False, emoji=False, highlight=False)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
 
@@ -68,21 +67,21 @@ def score(
 
     found = compute(rows, system, lenient, grid, against is Against.PAPER)
     for refusal in found.rollouts.refusals:
-        _ERR.print(f"left out: {refusal}", soft_wrap=True)
+        MESSAGES.print(f"left out: {refusal}")
     if found.rollouts.refused:
-        _ERR.print(f"{found.rollouts.refused:,} bad rows left out")
+        MESSAGES.print(f"{found.rollouts.refused:,} bad rows left out")
     write_tables(list(found.tables.values()), out / "tables", main_markdown(found.cells))
-    with _ERR.status("Drawing the figures"):
+    with MESSAGES.status("Drawing the figures"):
         figures = draw_figures(found, out / "figures")
         write_report(found, figures, out / "report.html")
     if export_to is not None:
         for path in export(found.rollouts, export_to, system):
-            _ERR.print(f"{path} written", soft_wrap=True)
+            MESSAGES.print(f"{path} written")
     if as_json:
         typer.echo(json.dumps(_as_dict(found), indent=2, ensure_ascii=False, allow_nan=False))
     else:
         typer.echo(main_markdown(found.cells))
-    _ERR.print(f"Report: {out / 'report.html'}", soft_wrap=True)
+    MESSAGES.print(f"Report: {out / 'report.html'}")
 
 
 def _as_dict(found: "Score") -> dict[str, Any]:
@@ -116,7 +115,7 @@ def compare(
 
     found = compute(run_a, run_b, (system_a, system_b))
     for note in found.notes:
-        _ERR.print(note, soft_wrap=True)
+        MESSAGES.print(note)
     if as_json:
         value = {"notes": list(found.notes), "rows": found.table.records()}
         typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))

@@ -3,6 +3,9 @@
 Nothing is downloaded: weights are read from a folder or from the Hub's cache.
 """
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -62,7 +65,8 @@ class Siglip:
                 f"device {device!r} cannot be used: {reason}", "Try: --device cpu"
             ) from None
         self.batch = batch or (32 if self._device.type == "cuda" else 8)
-        self._vision, self._processor = _load(transformers, model, folder)
+        with _quiet(transformers):
+            self._vision, self._processor = _load(transformers, model, folder)
         self._weights_sha256 = _weights_digest(self._vision)
         self._dtype = self._precision()
         self._vision.to(self._device, self._dtype)
@@ -70,8 +74,7 @@ class Siglip:
     @property
     def fingerprint(self) -> dict[str, Any]:
         """What determines the features, up to the precision in which they are computed."""
-        settings = self._processor.to_dict()
-        settings = {name: value for name, value in settings.items() if _is_plain(value)}
+        settings = json.loads(self._processor.to_json_string())
         return {
             "name": "siglip",
             "model": self._model,
@@ -117,6 +120,21 @@ def _libraries() -> tuple[Any, Any]:
             'Install them: pip install "robomme-interference-data[retrieval]"',
         ) from error
     return torch, transformers
+
+
+@contextmanager
+def _quiet(transformers: Any) -> Iterator[None]:
+    """Keep transformers from reporting that the text tower of the file is left unread."""
+    logging = transformers.utils.logging
+    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bars:
+            logging.enable_progress_bar()
 
 
 def _locate(model: str) -> tuple[Path, str | None]:
@@ -182,7 +200,3 @@ def _weights_digest(vision: Any) -> str:
         running.update(f"{name} {tuple(value.shape)}\n".encode())
         running.update(value.numpy().tobytes())
     return running.hexdigest()
-
-
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, bool | int | float | str | list | dict)

@@ -1,6 +1,7 @@
 """The commands `simulate` and `simulate-score`."""
 
 import json
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,16 +9,19 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.progress import MESSAGES
 from robomme_interference_data.simulators.base import Observation, Status
 
 __all__ = ["simulate", "simulate_score"]
 
-_messages = Console(stderr=True)
 
 POLICIES = ("oracle", "guess")
+
+NO_POLICY = "none"
+"""Plays the demonstration only: all that there is to see where no policy is built in."""
 
 Policy = Annotated[str, typer.Option(help="oracle: knows the answer; guess: draws one.")]
 Json = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
@@ -27,32 +31,50 @@ def simulate(
     family: Annotated[str, typer.Option(help="Task family, such as MoveCube.")],
     episode: Annotated[int, typer.Option(help="Index of the episode in its split, from 0.")] = 0,
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
-    policy: Policy = "oracle",
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            help="oracle: knows the answer; guess: draws one; none: only the demonstration. "
+            "By default oracle, or none on robomme, which has no other.",
+        ),
+    ] = None,
     video: Annotated[Path | None, typer.Option(help="Write a video here, .mp4.")] = None,
     as_json: Json = False,
-    simulator: Annotated[str, typer.Option(help="Which simulator.")] = "tabletop",
+    simulator: Annotated[str, typer.Option(help="tabletop or robomme.")] = "tabletop",
+    robomme_python: Annotated[
+        Path | None,
+        typer.Option(help="RoboMME's own interpreter.", envvar="ROBOMME_PYTHON", show_envvar=True),
+    ] = None,
 ) -> None:
     """Play one episode: its demonstration, then a built-in policy.
 
     The video shows both cameras side by side, under a blue bar during the demonstration and an
     orange one while the policy acts.
 
-    Example: robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
+    Examples:
+    robomme-interference simulate --family MoveCube --episode 3 --video out.mp4;
+    robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
     """
     from robomme_interference_data.ids import EpisodeId
     from robomme_interference_data.simulators.registry import make_simulator
 
-    _check(policy)
+    policies = (NO_POLICY,) if simulator == "robomme" else (*POLICIES, NO_POLICY)
+    policy = policy or policies[0]
+    _check(policy, policies)
     if video is not None and video.suffix != ".mp4":
         raise InvalidOptionError(
             f"cannot write {video}: only .mp4 is written", "Give a path that ends in .mp4."
         )
     name = EpisodeId(family, split, episode)
-    options = {"render": video is not None} if simulator == "tabletop" else {}
+    options: dict[str, Any] = {}
+    if simulator == "tabletop":
+        options = {"render": video is not None}
+    elif simulator == "robomme":
+        options = {"python": robomme_python}
     with closing(make_simulator(simulator, **options)) as running:
         lesson, first, info = running.reset(str(name))
         live, status = [first], Status.ONGOING
-        while status is Status.ONGOING:
+        while status is Status.ONGOING and policy != NO_POLICY:
             seen, status = running.step(running.act(policy))
             live.append(seen)
     result: dict[str, Any] = {
@@ -92,14 +114,18 @@ def simulate_score(
     from robomme_interference_data.simulators.score import markdown_table, play_all
     from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
-    _check(policy)
+    _check(policy, POLICIES)
     episodes, outcomes = episode_ids(family, split), []
-    for outcome in play_all(policy, episodes, workers=workers):
-        outcomes.append(outcome)
-        if outcome.status is not Status.SUCCESS and policy == "oracle":
-            _messages.print(f"{outcome.episode} ({outcome.difficulty}): {outcome.status}")
-        if len(outcomes) % 50 == 0:
-            _messages.print(f"{len(outcomes)} of {len(episodes)} episodes played")
+    with Progress(
+        *Progress.get_default_columns(), MofNCompleteColumn(), console=MESSAGES
+    ) as progress:
+        bar = progress.add_task("episodes", total=len(episodes))
+        for outcome in play_all(policy, episodes, workers=workers):
+            outcomes.append(outcome)
+            progress.advance(bar)
+            if outcome.why or (policy == "oracle" and outcome.status is not Status.SUCCESS):
+                MESSAGES.print(f"{outcome.episode}: {outcome.status} {outcome.why}")
+    outcomes.sort(key=lambda outcome: episodes.index(outcome.episode))
     if as_json:
         rows = [{**vars(o), "episode": str(o.episode), "status": str(o.status)} for o in outcomes]
         typer.echo(json.dumps(rows))
@@ -107,11 +133,11 @@ def simulate_score(
         typer.echo(markdown_table(outcomes))
 
 
-def _check(policy: str) -> None:
-    if policy not in POLICIES:
+def _check(policy: str, policies: Sequence[str]) -> None:
+    if policy not in policies:
         raise UnknownNameError(
-            f"there is no built-in policy {policy!r}; expected oracle or guess",
-            nearest(policy, POLICIES),
+            f"there is no built-in policy {policy!r} here; expected {' or '.join(policies)}",
+            nearest(policy, policies),
         )
 
 

@@ -1,13 +1,14 @@
 """Simulators by name; the libraries behind them are imported when one is made."""
 
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from typing import Any
 
 from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Simulator
 
-__all__ = ["SIMULATORS", "make_simulator"]
+__all__ = ["SIMULATORS", "make_simulator", "own_simulator"]
 
 
 def _tabletop(**options: Any) -> Simulator:
@@ -21,7 +22,13 @@ def _tabletop(**options: Any) -> Simulator:
     return TabletopSimulator(**options)
 
 
-SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop}
+def _robomme(**options: Any) -> Simulator:
+    from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+
+    return RoboMMESimulator(**options)
+
+
+SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop, "robomme": _robomme}
 """Name to a function that makes the simulator; another backend adds itself here."""
 
 
@@ -29,12 +36,13 @@ def make_simulator(name: str, **options: Any) -> Simulator:
     """Make a simulator in this process; keep to one, and use `RemoteSimulator` for more.
 
     Args:
-        name: `tabletop`, or `module:function` for a simulator of your own.
-        **options: For the simulator; `tabletop` takes `render`, see `TabletopSimulator`.
+        name: `tabletop`, `robomme`, or `module:function` for a simulator of your own.
+        **options: For the simulator: see `TabletopSimulator` and `RoboMMESimulator`.
 
     Raises:
         UnknownNameError: There is no such simulator.
         MissingExtraError: Its libraries are not installed.
+        InvalidOptionError: An option is not what it may be.
         NoRendererError: This machine cannot draw its cameras' pictures.
     """
     if name in SIMULATORS:
@@ -50,3 +58,12 @@ def make_simulator(name: str, **options: Any) -> Simulator:
             "Expected <module>:<function>, which can be imported and returns a simulator.",
         ) from error
     return simulator
+
+
+@cache
+def own_simulator(name: str, **options: Any) -> Simulator:
+    """Return this process's simulator of a name and options; it is made once and kept.
+
+    For functions that `workers.run_tasks` calls in its worker processes, each many times.
+    """
+    return make_simulator(name, **options)

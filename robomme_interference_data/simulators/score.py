@@ -2,16 +2,32 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol, cast
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.errors import SimulatorCrashError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    MotionError,
+    SimulatorCrashError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.intervals import wilson
-from robomme_interference_data.simulators.base import Status
-from robomme_interference_data.simulators.pool import map_episodes
-from robomme_interference_data.simulators.worker import RemoteSimulator
+from robomme_interference_data.simulators.base import Simulator, Status
+from robomme_interference_data.simulators.registry import own_simulator
+from robomme_interference_data.workers import run_tasks
 
 __all__ = ["Outcome", "markdown_table", "play_all"]
+
+_BROKEN = (SimulatorCrashError, MotionError)
+"""Errors that are one episode's, not the run's."""
+
+
+class _WithChance(Simulator, Protocol):
+    """A simulator that knows how often a guess is right."""
+
+    @property
+    def chance(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -25,6 +41,7 @@ class Outcome:
         lesson: Frames of the demonstration.
         steps: Executed steps.
         chance: Probability that a guess is right.
+        why: What broke, or empty.
     """
 
     episode: EpisodeId
@@ -33,26 +50,52 @@ class Outcome:
     lesson: int
     steps: int
     chance: float
+    why: str = ""
 
 
 def play_all(
-    policy: str, episodes: Sequence[EpisodeId], simulator: str = "tabletop", workers: int = 1
+    policy: str,
+    episodes: Sequence[EpisodeId],
+    simulator: str = "tabletop",
+    workers: int = 1,
+    time_limit: float = 600.0,
 ) -> Iterator[Outcome]:
-    """Play episodes with `oracle` or `guess`, without drawing, and yield what came of each."""
+    """Play episodes with `oracle` or `guess`, without drawing, in worker processes.
 
-    def play(remote: RemoteSimulator, episode: EpisodeId) -> Outcome:
-        lesson, _, info = remote.reset(str(episode))
-        chance, status, steps = remote.chance, Status.ONGOING, 0
-        while status is Status.ONGOING:
-            _, status = remote.step(remote.act(policy))
-            steps += 1
-        return Outcome(episode, info.difficulty, status, len(lesson), steps, chance)
+    An episode whose worker dies or exceeds its time is played once more, then given as an error.
 
-    for episode, result in map_episodes(play, episodes, simulator, workers, render=False):
-        if isinstance(result, SimulatorCrashError):
-            yield Outcome(episode, "", Status.ERROR, 0, 0, 0.0)
+    Args:
+        policy: `oracle` or `guess`.
+        episodes: Which episodes.
+        simulator: Name of the simulator.
+        workers: Worker processes.
+        time_limit: Seconds that an episode may take.
+
+    Yields:
+        What came of each episode, as they end.
+
+    Raises:
+        InterferenceError: The simulator cannot be made, or refuses an episode.
+    """
+    function = partial(_play, simulator, policy)
+    for done in run_tasks(function, episodes, workers=workers, time_limit=time_limit):
+        if done.error is None:
+            yield done.value
+        elif isinstance(done.error, InterferenceError) and not isinstance(done.error, _BROKEN):
+            raise done.error
         else:
-            yield result
+            why = (str(done.error).splitlines() or [repr(done.error)])[0]
+            yield Outcome(done.task, "", Status.ERROR, 0, 0, 0.0, why)
+
+
+def _play(simulator: str, policy: str, episode: EpisodeId) -> Outcome:
+    running = cast(_WithChance, own_simulator(simulator, render=False))
+    lesson, _, info = running.reset(str(episode))
+    chance, status, steps = running.chance, Status.ONGOING, 0
+    while status is Status.ONGOING:
+        _, status = running.step(running.act(policy), observe=False)
+        steps += 1
+    return Outcome(episode, info.difficulty, status, len(lesson), steps, chance)
 
 
 def markdown_table(outcomes: Iterable[Outcome]) -> str:

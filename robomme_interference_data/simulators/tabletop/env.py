@@ -23,6 +23,7 @@ from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
 from robomme_interference_data.simulators.tabletop.panda import PANDA, draw_low_polygon
+from robomme_interference_data.simulators.tabletop.shading import SHADER
 
 __all__ = ["CAMERAS", "FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 
@@ -73,7 +74,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
         pose = sapien_utils.look_at(eye=FRONT_EYE, target=FRONT_TARGET)
-        return [CameraConfig("front", pose, 256, 256, fov=FRONT_VIEW, near=0.01, far=10)]
+        view = {"fov": FRONT_VIEW, "near": 0.01, "far": 10, "shader_config": SHADER}
+        return [CameraConfig("front", pose, 256, 256, **view)]
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE))

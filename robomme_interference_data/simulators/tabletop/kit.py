@@ -109,15 +109,16 @@ class Kit:
     # --- the room ----------------------------------------------------------------------------
 
     def room(self, table: Colour, floor: Colour) -> None:
-        """A table with the arm on it, and a floor that fills the picture behind."""
+        """A table with the arm on it, and a floor behind it and before it."""
         self._body(
             [((0, 0, -0.45), (0.55, 0.75, 0.45), table)],
             Place((-0.25, 0, 0)),
             "table",
             moves="never",
         )
+        # No floor under the table: hidden pixels would cost as much as those that are seen.
         self._body(
-            [((0, 0, -0.05), (8, 8, 0.05), floor)],
+            [((-4.8, 0, -0.05), (4, 8, 0.05), floor), ((4.3, 0, -0.05), (4, 8, 0.05), floor)],
             Place((0, 0, -0.9)),
             "floor",
             moves="never",

@@ -17,6 +17,8 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import PandaWristCam
 from mani_skill.sensors.camera import CameraConfig
 
+from robomme_interference_data.simulators.tabletop.shading import SHADER
+
 __all__ = ["PANDA", "draw_low_polygon"]
 
 PANDA = "panda_low_polygon"
@@ -55,6 +57,7 @@ class LowPolygonPanda(PandaWristCam):  # type: ignore[misc]
                 fov=math.pi / 2,
                 near=0.01,
                 far=10,
+                shader_config=SHADER,
                 mount=self.robot.links_map["camera_link"],
             )
         ]

@@ -46,6 +46,7 @@ class MoveCube(Family):
         return ("move the cube to the target in the same manner as in the video",)
 
     def demonstrate(self, arm: Arm, answer: str) -> Script:
+        yield from arm.wait(10)
         yield from self.solve(arm, answer)
         if answer == "hook":
             yield from arm.grip(close=False)  # leaves it on the table

@@ -48,7 +48,7 @@ class PatternLock(Family):
         return ("retrace the pattern with the stick, button by button in the same order",)
 
     def demonstrate(self, arm: Arm, answer: tuple[int, ...]) -> Script:
-        yield from arm.wait(3)
+        yield from arm.wait(10)
         yield from self.solve(arm, answer)
         yield from arm.go_home()
 
@@ -56,7 +56,7 @@ class PatternLock(Family):
         yield from arm.move((*self.spots[answer[0]], HIGH))
         for number in answer:
             yield from arm.move((*self.spots[number], LOW), speed=0.15)
-            yield from arm.wait(7)
+            yield from arm.wait(8)
         yield from arm.move((*self.spots[answer[-1]], HIGH))
 
     def react(self, arm: Arm) -> None:

@@ -16,7 +16,7 @@ __all__ = ["RouteStick"]
 
 Route = tuple[tuple[int, ...], tuple[int, ...]]
 
-COUNT, SPACING = 5, 0.12  # targets; m from one to the next, with a post in the middle
+COUNT, SPACING = 5, 0.105  # targets; m from one to the next, with a post in the middle
 RADIUS, POST, TALL = 0.024, 0.010, 0.07  # m
 ASIDE = 0.06  # m, how far from a post the stick goes round it
 LOW, HIGH = 0.020, 0.13  # m, the stick's tip on the table and above the posts
@@ -53,7 +53,7 @@ class RouteStick(Family):
         return ("follow the same path round the posts with the stick as in the video",)
 
     def demonstrate(self, arm: Arm, answer: Route) -> Script:
-        yield from arm.wait(3)
+        yield from arm.wait(10)
         yield from self.solve(arm, answer)
         yield from arm.go_home()
 

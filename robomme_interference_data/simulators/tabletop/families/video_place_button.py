@@ -87,7 +87,7 @@ class VideoPlaceButton(PlaceFamily):
 
     def build(self, kit: Kit) -> None:
         super().build(kit)
-        self.button = kit.button((-0.08, 0.25))
+        self.button = kit.button((-0.08, 0.20))
 
     def goals(self) -> tuple[str, ...]:
         return (
@@ -100,7 +100,7 @@ class VideoPlaceButton(PlaceFamily):
         places = [self.targets[answer], others[0]]
         before, after = places if self.when == "before" else places[::-1]
         starts = [before, *others[1:]]
-        yield from arm.wait(5)
+        yield from arm.wait(15)
         for cube, target in zip(self.cubes, starts, strict=False):
             yield from self.place(arm, cube, target)
         yield from arm.press(self.button)

@@ -39,7 +39,7 @@ class VideoPlaceOrder(PlaceFamily):
         first = visits[:3]
         # A second cube goes its own way round, clear of where the first one stays.
         second = [number for number in self.order if number != first[-1]][:3]
-        yield from arm.wait(5)
+        yield from arm.wait(10)
         for cube, way in zip(self.cubes, (first, second), strict=False):
             for number in way:
                 yield from self.place(arm, cube, self.targets[number])

@@ -24,6 +24,7 @@ class VideoUnmask(Family):
     """
 
     table = (0.60, 0.44, 0.28)
+    pace = 0.4
     shell = (0.30, 0.34, 0.42)
     containers = (3, 4, 5)
 
@@ -57,13 +58,13 @@ class VideoUnmask(Family):
             body.hold(True)
         for shell in self.shells:
             shell.put(Place((*shell.home.p[:2], HIGH)))
-        yield from arm.wait(30)
-        ways = [along(shell, shell.home, 40) for shell in self.shells]
+        yield from arm.wait(45)
+        ways = [along(shell, shell.home, 55) for shell in self.shells]
         for places in zip(*ways, strict=True):
             for shell, place in zip(self.shells, places, strict=True):
                 shell.put(place)
             yield
-        yield from arm.wait(30)
+        yield from arm.wait(45)
 
     def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
         for number in answer:

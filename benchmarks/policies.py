@@ -1,0 +1,164 @@
+"""How fast a policy server is fed a history buffer, against a bare send of the same bytes.
+
+Server and client are two processes on the loopback interface. The adapter is given the frames of
+a k7 buffer, cuts them into messages of 16 and packs them; the bare client sends the same messages,
+packed beforehand, over the same kind of connection. Every message is answered before the next.
+"""
+
+import argparse
+import asyncio
+import multiprocessing
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from http import HTTPStatus
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from timing import Times, interleave, machine, megabytes, positive, table
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from robomme_interference_data.constants import UNIT_FRAMES
+from robomme_interference_data.evaluate.policies.base import RolloutInfo
+from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
+from robomme_interference_data.evaluate.policies.wire import pack, unpack
+
+CHUNK = 16
+ANSWER = pack({"reset_finished": True, "add_buffer_finished": True})
+COLUMNS = ("<feeding", ">ms", ">MB/s", ">ratio")
+BARE = "bare send of the same bytes"
+FED = "WebsocketPolicy"
+READ = "WebsocketPolicy, server unpacks"
+OPTIONS: dict[str, Any] = {"compression": None, "max_size": None}
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parse_options()
+    frames = options.lesson + 7 * UNIT_FRAMES
+    draw = np.random.default_rng(0)
+    # One frame more: the first live observation.
+    images = draw.integers(0, 256, (frames + 1, 256, 256, 3), dtype=np.uint8)
+    states = draw.normal(size=(frames + 1, 8)).astype(np.float32)
+    with servers() as ports:
+        times, size = measure(ports, images, states, options.rounds)
+    print(machine("websockets", "msgpack"), end="\n\n", flush=True)
+    messages = -(-len(images) // CHUNK)
+    print(
+        table(
+            f"A k7 buffer of {frames:,} frames and the first live observation, front camera, "
+            f"{megabytes(size)} MB in {messages} messages; medians of {options.rounds} rounds.",
+            COLUMNS,
+            [
+                [
+                    way,
+                    f"{times.median(way) * 1e3:.0f}",
+                    f"{size / 1e6 / times.median(way):,.0f}",
+                    f"{times.ratio(way, BARE):.2f}",
+                ]
+                for way in (BARE, FED, READ)
+            ],
+        )
+    )
+
+
+def parse_options() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--lesson", type=positive, default=246, help="frames of the lesson")
+    parser.add_argument("--rounds", type=positive, default=7)
+    return parser.parse_args()
+
+
+def measure(
+    ports: tuple[int, int], images: np.ndarray, states: np.ndarray, rounds: int
+) -> tuple[Times, int]:
+    """Time the three ways in turns; return their times and the bytes that each sends."""
+    plain, _ = ports
+    frames = len(images) - 1
+    messages = [
+        pack(
+            {
+                "add_buffer": True,
+                "images": images[start : start + CHUNK, None],
+                "state": states[start : start + CHUNK],
+                "exec_start_idx": frames,
+            }
+        )
+        for start in range(0, len(images), CHUNK)
+    ]
+    with ExitStack() as stack:
+        bare = stack.enter_context(
+            connect(f"ws://127.0.0.1:{plain}", ping_interval=None, proxy=None, **OPTIONS)
+        )
+        bare.recv()
+        policies = [WebsocketPolicy("127.0.0.1", port) for port in ports]
+        for policy in policies:
+            stack.callback(policy.close)
+
+        def send() -> None:
+            for message in messages:
+                bare.send(message)
+                bare.recv()
+
+        def feed(policy: WebsocketPolicy) -> None:
+            policy.reset(RolloutInfo("pick", frames, 0))
+            policy.add_history({"front": images[:-1]}, states[:-1], frames)
+            policy.observe({"front": images[-1:]}, states[-1:])
+
+        ways = {BARE: send, FED: lambda: feed(policies[0]), READ: lambda: feed(policies[1])}
+        return interleave(ways, rounds), sum(map(len, messages))
+
+
+@contextmanager
+def servers() -> Iterator[tuple[int, int]]:
+    """Run a process with two servers, one of which unpacks what it gets; yield their ports."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe()
+    process = context.Process(target=run_servers, args=(theirs,), daemon=True)
+    process.start()
+    try:
+        yield mine.recv()
+    finally:
+        process.terminate()
+        process.join()
+
+
+def run_servers(pipe: Connection) -> None:
+    """Serve until the process is ended; tell the ports first."""
+
+    def health(connection: ServerConnection, request: Any) -> Any:
+        return connection.respond(HTTPStatus.OK, "OK\n") if request.path == "/healthz" else None
+
+    async def answer(connection: ServerConnection, reads: bool) -> None:
+        await connection.send(pack({}))
+        try:
+            while True:
+                data = await connection.recv()
+                if reads and isinstance(data, bytes):
+                    unpack(data)
+                await connection.send(ANSWER)
+        except ConnectionClosed:
+            return
+
+    async def serve_both() -> None:
+        started = [
+            await serve(
+                lambda connection, reads=reads: answer(connection, reads),
+                "127.0.0.1",
+                0,
+                process_request=health,
+                **OPTIONS,
+            )
+            for reads in (False, True)
+        ]
+        pipe.send(tuple(server.sockets[0].getsockname()[1] for server in started))
+        await asyncio.gather(*(server.serve_forever() for server in started))
+
+    asyncio.run(serve_both())
+
+
+if __name__ == "__main__":
+    main()

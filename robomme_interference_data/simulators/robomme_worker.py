@@ -1,0 +1,245 @@
+"""RoboMME's side of the official simulator: runs in RoboMME's own interpreter, started by path.
+
+That interpreter has numpy < 2 and no package of ours, so this file imports neither, and keeps to
+Python 3.11. It answers on an inherited socket, never on stdout, where ManiSkill prints. Run
+without an argument it prints, as its last line, in JSON, what `probe` finds.
+
+A message is the length of its head (4 bytes, big-endian), the head as JSON, and the bytes of its
+arrays one after the other. No pickles: those of numpy 1 and 2 differ.
+"""
+
+import importlib
+import importlib.util
+import json
+import os
+import platform
+import queue
+import signal
+import socket
+import struct
+import sys
+import threading
+import traceback
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["probe", "receive", "send"]
+
+MAX_HEAD = 1 << 20
+"""Bytes; a head longer than that is no message."""
+
+LISTS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
+"""Camera name to the key under which RoboMME returns its frames."""
+
+
+def send(
+    channel: socket.socket,
+    head: Mapping[str, Any],
+    arrays: Mapping[str, Any] | None = None,
+) -> None:
+    """Send a message.
+
+    Args:
+        channel: A connected stream socket.
+        head: Plain values; `arrays` is taken.
+        arrays: Name to a sequence of numpy arrays of one shape and type; they arrive as one
+            array with a new first axis. An array is a sequence of its rows.
+    """
+    parts = {name: list(items) for name, items in (arrays or {}).items()}
+    described = []
+    for name, items in parts.items():
+        kinds = {(item.dtype.str, tuple(item.shape)) for item in items}
+        if len(kinds) != 1:
+            raise ValueError(f"{name}: expected arrays of one shape and type, got {sorted(kinds)}")
+        (dtype, shape) = kinds.pop()
+        described.append([name, dtype, [len(items), *shape]])
+    encoded = json.dumps({**head, "arrays": described}).encode()
+    channel.sendall(struct.pack(">I", len(encoded)) + encoded)
+    for items in parts.values():
+        for item in items:
+            channel.sendall(item.tobytes())
+
+
+def receive(channel: socket.socket) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the head and the arrays, by name, of the next message.
+
+    Raises:
+        EOFError: The other side closed the socket.
+        ValueError: What came is no message.
+    """
+    (length,) = struct.unpack(">I", _exactly(channel, bytearray(4)))
+    if length > MAX_HEAD:
+        raise ValueError(f"a head of {length} bytes; expected {MAX_HEAD} at most")
+    head = json.loads(bytes(_exactly(channel, bytearray(length))))
+    arrays: dict[str, Any] = {}
+    for name, dtype, shape in head.pop("arrays"):
+        import numpy as np
+
+        array = np.empty(shape, dtype)
+        _exactly(channel, array.reshape(-1).view(np.uint8))
+        arrays[name] = array
+    return head, arrays
+
+
+def _exactly(channel: socket.socket, buffer: Any) -> Any:
+    """Fill the buffer."""
+    view = memoryview(buffer)
+    while view:
+        count = channel.recv_into(view)
+        if count == 0:
+            raise EOFError("the other side closed the socket")
+        view = view[count:]
+    return buffer
+
+
+def probe() -> dict[str, Any]:
+    """Return this interpreter's versions and RoboMME's families, or what it lacks, as `problem`."""
+    found: dict[str, Any] = {"python": platform.python_version()}
+    if importlib.util.find_spec("robomme") is None:
+        return {**found, "problem": "robomme is not installed there"}
+    try:
+        numpy = importlib.import_module("numpy")
+        found["numpy"] = str(numpy.__version__)
+        if int(found["numpy"].split(".")[0]) >= 2:
+            return {**found, "problem": f"numpy is {found['numpy']}; RoboMME needs numpy < 2"}
+        found["families"] = list(_builder().get_task_list())
+    except Exception as error:
+        traceback.print_exc()
+        return {**found, "problem": f"robomme cannot be imported: {_text(error)}"}
+    return found
+
+
+class UnknownEpisode(Exception):
+    """RoboMME has no such episode."""
+
+
+class Episodes:
+    """One episode at a time, each in an environment of its own.
+
+    A second reset of the same environment gives a different episode.
+    """
+
+    def __init__(self) -> None:
+        self._env: Any = None
+        self._cameras: list[str] = []
+
+    def reset(
+        self,
+        family: str,
+        split: str,
+        index: int,
+        max_steps: int,
+        cameras: list[str],
+        demonstration: bool,
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Play a demonstration; return what is known of the episode, and frames and states.
+
+        The last frame and state are the first live observation; without `demonstration`, frames
+        are of that one only.
+        """
+        self.close()
+        builder = _builder()(
+            env_id=family, dataset=split, action_space="joint_angle", max_steps=max_steps
+        )
+        seed, difficulty = builder.resolve_episode(index)
+        # RoboMME makes an environment all the same, with a seed that belongs to no episode.
+        if seed is None or not difficulty:
+            raise UnknownEpisode(f"{family} has {builder.get_episode_num()} {split} episodes")
+        self._env = builder.make_env_for_episode(index)
+        self._cameras = cameras
+        observations, info = self._env.reset()
+        about = {
+            "seed": int(seed),
+            "difficulty": str(difficulty),
+            "goals": [str(goal) for goal in info["task_goal"]],
+        }
+        return about, self._arrays(observations, slice(None) if demonstration else slice(-1, None))
+
+    def step(self, *, action: Any, observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Execute an action; return the status, and one state and, if wanted, one frame each."""
+        observations, _, _, _, info = self._env.step(action[0])
+        if info["status"] == "error":
+            self.close()
+            return {"status": "error", "message": str(info.get("error_message"))}, {}
+        shown = slice(-1, None) if observe else slice(0, 0)
+        arrays = self._arrays(observations, shown)
+        return {"status": str(info["status"])}, {**arrays, "states": arrays["states"][-1:]}
+
+    def close(self) -> None:
+        """Close the environment, if there is one."""
+        env, self._env = self._env, None
+        if env is not None:
+            env.close()
+
+    def _arrays(self, observations: Any, shown: slice) -> dict[str, Any]:
+        import numpy as np
+
+        joints = np.stack(observations["joint_state_list"])[:, :7]
+        gripper = np.stack(observations["gripper_state_list"])[:, :1]
+        states = np.concatenate([joints, gripper], axis=1).astype(np.float32)
+        arrays: dict[str, Any] = {"states": states}
+        for camera in self._cameras:
+            frames = observations[LISTS[camera]]
+            if len(frames) != len(states):
+                raise ValueError(f"{len(frames)} frames of {camera}, {len(states)} states")
+            if frames[shown]:
+                arrays[camera] = [np.asarray(frame) for frame in frames[shown]]
+        return arrays
+
+
+def serve(channel: socket.socket) -> None:
+    """Answer requests until the other side closes the socket, which ends this process."""
+    requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(channel, requests), daemon=True).start()
+    hello = probe()
+    send(channel, hello)
+    if "problem" in hello:
+        return
+    episodes = Episodes()
+    while True:
+        head, arrays = requests.get()
+        call = episodes.step if head.pop("call") == "step" else episodes.reset
+        try:
+            answer, found = call(**head, **arrays)
+        except UnknownEpisode as error:
+            answer, found = {"unknown": str(error)}, {}
+        except Exception as error:
+            traceback.print_exc()
+            episodes.close()
+            answer, found = {"failed": _text(error)}, {}
+        send(channel, answer, found)
+
+
+def _read(channel: socket.socket, requests: Any) -> None:
+    """Queue requests; end this process, whatever it is doing, when the other side is gone."""
+    try:
+        while True:
+            requests.put(receive(channel))
+    except Exception as error:
+        if not isinstance(error, EOFError | OSError):
+            traceback.print_exc()
+        os._exit(1)
+
+
+def _builder() -> Any:
+    return importlib.import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder
+
+
+def _text(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def main() -> None:
+    """Serve on the socket whose descriptor is the first argument, or print what `probe` finds."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the other side's to handle
+    if len(sys.argv) == 1:
+        found = json.dumps(probe())
+        sys.stdout.write(f"\n{found}\n")
+        return
+    channel = socket.socket(fileno=int(sys.argv[1]))
+    channel.set_inheritable(False)
+    serve(channel)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,322 @@
+"""Encoders, the index beside the data, and the selector of rollouts."""
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import factories
+import numpy as np
+import pytest
+
+from robomme_interference_data import Dataset, load_buffer, load_split
+from robomme_interference_data.embeddings import index_folder, normalised
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    MissingIndexError,
+    MissingWeightsError,
+    StaleIndexError,
+    UnknownNameError,
+)
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.progress import BuildProgress
+from robomme_interference_data.retrieval.commands import datasets_in
+from robomme_interference_data.retrieval.encoders import make_encoder
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.retrieval.segment import adaptive_threshold
+from robomme_interference_data.retrieval.selector import Selector
+
+QUIET = BuildProgress(quiet=True)
+EPISODE = "VideoRepick/test/0"
+
+
+def make_index(split: Path, encoder: str = "thumbnail", **options: Any) -> list[int]:
+    reports = build_index(datasets_in(split), make_encoder(encoder), QUIET, **options)
+    return [report.embedded for report in reports]
+
+
+def files_of(split: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(split).as_posix(): path.read_bytes()
+        for path in split.glob("*/index/**/*")
+        if path.is_file()
+    }
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    return factories.copy_of_split(tmp_path / "split")
+
+
+def test_thumbnail_by_hand() -> None:
+    # 16 × 16 pixels, 2 × 2 a cell: upper half black, lower half red.
+    image = np.zeros((16, 16, 3), np.uint8)
+    image[8:, :, 0] = 255
+    encoder = Thumbnail()
+    (row,) = encoder.features(encoder.prepare(image[None]))
+    colours, right, below = row[:192], row[192:360], row[360:]
+    assert colours.reshape(8, 8, 3)[:, 0].tolist() == [[0, 0, 0]] * 4 + [[1, 0, 0]] * 4
+    assert not right.any()
+    steps = below.reshape(7, 8, 3)
+    assert steps[3].tolist() == [[1, 0, 0]] * 8 and steps.sum() == 8
+    with pytest.raises(InvalidOptionError, match="4 × 9 pixels"):
+        encoder.prepare(np.zeros((1, 4, 9, 3), np.uint8))
+
+
+def test_cells_of_uneven_size_are_means() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (21, 11, 3), np.uint8)
+    (row,) = Thumbnail().prepare(image[None])
+    # Cell (2, 7): rows 5 to 6 (42 // 8, 63 // 8 = 7 excluded), columns 9 and 10.
+    expected = image[5:7, 9:11].mean(axis=(0, 1)) / 255
+    assert row[:192].reshape(8, 8, 3)[2, 7] == pytest.approx(expected, abs=1e-6)
+
+
+def test_normalising() -> None:
+    rows = normalised(np.array([[3, 4], [1, 1]]), np.array([0, 0], np.float32))
+    assert rows.dtype == np.float16
+    assert rows[0] == pytest.approx([0.6, 0.8], abs=1e-3)
+    # Nothing is left of the centre itself.
+    assert normalised(np.array([[1, 1]]), np.array([1, 1], np.float32)).tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("encoder", "folder"),
+    [
+        ("thumbnail", "index/thumbnail"),
+        ("siglip", "index/siglip"),
+        ("siglip:google/siglip2-base@abc", "index/siglip-siglip2-base"),
+        ("siglip:models/my model", "index/siglip-my-model"),
+    ],
+)
+def test_folders(encoder: str, folder: str) -> None:
+    assert index_folder(encoder) == folder
+
+
+def test_a_buffers_embeddings_are_those_of_its_frames(split: Path) -> None:
+    # 8 demonstrations: index 0 has 20 + 1 frames, index 1 has 36 + 1; 7 units of 32.
+    assert make_index(split) == [4 * (21 + 37), 7 * 32]
+    buffer = load_buffer(EPISODE, 3, split)
+    found = buffer.embeddings("thumbnail")
+    assert found.dtype == np.float16 and found.shape == (20 + 3 * 32, 528)
+    encoder, centre = Thumbnail(), buffer.query_index("thumbnail").centre
+    assert np.array_equal(found, normalised(encoder.prepare(buffer.frames()), centre))
+    query = normalised(encoder.prepare(buffer.query_frame()[None]), centre)[0]
+    assert np.array_equal(buffer.query_embedding("thumbnail"), query)
+
+
+def test_an_index_is_the_same_bytes_every_time(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    assert make_index(split) == [0, 0]  # it is there and right
+    assert files_of(split) == once
+    for path in split.glob("*/index"):
+        shutil.rmtree(path)
+    make_index(split, threads=3)
+    assert files_of(split) == once
+
+
+def test_an_interrupted_run_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_index(split)
+    once = files_of(split)
+    for path in split.glob("*/index"):
+        shutil.rmtree(path)
+    calls = 0
+
+    def features(_: Thumbnail, prepared: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls > 3:
+            raise KeyboardInterrupt
+        return prepared
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Thumbnail, "features", features)
+        with pytest.raises(KeyboardInterrupt):
+            make_index(split)
+    with pytest.raises(MissingIndexError):
+        load_buffer(EPISODE, 0, split).embeddings("thumbnail")
+    # Three demonstrations, of 21, 37 and 21 frames, were done.
+    assert make_index(split) == [4 * (21 + 37) - 79, 7 * 32]
+    assert files_of(split) == once
+
+
+def test_a_damaged_index_is_made_again(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    path = split / "distractors" / "index" / "thumbnail" / "embeddings.npy"
+    path.write_bytes(path.read_bytes()[:-2] + b"xx")
+    assert make_index(split)[1] == 7 * 32
+    assert files_of(split) == once
+
+
+def test_what_cannot_be_used_is_refused(split: Path) -> None:
+    buffer = load_buffer(EPISODE, 1, split)
+    with pytest.raises(MissingIndexError, match=f"index --data {split} --encoder thumbnail"):
+        buffer.embeddings("thumbnail")
+    make_index(split)
+    header = split / "demonstrations" / "index" / "thumbnail" / "index.json"
+    whole = json.loads(header.read_text())
+
+    def refused(error: type[Exception], match: str, **change: Any) -> None:
+        header.write_text(json.dumps(whole | change))
+        with pytest.raises(error, match=match):
+            load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+
+    refused(StaleIndexError, "revision 0000", revision="0" * 64)
+    refused(FormatError, "format version 2", format_version=2)
+    refused(FormatError, "expected float16 of shape", size=7)
+    other = whole["encoder"] | {"sha256": "0" * 64}
+    refused(StaleIndexError, "made differently", encoder=other)
+    with pytest.raises(StaleIndexError, match="another version of the encoder"):
+        Selector("thumbnail").select(load_buffer(EPISODE, 0, split), buffer.query_frame())
+    refused(StaleIndexError, "made differently", camera="observation.images.wrist")
+    header.write_text(json.dumps(whole))
+    (header.parent / "rows.parquet").write_bytes(b"PAR1")
+    refused(FormatError, "rows.parquet")
+
+
+def test_the_datasets_of_a_split_must_be_centred_together(split: Path) -> None:
+    make_index(split)
+    build_index([split / "distractors"], make_encoder("thumbnail"), QUIET)
+    load_buffer(EPISODE, 0, split).embeddings("thumbnail")  # demonstrations only
+    with pytest.raises(StaleIndexError, match="both at once"):
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+
+
+def test_the_selector(split: Path) -> None:
+    make_index(split)
+    selector = Selector("thumbnail")
+    assert (selector.name, selector.camera) == ("thumbnail/max/adaptive", "front")
+    assert Selector("thumbnail", threshold=0.9, method="mean").name == "thumbnail/mean/0.9"
+    for buffer in load_split(split).buffers(k=3):
+        index = buffer.query_index("thumbnail")
+        assert selector.threshold_for(index) == adaptive_threshold(index.typical_cosine)
+        chosen = selector.select(buffer, buffer.query_frame())
+        stored = selector.select_stored(buffer)
+        assert (chosen.start, chosen.stop) == (stored.start, stored.stop)
+        # An even sample of the span with the live observation as the last of its frames.
+        roles = [*buffer.session_index[chosen.start : chosen.stop], -1]
+        count = min(len(roles), 32)
+        sample = [roles[j * (len(roles) - 1) // (count - 1)] for j in range(count)]
+        assert chosen.lesson_fraction == sample.count(0) / count
+        assert chosen.filler_fraction == sum(role > 0 for role in sample) / count
+        assert chosen.query_fraction == 1 / count
+    whole = Selector("thumbnail", threshold=-1.0).select_stored(load_buffer(EPISODE, 1, split))
+    # One segment of 52 frames; j · 52 // 31 is below 20 for j = 0 … 11, 52 for j = 31.
+    assert (whole.start, whole.stop) == (0, 52)
+    assert whole.lesson_fraction == 12 / 32
+    assert (whole.filler_fraction, whole.query_fraction) == (19 / 32, 1 / 32)
+
+
+def test_the_selector_refuses() -> None:
+    for options, error in (
+        ({"method": "top32"}, InvalidOptionError),
+        ({"method": "best"}, UnknownNameError),
+        ({"threshold": 2.0}, InvalidOptionError),
+    ):
+        with pytest.raises(error):
+            Selector("thumbnail", **options)  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match="'thumbnial'"):
+        Selector("thumbnial")
+    with pytest.raises(InvalidOptionError, match="no models"):
+        make_encoder("thumbnail:x")
+
+
+def test_what_is_no_data_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match="neither a split"):
+        datasets_in(tmp_path)
+    with pytest.raises(UnknownNameError, match="camera 'side'"):
+        build_index([factories.split() / "distractors"], Thumbnail(), QUIET, camera="side")
+
+
+@cache
+def siglip(folder: Path) -> str:
+    """Save a small SigLIP of random weights; returns the encoder's name."""
+    torch = pytest.importorskip("torch")
+    transformers = pytest.importorskip("transformers")
+    tower = {"hidden_size": 32, "intermediate_size": 64, "num_attention_heads": 2}
+    config = transformers.SiglipConfig(
+        vision_config=tower | {"num_hidden_layers": 2, "image_size": 32, "patch_size": 8},
+        text_config=tower | {"num_hidden_layers": 1, "vocab_size": 64, "projection_size": 32},
+    )
+    torch.manual_seed(0)
+    transformers.SiglipModel(config).save_pretrained(folder)
+    settings = {"image_processor_type": "SiglipImageProcessor", "size": {"height": 32, "width": 32}}
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    return f"siglip:{folder}"
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return siglip(tmp_path_factory.mktemp("models") / "tiny")
+
+
+def test_siglip_is_transformers_own_pipeline(model: str) -> None:
+    import torch
+    from transformers import AutoImageProcessor, SiglipModel
+
+    folder = model.partition(":")[2]
+    images = np.random.default_rng(0).integers(0, 256, (9, 48, 64, 3), np.uint8)
+    encoder = make_encoder(model, device="cpu")
+    found = encoder.features(encoder.prepare(images))
+    whole = SiglipModel.from_pretrained(folder).eval()
+    processor = AutoImageProcessor.from_pretrained(folder, backend="pil")
+    with torch.no_grad():
+        inputs = processor(images=list(images), return_tensors="pt")
+        expected = whole.get_image_features(**inputs).pooler_output.numpy()
+    assert found.shape == (9, 32) and found.dtype == np.float32
+    assert found == pytest.approx(expected, abs=1e-5)
+    # Alone or together, within a unit of float16 (2⁻¹¹ below 1).
+    alone = np.concatenate([encoder.features(encoder.prepare(image[None])) for image in images])
+    apart = normalised(found).astype(np.float32) - normalised(alone)
+    assert np.abs(apart).max() <= 2**-11
+    assert encoder.computed_in == "cpu, float32"
+    assert encoder.fingerprint == make_encoder(model, device="cpu").fingerprint
+    assert encoder.fingerprint["preprocessing"]["size"] == {"height": 32, "width": 32}
+
+
+def test_siglip_makes_an_index(split: Path, model: str) -> None:
+    build_index([split / "demonstrations"], make_encoder(model, device="cpu"), QUIET)
+    index = Dataset(LocalFiles(split / "demonstrations")).index(model)
+    assert index.embeddings.shape == (232, 32) and index.centre is None
+    lengths = np.linalg.norm(index.embeddings.astype(np.float32), axis=1)
+    assert lengths == pytest.approx(np.ones(232), abs=2e-3)
+    buffer = load_buffer(EPISODE, 0, split)
+    selector = Selector(model, device="cpu")
+    assert selector.name == "siglip-tiny/max/adaptive"
+    live = selector.select(buffer, buffer.query_frame()).choice.query_cosines
+    stored = selector.select_stored(buffer).choice.query_cosines
+    assert live == pytest.approx(stored, abs=2e-3)
+
+
+def test_other_weights_are_another_encoder(model: str, tmp_path: Path) -> None:
+    import torch
+    from transformers import SiglipVisionModel
+
+    folder = Path(model.partition(":")[2])
+    changed = shutil.copytree(folder, tmp_path / "tiny")
+    vision = SiglipVisionModel.from_pretrained(changed)
+    with torch.no_grad():
+        next(vision.parameters()).add_(0.01)
+    vision.save_pretrained(changed)
+    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
+    assert one.fingerprint["weights_sha256"] != other.fingerprint["weights_sha256"]
+
+
+def test_weights_that_are_not_there(tmp_path: Path) -> None:
+    pytest.importorskip("transformers")
+    with pytest.raises(MissingWeightsError) as caught:
+        make_encoder("siglip")
+    assert "google/siglip-so400m-patch14-384" in caught.value.message
+    assert "huggingface" in caught.value.message
+    assert caught.value.hint is not None
+    assert "hf download google/siglip-so400m-patch14-384" in caught.value.hint
+    with pytest.raises(FormatError, match="cannot be loaded"):
+        make_encoder(f"siglip:{tmp_path}")
+    (tmp_path / "config.json").write_text('{"model_type": "bert"}')
+    with pytest.raises(FormatError, match="type 'bert'"):
+        make_encoder(f"siglip:{tmp_path}")

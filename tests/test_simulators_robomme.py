@@ -1,0 +1,491 @@
+"""The official simulator's seam, against a stand-in for RoboMME in an environment of its own."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from typer.testing import CliRunner
+
+from robomme_interference_data import doctor
+from robomme_interference_data.cli import app
+from robomme_interference_data.errors import (
+    InvalidIdError,
+    InvalidOptionError,
+    MissingExtraError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.simulators import Status, make_simulator, robomme_worker
+from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+from robomme_interference_data.simulators.worker import RemoteSimulator
+
+STAND_IN = Path(__file__).parent / "robomme_stand_in"
+"""A package `robomme` with RoboMME's interface, which behaves badly where an index asks for it."""
+
+HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
+
+DIES, HANGS, RAISES, BREAKS, SMALL_WRIST = 40, 41, 42, 43, 44
+"""Indices of episodes that do so; those from 45 on end as `ENDS` says."""
+
+ENDS = {45: Status.SUCCESS, 46: Status.FAIL, 47: Status.TIMEOUT}
+
+
+@pytest.fixture(scope="session")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment with numpy < 2 and nothing else."""
+    folder = tmp_path_factory.mktemp("robomme") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}"
+    command = [sys.executable, "-m", "pip", "--no-input", "install", "--quiet", "--no-deps"]
+    command += ["--only-binary", ":all:", "--target", str(site / "site-packages"), "numpy<2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"no package index gives numpy < 2: {done.stderr.strip()[-500:]}")
+    return folder / "bin" / "python"
+
+
+@pytest.fixture
+def python(bare: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """That interpreter with the stand-in."""
+    monkeypatch.setenv("PYTHONPATH", str(STAND_IN))
+    return bare
+
+
+@pytest.fixture
+def simulator(python: Path) -> Iterator[RoboMMESimulator]:
+    with RoboMMESimulator(python) as made:
+        yield made
+
+
+def ended(pid: int, within: float = 20.0) -> bool:
+    """Tell whether a process that is no child of ours ends in time."""
+    limit = time.monotonic() + within
+    while time.monotonic() < limit:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+# --- what it serves ----------------------------------------------------------------------------
+
+
+def test_an_episode_is_what_robomme_returns(simulator: RoboMMESimulator) -> None:
+    lesson, first, info = simulator.reset("MoveCube/test/3")
+    # The stand-in's demonstration has 5 frames for index 3 (3 + 2), then the live observation;
+    # frame t of the front camera is all t, of the wrist camera all 100 + t.
+    assert len(lesson) == 5
+    assert {name: frames.shape for name, frames in lesson.images.items()} == {
+        "front": (5, 256, 256, 3),
+        "wrist": (5, 256, 256, 3),
+    }
+    assert lesson.images["front"].dtype == np.uint8
+    assert lesson.images["front"][:, 7, 9, 1].tolist() == [0, 1, 2, 3, 4]
+    assert lesson.images["wrist"][:, 7, 9, 1].tolist() == [100, 101, 102, 103, 104]
+    # Joint j at frame t is t + j / 8; the first value of the gripper t / 100, the second −1.
+    assert lesson.states.dtype == np.float32
+    assert lesson.states[2].tolist() == [
+        *(2 + joint / 8 for joint in range(7)),
+        pytest.approx(0.02, rel=1e-6),
+    ]
+    assert lesson.actions.shape == (0, 8)
+    assert first.images["front"][0, 0].tolist() == [5, 5, 5]
+    assert first.images["wrist"][0, 0].tolist() == [105, 105, 105]
+    assert first.state[:7].tolist() == [5 + joint / 8 for joint in range(7)]
+    assert info.goals == ("move the cube as before", "do it again, Schritt für Schritt")
+    assert info.goal == "move the cube as before"
+    assert (info.difficulty, info.seed, info.simulator) == ("easy", 640_003, "robomme")
+
+
+def test_splits_are_robommes_datasets(simulator: RoboMMESimulator) -> None:
+    # The stand-in's seeds: 640000 + 1000 times the rank of test, val, train + index.
+    seeds = [simulator.reset(f"MoveCube/{split}/1")[2].seed for split in ("test", "val", "train")]
+    assert seeds == [640_001, 641_001, 642_001]
+
+
+def test_the_same_episode_is_the_same_each_time(simulator: RoboMMESimulator) -> None:
+    # A second reset of one of the stand-in's environments shifts all frames.
+    first = simulator.reset("MoveCube/test/3")
+    simulator.step(HOLD)
+    again = simulator.reset("MoveCube/test/3")
+    assert first[0].images["front"].tobytes() == again[0].images["front"].tobytes()
+    assert first[0].states.tobytes() == again[0].states.tobytes()
+    assert first[2] == again[2]
+
+
+def test_environments_are_closed(simulator: RoboMMESimulator) -> None:
+    simulator.reset("MoveCube/test/0")
+    simulator.reset("MoveCube/test/1")
+    with pytest.raises(UnknownNameError):
+        simulator.reset("MoveCube/test/50")
+    # The goal of this episode counts the environments that are open, itself included.
+    assert simulator.reset("VideoRepick/test/0")[2].goals[-1] == "open environments: 1"
+
+
+def test_a_step_executes_the_action(simulator: RoboMMESimulator) -> None:
+    simulator.reset("MoveCube/test/0")
+    action = np.linspace(-1, 1, 8, dtype=np.float32)
+    seen, status = simulator.step(action)
+    assert status is Status.ONGOING
+    # The stand-in's arm is where it was sent, and its finger's way is (gripper + 1) / 50.
+    assert seen.state[:7].tolist() == action[:7].tolist()
+    assert seen.state[7] == pytest.approx(0.04)
+    assert seen.images["front"].shape == (256, 256, 3)
+    # The front camera shows the number of the step.
+    assert [simulator.step(HOLD)[0].images["front"][0, 0, 0] for _ in range(3)] == [2, 3, 4]
+
+
+def test_a_stick_has_no_gripper(simulator: RoboMMESimulator) -> None:
+    lesson, _, _ = simulator.reset("PatternLock/test/2")
+    assert lesson.states[:, 7].tolist() == [0.0] * 4
+    seen, _ = simulator.step(HOLD)
+    assert seen.state.tolist() == [*HOLD[:7].tolist(), 0.0]
+
+
+def test_images_are_left_out_where_not_wanted(python: Path) -> None:
+    with RoboMMESimulator(python, cameras=["front"]) as simulator:
+        lesson, first, _ = simulator.reset("MoveCube/test/0")
+        assert list(lesson.images) == list(first.images) == ["front"]
+        lesson, first, _ = simulator.reset("MoveCube/test/3", demonstration=False)
+        assert lesson.images == {}
+        assert lesson.states.shape == (5, 8)
+        assert first.images["front"][0, 0, 0] == 5
+        seen, _ = simulator.step(HOLD, observe=False)
+        assert seen.images == {}
+        assert seen.state.shape == (8,)
+
+
+@pytest.mark.parametrize("index", ENDS)
+def test_robommes_statuses(simulator: RoboMMESimulator, index: int) -> None:
+    simulator.reset(f"MoveCube/test/{index}")
+    statuses = [simulator.step(HOLD, observe=False)[1] for _ in range(3)]
+    assert statuses == [Status.ONGOING, Status.ONGOING, ENDS[index]]
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        simulator.step(HOLD)
+
+
+def test_an_episode_ends_after_1300_steps(simulator: RoboMMESimulator) -> None:
+    # RoboMME goes on for one more, and so does the stand-in.
+    simulator.reset("MoveCube/test/0")
+    statuses = [simulator.step(HOLD, observe=False)[1] for _ in range(1300)]
+    assert statuses == [Status.ONGOING] * 1299 + [Status.TIMEOUT]
+
+
+def test_there_is_no_built_in_policy(simulator: RoboMMESimulator) -> None:
+    with pytest.raises(UnknownNameError, match="no built-in policy 'oracle'"):
+        simulator.act("oracle")
+
+
+def test_it_runs_in_a_worker_process_too(python: Path) -> None:
+    with RemoteSimulator("robomme", python=str(python)) as remote:
+        lesson, _, info = remote.reset("RouteStick/val/1")
+        assert (len(lesson), info.simulator) == (3, "robomme")
+        assert remote.step(HOLD)[1] is Status.ONGOING
+
+
+# --- what it refuses ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("episode", "error", "message"),
+    [
+        ("MoveCube/test/50", UnknownNameError, "MoveCube has 50 test episodes"),
+        ("MoveQube/test/0", UnknownNameError, "Did you mean 'MoveCube'"),
+        ("MoveCube/tests/0", InvalidIdError, "not a split"),
+        ("MoveCube", InvalidIdError, "not an episode id"),
+    ],
+)
+def test_unknown_episodes(
+    simulator: RoboMMESimulator, episode: str, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        simulator.reset(episode)
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+
+
+@pytest.mark.parametrize("action", [np.zeros(7), np.zeros((1, 8)), [np.nan] * 8, [np.inf] * 8])
+def test_bad_actions_do_not_reach_robomme(simulator: RoboMMESimulator, action: object) -> None:
+    simulator.reset("MoveCube/test/0")
+    with pytest.raises(InvalidOptionError, match="8 finite numbers"):
+        simulator.step(np.asarray(action, np.float32))
+    assert simulator.step(HOLD)[0].images["front"][0, 0, 0] == 1  # still the first step
+
+
+def test_there_must_be_an_episode(simulator: RoboMMESimulator) -> None:
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        simulator.step(HOLD)
+    simulator.close()
+    with pytest.raises(SimulatorCrashError, match="closed"):
+        simulator.reset("MoveCube/test/0")
+
+
+def test_unknown_cameras(python: Path) -> None:
+    with pytest.raises(UnknownNameError, match="'wrist'"):
+        RoboMMESimulator(python, cameras=["wirst"])
+
+
+def test_images_of_another_size(simulator: RoboMMESimulator) -> None:
+    with pytest.raises(InvalidOptionError, match=r"wrist camera .* \(128, 128, 3\) uint8; exp"):
+        simulator.reset(f"MoveCube/test/{SMALL_WRIST}")
+
+
+# --- what breaks -------------------------------------------------------------------------------
+
+
+def test_a_death_shows_the_end_of_its_log(simulator: RoboMMESimulator) -> None:
+    with pytest.raises(SimulatorCrashError) as caught:
+        simulator.reset(f"MoveCube/test/{DIES}")
+    assert "died during reset, exit code 7" in caught.value.message
+    assert caught.value.hint is not None
+    lines = caught.value.hint.splitlines()
+    # 20 lines at most, the last ones.
+    assert (lines[0], len(lines), lines[-1]) == ("It printed last:", 21, "planner failure 99")
+    assert simulator.pid is None
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+
+
+def test_a_worker_killed_between_steps(simulator: RoboMMESimulator) -> None:
+    simulator.reset("MoveCube/test/3")
+    assert simulator.pid is not None
+    os.kill(simulator.pid, signal.SIGKILL)
+    with pytest.raises(SimulatorCrashError, match=r"died during step, exit code -9 \(MoveCube/tes"):
+        simulator.step(HOLD)
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        simulator.step(HOLD)
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+
+
+def test_a_hang_is_ended(python: Path) -> None:
+    with RoboMMESimulator(python, reset_s=30, step_s=3) as simulator:
+        simulator.reset(f"MoveCube/test/{HANGS}")
+        pid = simulator.pid
+        assert pid is not None
+        with pytest.raises(SimulatorCrashError, match="took more than 3 s to step"):
+            simulator.step(HOLD)
+        assert ended(pid)
+        assert simulator.pid is None
+
+
+def test_an_exception_in_a_reset(simulator: RoboMMESimulator) -> None:
+    with pytest.raises(SimulatorCrashError, match="failed during reset: RuntimeError: no Vulkan"):
+        simulator.reset(f"MoveCube/test/{RAISES}")
+    pid = simulator.pid
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+    assert simulator.pid == pid
+
+
+def test_robommes_own_error_status(simulator: RoboMMESimulator) -> None:
+    simulator.reset(f"MoveCube/test/{BREAKS}")
+    simulator.step(HOLD)
+    with pytest.raises(SimulatorCrashError, match="reports an error at step 2: caught: no such jo"):
+        simulator.step(HOLD)
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        simulator.step(HOLD)
+
+
+def test_the_worker_ends_with_us_even_in_a_long_call(python: Path) -> None:
+    code = f"""
+        import threading, time
+        from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+        simulator = RoboMMESimulator({str(python)!r})
+        simulator.reset("MoveCube/test/{HANGS}")
+        print(simulator.pid, flush=True)
+        import numpy as np
+        simulator.step(np.zeros(8, np.float32))
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        time.sleep(0.5)
+        parent.kill()
+    assert ended(pid)
+
+
+# --- interpreters that will not do -------------------------------------------------------------
+
+
+def test_no_interpreter_is_given() -> None:
+    with pytest.raises(InvalidOptionError, match="none is given") as caught:
+        make_simulator("robomme")
+    assert "--robomme-python PATH" in str(caught.value)
+
+
+def test_the_environment_variable_names_it(python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOMME_PYTHON", str(python))
+    simulator = make_simulator("robomme")
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+    simulator.close()
+
+
+@pytest.mark.parametrize("name", ["nowhere/python", "folder", "notes.txt"])
+def test_no_interpreter_is_there(tmp_path: Path, name: str) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "notes.txt").write_text("not a program")
+    with pytest.raises(InvalidOptionError, match=f"{name} is not an executable file"):
+        RoboMMESimulator(tmp_path / name)
+
+
+def test_a_program_that_is_no_python(tmp_path: Path) -> None:
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\necho I am a shell\nexit 3\n")
+    program.chmod(0o755)
+    with pytest.raises(SimulatorCrashError, match=r"(?s)died during start, exit code 3.*a shell"):
+        RoboMMESimulator(program)
+    program.write_bytes(b"\x7fELF of another machine")
+    with pytest.raises(InvalidOptionError, match="cannot be run as RoboMME's Python"):
+        RoboMMESimulator(program)
+
+
+def test_an_interpreter_without_robomme(bare: Path) -> None:
+    with pytest.raises(MissingExtraError, match="robomme is not installed there") as caught:
+        RoboMMESimulator(bare)
+    assert str(bare) in caught.value.message
+
+
+def test_numpy_2_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(STAND_IN))
+    with pytest.raises(MissingExtraError, match=rf"numpy is {np.__version__}; RoboMME needs numpy"):
+        RoboMMESimulator(sys.executable)
+
+
+def test_robomme_that_cannot_be_imported(
+    bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "robomme").mkdir()
+    (tmp_path / "robomme" / "env_record_wrapper.py").write_text("import mplib_is_missing\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(MissingExtraError, match=r"imported: ModuleNotFoundError: .*mplib_is_miss"):
+        RoboMMESimulator(bare)
+
+
+def test_one_that_does_not_start_in_time(python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STAND_IN_IMPORT_SECONDS", "60")
+    with pytest.raises(SimulatorCrashError, match="took more than 1 s to start"):
+        RoboMMESimulator(python, start_s=1)
+
+
+# --- commands ----------------------------------------------------------------------------------
+
+
+def test_simulate_plays_the_demonstration(python: Path) -> None:
+    given_words = ["simulate", "--family", "MoveCube", "--episode", "3", "--json"]
+    given_words += ["--simulator", "robomme", "--robomme-python", str(python)]
+    done = CliRunner().invoke(app, given_words)
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == {
+        "episode": "MoveCube/test/3",
+        "simulator": "robomme",
+        "goal": "move the cube as before",
+        "difficulty": "easy",
+        "seed": 640_003,
+        "policy": "none",
+        "status": "ongoing",
+        "lesson_frames": 5,
+        "steps": 0,
+    }
+
+
+def test_simulate_has_no_oracle_there() -> None:
+    given_words = ["simulate", "--family", "MoveCube", "--policy", "oracle"]
+    done = CliRunner().invoke(app, [*given_words, "--simulator", "robomme"])
+    assert isinstance(done.exception, UnknownNameError)
+    assert "expected none" in str(done.exception)
+
+
+def test_the_doctor_asks_the_interpreter(python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = doctor._robomme()
+    assert (row.ok, row.detail) == (
+        None,
+        "ROBOMME_PYTHON is not set; only --simulator robomme needs it",
+    )
+    monkeypatch.setenv("ROBOMME_PYTHON", str(python))
+    row = doctor._robomme()
+    assert (row.ok, row.fix) == (True, None)
+    assert "numpy 1." in row.detail and row.detail.endswith("4 families")
+    monkeypatch.setenv("ROBOMME_PYTHON", sys.executable)
+    assert "RoboMME needs numpy < 2" in doctor._robomme().detail
+    monkeypatch.setenv("ROBOMME_PYTHON", "/nowhere/python")
+    row = doctor._robomme()
+    assert row.ok is False
+    assert "cannot be asked" in row.detail
+
+
+# --- messages ----------------------------------------------------------------------------------
+
+
+def exchange(
+    head: dict[str, object], arrays: dict[str, object]
+) -> tuple[dict[str, object], dict[str, np.ndarray]]:
+    ours, theirs = socket.socketpair()
+    theirs.settimeout(60)
+    with ours, theirs:
+        # In a thread: what a socket holds without a reader is little.
+        sender = threading.Thread(target=robomme_worker.send, args=(ours, head, arrays))
+        sender.start()
+        received = robomme_worker.receive(theirs)
+        sender.join()
+    return received
+
+
+ARRAYS = npst.arrays(
+    st.sampled_from([np.uint8, np.float32, np.float64, np.int64, np.bool_]),
+    npst.array_shapes(max_dims=4, max_side=5),
+)
+
+
+@given(st.dictionaries(st.text(max_size=5), ARRAYS, max_size=3), st.text())
+def test_messages_arrive_as_they_were_sent(arrays: dict[str, np.ndarray], text: str) -> None:
+    head, found = exchange({"text": text}, dict(arrays))
+    assert head == {"text": text}
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
+        assert found[name].tobytes() == array.tobytes()
+
+
+def test_lists_arrive_as_one_array() -> None:
+    _, found = exchange({}, {"a": [np.full((2, 3), 1, np.uint8), np.full((2, 3), 2, np.uint8)]})
+    assert found["a"].tolist() == [[[1] * 3] * 2, [[2] * 3] * 2]
+
+
+def test_the_bytes_of_a_message() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        robomme_worker.send(ours, {"n": 1}, {"a": np.array([[1, 258]], "<u2")})
+        head = b'{"n": 1, "arrays": [["a", "<u2", [1, 2]]]}'
+        assert theirs.recv(1000) == b"\0\0\0" + bytes([len(head)]) + head + b"\1\0\2\1"
+
+
+def test_lists_of_unlike_arrays_are_refused() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs, pytest.raises(ValueError, match="arrays of one shape and type"):
+        robomme_worker.send(ours, {}, {"a": [np.zeros(2), np.zeros(3)]})
+
+
+@pytest.mark.parametrize(
+    ("sent", "error"),
+    [(b"", EOFError), (b"\0\0\0\5{", EOFError), (b"\xff\0\0\0{}", ValueError)],
+)
+def test_what_is_no_message(sent: bytes, error: type[Exception]) -> None:
+    ours, theirs = socket.socketpair()
+    with theirs:
+        with ours:
+            ours.sendall(sent)
+        with pytest.raises(error):
+            robomme_worker.receive(theirs)
