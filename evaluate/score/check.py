@@ -152,11 +152,10 @@ class Checker:
 
     def _check_revisions(self, rows: Rows, simulator: Codes) -> None:
         revisions: list[str] = []
-        code = rows.text("revision", lambda v: _add(revisions, v or ""))
-        for pair in np.unique(simulator * len(revisions) + code).tolist():
-            number, place = divmod(pair, max(len(revisions), 1))
-            if number < 0 or not revisions[place]:
-                continue
+        code = rows.text("revision", lambda v: _revision(revisions, v))
+        sound = (simulator >= 0) & (code >= 0)
+        for pair in np.unique((simulator * max(len(revisions), 1) + code)[sound]).tolist():
+            number, place = divmod(pair, len(revisions))
             name = self.simulators[number]
             known = self.revisions.setdefault(name, revisions[place])
             if known != revisions[place]:
@@ -182,14 +181,13 @@ class Checker:
             said = sound & (given >= 0)
             at = group[said], episode[said]
             before = known[at]
-            # Of several rows the first one counts: what is assigned last stays.
-            known[at[0][::-1], at[1][::-1]] = np.where(before >= 0, before, given[said])[::-1]
+            # Of several rows the first one counts: what is assigned last stays. Copies, because
+            # numpy walks through reversed views forwards.
+            last_first = tuple(place[::-1].copy() for place in at)
+            known[last_first] = np.where(before >= 0, before, given[said])[::-1].copy()
             wrong = np.zeros(len(episode), bool)
             wrong[said] = known[at] != given[said]
-            rows.refuse(
-                wrong,
-                _differs(rows, name),
-            )
+            rows.refuse(wrong, _differs(rows, name))
 
     def _grow(self, episode: int) -> None:
         groups, width = self.difficulty.shape
@@ -224,7 +222,9 @@ def _differs(rows: Rows, name: str) -> Callable[[int], str]:
     )
 
 
-def _add(names: list[str], value: str) -> int:
+def _revision(names: list[str], value: str | None) -> int:
+    if not value:
+        raise ValueError("revision is empty")
     if value not in names:
         names.append(value)
     return names.index(value)

@@ -134,7 +134,7 @@ class _Reader:
             lines = [str(refusal) for refusal in self.refusals]
             lines += [f"… and {more:,} more so far"] if more else []
             raise BadRowsError(
-                "\n".join([f"{self.refused:,} bad rows:", *lines]),
+                "\n".join([f"{self.refused:,} bad row{'s' * (self.refused > 1)}:", *lines]),
                 "Mend them, or leave them out with --lenient.",
             )
 
