@@ -122,6 +122,46 @@ def test_policies_prints_the_rate_and_the_ratio_to_a_bare_send() -> None:
 
 
 @pytest.mark.slow
+def test_score_prints_times_ratios_and_memory() -> None:
+    pytest.importorskip("pandas")
+    options = ("--rounds", "1", "--repeats", "2", "--draws", "50")
+    grid, repeats = printed("score", *options)
+    ways = ["score", "pandas, draws shared by hand", "pandas, scipy.stats.bootstrap"]
+    # 11 systems × 5 conditions × 9 families × 50 episodes
+    assert [row[:2] for row in grid] == [["24,750", way] for way in ways]
+    assert [row[:2] for row in repeats] == [["49,500", way] for way in ways[:2]]
+    assert grid[0][3] == repeats[0][3] == repeats[0][5] == "1.0"
+    for _, _, seconds, ratio in grid[1:]:
+        assert float(ratio) == pytest.approx(float(seconds) / float(grid[0][2]), rel=0.1)
+    assert all(float(row[4].replace(",", "")) > 0 for row in repeats)
+
+
+def test_all_ways_of_scoring_find_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pandas = pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(FOLDER)  # for what the benchmarks share
+    score = module("score")
+    monkeypatch.setattr(score, "SYSTEMS", 2)
+    monkeypatch.setattr(score, "GRID", 2 * 5 * 450)
+    rows = score.write_rows(tmp_path / "rows.parquet", 1)
+    found = {}
+    for place, (way, call) in enumerate(score.WAYS.items()):
+        call(rows, out := tmp_path / str(place), 2000)
+        found[way] = {path.stem: pandas.read_csv(path) for path in out.glob("*.csv")}
+    tables = found.pop("score")
+    main, effects = tables["main"], tables["effects"]
+    effects = effects[effects["condition"] == "k7"]
+    for other in found.values():
+        assert other["main"]["mean"].tolist() == pytest.approx(
+            main.sort_values(["system", "condition"])["rate"].tolist(), abs=1e-6
+        )
+        same = other["effects"].query("condition == 'k7' and against == 'k0'")
+        assert same["value"].tolist() == pytest.approx(effects["difference"].tolist(), abs=1e-6)
+        assert same["p"].tolist() == pytest.approx(effects["p"].tolist(), rel=1e-5)
+        for bound in ("low", "high"):  # of other draws
+            assert same[bound].tolist() == pytest.approx(effects[bound].tolist(), abs=0.01)
+
+
+@pytest.mark.slow
 def test_made_up_episode_tables_have_the_columns_of_real_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,7 +177,7 @@ def test_made_up_episode_tables_have_the_columns_of_real_ones(
         assert len(list(made_up.records())) == 11
 
 
-@pytest.mark.parametrize("name", ["load", "build", "manifests", "policies", "evaluate"])
+@pytest.mark.parametrize("name", ["load", "build", "manifests", "policies", "evaluate", "score"])
 def test_help_and_refusals(name: str) -> None:
     shown = run(name, "--help")
     assert shown.returncode == 0 and "--rounds" in shown.stdout

@@ -12,10 +12,16 @@ import score_rows as made
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robomme_interference_data.errors import BadRowsError, FormatError, MissingFileError
+from robomme_interference_data.errors import (
+    BadRowsError,
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+)
 from robomme_interference_data.evaluate.score import read, rollouts
 from robomme_interference_data.evaluate.score.check import BITS, REFUSED, field, pack
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
+from robomme_interference_data.evaluate.score.scoring import score
 
 GOOD = "my-memory,MoveCube,k0,0,7,easy,success,1,100"
 
@@ -135,7 +141,7 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
     path = made.released(tmp_path / "rows.csv", [GOOD, line, GOOD.replace("k0", "k3")])
     with pytest.raises(BadRowsError) as raised:
         read_rollouts([path])
-    assert raised.value.message.startswith(f"1 bad rows:\n{path}, line 3: ")
+    assert raised.value.message.startswith(f"1 bad row:\n{path}, line 3: ")
     assert reason in raised.value.message
     assert raised.value.hint is not None and "--lenient" in raised.value.hint
     # Leniently it is left out and counted; the others stay.
@@ -304,3 +310,52 @@ def test_recoding_in_steps_is_recoding_at_once(
     expected = read_rollouts([path])
     monkeypatch.setattr(rollouts, "_STEP", 7)
     assert np.array_equal(read_rollouts([path]).packed, expected.packed)
+
+
+def test_of_rows_that_differ_on_an_episode_the_first_counts(tmp_path: Path) -> None:
+    first = next(row for row in made.rows() if row.condition == "k0")
+    rows = [replace(first, condition=name, seed=seed) for name, seed in KINDS]
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([path := made.write_csv(tmp_path / "a.csv", rows)])
+    assert raised.value.message.splitlines() == [
+        "2 bad rows:",
+        f"{path}, line 3: seed '8' differs from that of other rows of the same episode",
+        f"{path}, line 5: seed '8' differs from that of other rows of the same episode",
+    ]
+
+
+KINDS = (("k0", 7), ("k1", 8), ("k3", 7), ("k7", 8))
+
+
+def test_a_file_that_is_given_twice_is_refused(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    with pytest.raises(InvalidOptionError, match=r"a\.csv is given twice"):
+        read_rollouts([path, tmp_path / "." / "a.csv"])
+
+
+def test_a_row_without_a_revision_is_bad_where_others_name_one(tmp_path: Path) -> None:
+    rows = made.rows()
+    rows[1] = replace(rows[1], revision="")
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    with pytest.raises(BadRowsError, match="line 3: revision is empty"):
+        read_rollouts([path])
+    found = read_rollouts([path], lenient=True)
+    assert (found.refused, len(found.packed)) == (1, len(rows) - 1)
+    assert list(found.revisions.values()) == [made.REVISION]
+
+
+def test_lines_of_duplicates_beside_lines_that_are_no_rows(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows()[:2])
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join([lines[0], "x,y", *lines[1:], lines[1]]) + "\n", encoding="utf-8")
+    found = read_rollouts([path], lenient=True)
+    assert [str(refusal) for refusal in found.refusals] == [
+        f"{path}, line 2: the line has 2 fields; expected {lines[0].count(',') + 1}",
+        f"{path}, line 5: the same rollout as {path}, line 3",
+    ]
+
+
+def test_nothing_but_bad_rows_says_how_many(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", [replace(r, family="X") for r in made.rows()[:3]])
+    with pytest.raises(BadRowsError, match=r"all 3 rows are bad; the first is .*line 2: unknown"):
+        score([path], lenient=True)

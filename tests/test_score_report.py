@@ -10,6 +10,7 @@ import score_rows as made
 from browser import open_page
 
 from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.evaluate.score.cells import main_markdown
 from robomme_interference_data.evaluate.score.episodes import episode_rows, flips
 from robomme_interference_data.evaluate.score.figures import draw_figures
 from robomme_interference_data.evaluate.score.grid import Grid
@@ -66,6 +67,16 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert page.requests() == [report.resolve().as_uri()]
         shown = page.run("document.querySelector('.headline').textContent")
         assert shown == headline(small, "tabletop")
+        grid = (
+            "[...document.querySelectorAll('#grid-tabletop tr')]"
+            ".map(r => [...r.cells].map(c => c.textContent))"
+        )
+        markdown = [line.strip("|").split("|") for line in main_markdown(small.cells).splitlines()]
+        expected = [[cell.strip(" *") for cell in line] for line in markdown if len(line) > 1]
+        found = page.run(grid)
+        assert found[0] == ["tabletop", "no-history", "k0", "k1", "k3", "k7"]
+        assert [row[0] for row in found[1:]] == [row[0] for row in expected[2:]]
+        assert found[1][1] == "8.3% [1.5, 35.4] n=12"
         images = "[...document.images].map(i => i.complete && i.naturalWidth > 100)"
         assert page.run(images) == [True] * 6
 

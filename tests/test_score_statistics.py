@@ -10,6 +10,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robomme_interference_data.evaluate.score import bootstrap
 from robomme_interference_data.evaluate.score.bootstrap import (
     Resampler,
     Statistic,
@@ -197,18 +198,34 @@ def test_nothing_to_compare_is_no_number() -> None:
     assert math.isnan(found.value)
 
 
-def test_the_same_key_gives_the_same_interval_and_the_order_of_episodes_none_other() -> None:
-    values = outcomes()
-    first, again, other = (
-        Resampler(v, key, 500).intervals([difference(0, 1)])[0]
-        for v, key in ((values, "a"), (values[::-1], "a"), (values, "b"))
-    )
+def test_the_key_alone_seeds_the_draws() -> None:
+    values, statistics = outcomes(), [slope([0, 1, 2, 3], slope_weights([0, 1, 3, 7]))]
+    first, again, other = (Resampler(values, k, 500).intervals(statistics) for k in "aab")
     assert first == again
     assert first != other
+    # Whatever else is computed from the same draws makes no difference.
+    assert Resampler(values, "a", 500).intervals([difference(0, 1), *statistics])[1:] == first
 
 
 def test_draws_in_chunks_are_the_same_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     statistics = [difference(0, 1), retention(0, 1, 3)]
     whole = Resampler(outcomes(), "x", 500).intervals(statistics)
-    monkeypatch.setattr("robomme_interference_data.evaluate.score.bootstrap._CHUNK", 160)
+    monkeypatch.setattr(bootstrap, "_CHUNK", 160)
+    bootstrap._drawn.cache_clear()
     assert Resampler(outcomes(), "x", 500).intervals(statistics) == whole
+
+
+def test_many_episodes_are_drawn_by_their_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways of drawing are the same bootstrap; by kinds, order and _MANY play no part."""
+    values, statistics = outcomes(400), [difference(0, 1), retention(0, 1, 3)]
+    single = Resampler(values, "x", 20_000).intervals(statistics)
+    monkeypatch.setattr(bootstrap, "_MANY", 399)
+    by_kind = Resampler(values, "x", 20_000).intervals(statistics)
+    assert by_kind == Resampler(values[::-1], "x", 20_000).intervals(statistics)
+    for one, other in zip(single, by_kind, strict=True):
+        assert one.value == other.value
+        tolerance = 0.05 * (one.high - one.low)
+        assert one.low == pytest.approx(other.low, abs=tolerance)
+        assert one.high == pytest.approx(other.high, abs=tolerance)
+    monkeypatch.setattr(bootstrap, "_CHUNK", 160)
+    assert by_kind == Resampler(values, "x", 20_000).intervals(statistics)

@@ -4,6 +4,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import NormalDist
 
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 __all__ = ["DRAWS", "Interval", "Resampler", "Statistic", "difference", "retention", "slope"]
 
 DRAWS = 10_000
-_CHUNK = 4_000_000  # whole numbers drawn at a time: 32 MB
+_CHUNK = 2**15  # numbers at a time: they stay in the cache, and BLAS starts no threads for them
+_MANY = 5_000
+"""Above so many episodes, equal ones are drawn together."""
 _NORMAL = NormalDist()
 
 Floats = NDArray[np.float64]
@@ -80,22 +83,25 @@ class Resampler:
     The episode is the cluster: its outcomes under all conditions, repeats among them as a mean,
     are drawn together, so what episodes have in common never counts as evidence twice.
 
-    Episodes with equal values cannot be told apart, so instead of episodes the number of each
-    distinct row of values is drawn, from the multinomial distribution with the observed shares.
-    That is the same bootstrap, and takes time by the number of distinct rows: 16 for four
-    conditions, however many episodes there are.
+    Above `_MANY` episodes those with equal values, which cannot be told apart, are drawn together:
+    how often each distinct row of values occurs, from the multinomial distribution with the
+    observed shares. That is the same bootstrap, and takes time by the number of distinct rows: 16
+    for four conditions without repeats, however many episodes there are.
 
     Args:
         values: A row per episode, a column per condition, NaN for what is missing,
             `(E, C) float64`.
-        key: Text that seeds the draws: the same key and values give the same intervals, whatever
-            else is computed.
+        key: Text that seeds the draws. The same key, values and order of episodes give the same
+            intervals, whatever else is computed.
         draws: Number of bootstrap samples.
     """
 
     def __init__(self, values: Floats, key: str, draws: int = DRAWS):
-        self._patterns, self._counts = _distinct(values)
-        self._seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:16])
+        if len(values) > _MANY:
+            self._rows, self._times = _distinct(values)
+        else:
+            self._rows, self._times = values, np.ones(len(values), np.int64)
+        self._key = key
         self._draws = draws
 
     def intervals(self, statistics: Sequence[Statistic]) -> list[Interval]:
@@ -111,27 +117,28 @@ class Resampler:
         no value (a zero denominator) are left out. Where the correction itself has no value, as
         when all draws lie on one side of the estimate, the bounds are the plain percentiles.
         """
-        features = [statistic.features(self._patterns) for statistic in statistics]
-        drawn: list[list[Floats]] = [[] for _ in statistics]
-        for weights in self._weights():
-            for place, statistic in enumerate(statistics):
-                drawn[place].append(_combine(statistic, weights @ features[place]))
-        return [
-            self._interval(statistic, features[place], np.concatenate(drawn[place]))
-            if drawn[place]
-            else Interval(math.nan, math.nan, math.nan)
-            for place, statistic in enumerate(statistics)
-        ]
+        if not len(self._rows) or not statistics:
+            return [Interval(math.nan, math.nan, math.nan) for _ in statistics]
+        features = [statistic.features(self._rows) for statistic in statistics]
+        # Statistics share most of what they sum: each column is summed once.
+        columns, place = np.unique(np.concatenate(features, axis=1), axis=1, return_inverse=True)
+        sums = np.concatenate([weights @ columns for weights in self._weights()])
+        intervals, start = [], 0
+        for statistic, feature in zip(statistics, features, strict=True):
+            mine = place[start : start + feature.shape[1]]
+            start += feature.shape[1]
+            intervals.append(self._interval(statistic, feature, _combine(statistic, sums[:, mine])))
+        return intervals
 
     def _interval(self, statistic: Statistic, features: Floats, drawn: Floats) -> Interval:
-        whole = self._counts @ features
+        whole = self._times @ features
         value = float(_combine(statistic, whole[None])[0])
         drawn = drawn[np.isfinite(drawn)]
         if not math.isfinite(value) or not len(drawn):
             return Interval(value if math.isfinite(value) else math.nan, math.nan, math.nan)
         below = ((drawn < value).sum() + (drawn <= value).sum()) / (2 * len(drawn))
         # Leaving out any episode of a distinct row gives the same estimate.
-        without, times = _combine(statistic, whole - features), self._counts
+        without, times = _combine(statistic, whole - features), self._times
         kept = np.isfinite(without)
         without, times = without[kept], times[kept]
         shifts = (times @ without) / times.sum() - without
@@ -147,21 +154,46 @@ class Resampler:
         return Interval(value, float(low), float(high))
 
     def _weights(self) -> Iterator[Floats]:
-        """Yield how often each distinct row is drawn, `(D, P) float64`, some draws at a time."""
-        total = int(self._counts.sum())
-        if total == 0:
+        """Yield how often each row is drawn, `(D, R) float64`, some draws at a time."""
+        step = max(1, _CHUNK // len(self._rows))
+        if len(self._rows) == self._times.sum():
+            drawn = _drawn(self._key, len(self._rows), self._draws)
+            for start in range(0, self._draws, step):
+                yield drawn[start : start + step].astype(float)
             return
-        generator = np.random.Generator(np.random.PCG64(self._seed))
-        shares = self._counts / total
-        step = max(1, _CHUNK // len(shares))
+        total = int(self._times.sum())
+        generator, shares = _generator(self._key), self._times / total
         for start in range(0, self._draws, step):
             size = min(step, self._draws - start)
             yield generator.multinomial(total, shares, size).astype(float)
 
 
+def _generator(key: str) -> np.random.Generator:
+    digest = hashlib.sha256(key.encode()).digest()
+    return np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16])))
+
+
+@lru_cache(maxsize=2)
+def _drawn(key: str, episodes: int, draws: int) -> NDArray[np.uint8]:
+    """Return how often each draw takes each episode, `(draws, episodes) uint8`.
+
+    All systems over the same episodes share the draws. That an episode is taken 256 times of
+    `_MANY` has no probability to speak of.
+    """
+    generator, counts = _generator(key), np.zeros((draws, episodes), np.uint8)
+    step = max(1, _CHUNK // episodes)
+    for start in range(0, draws, step):
+        part = counts[start : start + step]
+        places = generator.integers(0, episodes, part.shape)
+        places += np.arange(len(part))[:, None] * episodes
+        part[...] = np.bincount(places.ravel(), minlength=part.size).reshape(part.shape)
+    return counts
+
+
 def _combine(statistic: Statistic, sums: Floats) -> Floats:
+    # Rounded, so that what is equal in exact arithmetic is equal here on any machine.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return statistic.combine(sums)
+        return statistic.combine(sums).round(12)
 
 
 def _distinct(values: Floats) -> tuple[Floats, NDArray[np.int64]]:

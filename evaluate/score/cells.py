@@ -16,7 +16,8 @@ from robomme_interference_data.evaluate.score.tables import Column, Table, perce
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.intervals import wilson
 
-__all__ = ["Cell", "Part", "cells_by", "coverage_table", "main_markdown", "rate_table"]
+__all__ = ["Cell", "MainGrid", "Part", "cells_by", "coverage_table", "main_grids", "main_markdown"]
+__all__ += ["main_note", "rate_table"]
 
 Part = Literal["", "family", "difficulty"]
 
@@ -146,41 +147,69 @@ def rate_table(cells: Sequence[Cell], name: str, title: str, part: Part = "") ->
     return Table(name, title, tuple(columns), tuple(rows), NOTE)
 
 
-def main_markdown(cells: Sequence[Cell]) -> str:
-    """Return the paper's main table in Markdown: a row per system, a column per condition.
+@dataclass(frozen=True)
+class MainGrid:
+    """The paper's main table of one simulator: a row per system, a column per condition.
 
-    The highest rate of each condition among several complete cells is bold, as in the paper.
+    Attributes:
+        simulator: Name of the simulator.
+        conditions: Heads of the columns.
+        rows: Display name of a system, and its text under each condition. Between `**` stands the
+            highest rate of each condition among several complete cells, bold as in the paper.
     """
-    lines = []
+
+    simulator: str
+    conditions: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[str, ...]], ...]
+
+
+def main_grids(cells: Sequence[Cell]) -> list[MainGrid]:
+    """Return the paper's main table for each simulator."""
+    grids = []
     for simulator in dict.fromkeys(cell.simulator for cell in cells):
         found = [cell for cell in cells if cell.simulator == simulator]
-        conditions = sorted({cell.condition for cell in found}, key=condition_rank)
+        conditions = tuple(sorted({cell.condition for cell in found}, key=condition_rank))
         at = {(cell.system, cell.condition): cell for cell in found}
+        several = {c: sum(a.condition == c and a.complete for a in found) > 1 for c in conditions}
+        rows = (
+            (
+                display_name(system),
+                tuple(_shown(at.get((system, c)), several[c]) for c in conditions),
+            )
+            for system in dict.fromkeys(cell.system for cell in found)
+        )
+        grids.append(MainGrid(simulator, conditions, tuple(rows)))
+    return grids
+
+
+def main_markdown(cells: Sequence[Cell]) -> str:
+    """Return the paper's main table in Markdown."""
+    lines = []
+    for grid in main_grids(cells):
         lines += [
-            f"| {simulator} | {' | '.join(conditions)} |",
-            "| --- |" + " --- |" * len(conditions),
+            f"| {grid.simulator} | {' | '.join(grid.conditions)} |",
+            "| --- |" + " --- |" * len(grid.conditions),
+            *(f"| {system} | {' | '.join(shown)} |" for system, shown in grid.rows),
+            "",
         ]
-        for system in dict.fromkeys(cell.system for cell in found):
-            several = {
-                c: sum(a.condition == c and a.complete for a in found) > 1 for c in conditions
-            }
-            shown = [_shown(at.get((system, c)), several[c]) for c in conditions]
-            lines.append(f"| {display_name(system)} | {' | '.join(shown)} |")
-        lines.append("")
+    return "\n".join([*lines, main_note(cells)]) + "\n"
+
+
+def main_note(cells: Sequence[Cell]) -> str:
+    """Return how the main table is to be read, and how many rollouts broke."""
     errors = sum(cell.counts[ERROR] for cell in cells)
-    broke = f" Rollouts that broke: {errors}." if errors else " No rollout broke."
-    return "\n".join([*lines, NOTE + broke]) + "\n"
+    return NOTE + (f" Rollouts that broke: {errors}." if errors else " No rollout broke.")
 
 
 def _shown(cell: Cell | None, several: bool) -> str:
     if cell is None:
         return "–"
+    errors = f", errors: {cell.counts[ERROR]}" if cell.counts[ERROR] else ""
     if not cell.n:
-        return "no result†"
+        return f"no result†{errors}"
     low, high = cell.interval
     rate = f"**{percent(cell.rate)}**" if several and cell.rank == 1 else percent(cell.rate)
     mark = "" if cell.complete else "†"
-    errors = f", errors: {cell.counts[ERROR]}" if cell.counts[ERROR] else ""
     return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}] n={cell.n}{errors}"
 
 

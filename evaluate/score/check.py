@@ -4,13 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS, SPLITS
-from robomme_interference_data.errors import InterferenceError, nearest
+from robomme_interference_data.errors import nearest
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_rank
+from robomme_interference_data.evaluate.score.columns import Codes, Rows
 from robomme_interference_data.evaluate.score.read import Batch, Source
 from robomme_interference_data.evaluate.systems import name_system
 
@@ -42,8 +41,6 @@ _SUCCESS = {True: 1, False: 0, None: 2}
 _EXPECTED = np.array([1, 0, 0, 2])  # success by status
 _WORDS: dict[Any, bool | None] = {"": None, "none": None, "nan": None}
 _WORDS |= dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
-
-Codes = NDArray[np.int64]
 
 
 def pack(**codes: Codes | int) -> NDArray[np.uint64]:
@@ -84,7 +81,7 @@ class Checker:
 
     def pack(self, batch: Batch, source: Source) -> tuple[NDArray[np.uint64], dict[int, str]]:
         """Return the packed rows, `REFUSED` for bad ones, and the reason for each bad row."""
-        rows = _Rows(batch)
+        rows = Rows(batch)
         default = None if "system" in source.columns else self._system
         codes = {
             "simulator": rows.text(
@@ -137,9 +134,11 @@ class Checker:
         return code
 
     def _named_system(self, value: Any) -> int:
+        if value in self.systems:
+            return self.systems.index(value)
         return self._named(self.systems, "system")(name_system(value or "").name)
 
-    def _seeds(self, rows: "_Rows") -> Codes:
+    def _seeds(self, rows: Rows) -> Codes:
         seeds = rows.number("model_seed", 2**62, default=0)
         values, place = np.unique(seeds, return_inverse=True)
         codes = np.zeros(len(values), np.int64)
@@ -151,13 +150,12 @@ class Checker:
         rows.refuse(codes[place] >= most, lambda row: f"more than {most:,} model seeds")
         return codes[place]
 
-    def _check_revisions(self, rows: "_Rows", simulator: Codes) -> None:
+    def _check_revisions(self, rows: Rows, simulator: Codes) -> None:
         revisions: list[str] = []
-        code = rows.text("revision", lambda v: _add(revisions, v or ""))
-        for pair in np.unique(simulator * len(revisions) + code).tolist():
-            number, place = divmod(pair, max(len(revisions), 1))
-            if number < 0 or not revisions[place]:
-                continue
+        code = rows.text("revision", lambda v: _revision(revisions, v))
+        sound = (simulator >= 0) & (code >= 0)
+        for pair in np.unique((simulator * max(len(revisions), 1) + code)[sound]).tolist():
+            number, place = divmod(pair, len(revisions))
             name = self.simulators[number]
             known = self.revisions.setdefault(name, revisions[place])
             if known != revisions[place]:
@@ -166,7 +164,7 @@ class Checker:
                     _beside(rows, known),
                 )
 
-    def _check_episodes(self, rows: "_Rows", codes: dict[str, Codes]) -> None:
+    def _check_episodes(self, rows: Rows, codes: dict[str, Codes]) -> None:
         """Hold seed and difficulty against what other rows of the same episode say."""
         difficulty = rows.text("difficulty", _difficulty, default="")
         difficulty = np.where(difficulty == _UNSAID, -1, difficulty)
@@ -183,14 +181,13 @@ class Checker:
             said = sound & (given >= 0)
             at = group[said], episode[said]
             before = known[at]
-            # Of several rows the first one counts: what is assigned last stays.
-            known[at[0][::-1], at[1][::-1]] = np.where(before >= 0, before, given[said])[::-1]
+            # Of several rows the first one counts: what is assigned last stays. Copies, because
+            # numpy walks through reversed views forwards.
+            last_first = tuple(place[::-1].copy() for place in at)
+            known[last_first] = np.where(before >= 0, before, given[said])[::-1].copy()
             wrong = np.zeros(len(episode), bool)
             wrong[said] = known[at] != given[said]
-            rows.refuse(
-                wrong,
-                _differs(rows, name),
-            )
+            rows.refuse(wrong, _differs(rows, name))
 
     def _grow(self, episode: int) -> None:
         groups, width = self.difficulty.shape
@@ -212,122 +209,22 @@ def episode_group(simulator: Any, family: Any, split: Any) -> Any:
     return (simulator * len(FAMILIES) + family) * len(SPLITS) + split
 
 
-class _Rows:
-    """The columns of a batch as codes, and the first reason against each bad row."""
-
-    def __init__(self, batch: Batch):
-        self.batch = batch
-        self.reasons: dict[int, str] = {}
-
-    def text(self, name: str, parse: Callable[[Any], int], default: Any = None) -> Codes:
-        """Return the code of each row's value, −1 where `parse` refuses it.
-
-        `parse` is asked once for each distinct value. `default` stands for a missing column.
-        """
-        column = self.batch.columns.get(name)
-        if column is None:
-            values = [default]
-            index: Codes = np.zeros(self.batch.rows, np.int64)
-        else:
-            if not pa.types.is_dictionary(column.type):
-                column = column.dictionary_encode()
-            values = [*column.dictionary.to_pylist(), None]
-            index = _numbers(column.indices, len(values) - 1)
-        codes = np.zeros(len(values), np.int64)
-        reasons = {}
-        for place in np.unique(index).tolist():
-            try:
-                codes[place] = parse(values[place])
-            except InterferenceError as error:
-                codes[place], reasons[place] = -1, f"{error.message}. {error.hint or ''}".strip()
-            except ValueError as error:
-                codes[place], reasons[place] = -1, str(error)
-        found = codes[index]
-        self.refuse(found < 0, lambda row: reasons[int(index[row])])
-        return found
-
-    def number(self, name: str, most: int, default: int | None = None) -> Codes:
-        """Return whole numbers from 0 to `most`, −1 where there is something else.
-
-        With a default that stands for a missing column and for an empty cell.
-        """
-        column = self.batch.columns.get(name)
-        if column is None:
-            return np.full(self.batch.rows, -1 if default is None else default, np.int64)
-        if pa.types.is_dictionary(column.type):
-            numbers = _whole(column.dictionary)
-            column = pc.take(numbers, column.indices)
-        elif not pa.types.is_int64(column.type):
-            column = _whole(column)
-        empty = self.batch.columns[name].is_null().to_numpy(zero_copy_only=False)
-        found = _numbers(column, -1)
-        found = np.where((found < 0) | (found > most), -1, found)
-        refused = found < 0
-        if default is not None:
-            found = np.where(empty, default, found)
-            refused &= ~empty
-        self.refuse(
-            refused,
-            lambda row: (
-                f"{name} {self.shown(name, row)}; expected a whole number from 0"
-                + (f" to {most}" if most < 2**31 else "")
-            ),
-        )
-        return found
-
-    def refuse(self, bad: NDArray[np.bool_], reason: Callable[[int], str]) -> None:
-        """Note why rows are bad, unless something else is known against them."""
-        for row in np.flatnonzero(bad).tolist():
-            if row not in self.reasons:
-                self.reasons[row] = reason(row)
-
-    def shown(self, name: str, row: int) -> str:
-        value = self.batch.columns[name][row].as_py()
-        return "(empty)" if value is None else repr(value)
-
-
-def _beside(rows: _Rows, known: str) -> Callable[[int], str]:
+def _beside(rows: Rows, known: str) -> Callable[[int], str]:
     return lambda row: (
         f"revision {rows.shown('revision', row)} beside {known!r}: rows of different splits do "
         "not mix"
     )
 
 
-def _differs(rows: _Rows, name: str) -> Callable[[int], str]:
+def _differs(rows: Rows, name: str) -> Callable[[int], str]:
     return lambda row: (
         f"{name} {rows.shown(name, row)} differs from that of other rows of the same episode"
     )
 
 
-def _numbers(array: Any, null: int) -> Codes:
-    """Return an Arrow array of whole numbers as numpy's, with a number for null.
-
-    `fill_null` would import pandas wherever that is installed, which takes seconds.
-    """
-    if not array.null_count:
-        return array.to_numpy().astype(np.int64, copy=False)
-    empty = array.is_null().to_numpy(zero_copy_only=False)
-    data = np.frombuffer(array.buffers()[1], array.type.to_pandas_dtype())
-    return np.where(empty, null, data[array.offset : array.offset + len(array)])
-
-
-def _whole(values: Any) -> Any:
-    """Read values as int64, null where one is no whole number."""
-    try:
-        return values.cast(pa.int64())
-    except pa.ArrowInvalid:
-        return pa.array([_whole_number(value) for value in values.to_pylist()], pa.int64())
-
-
-def _whole_number(value: Any) -> int | None:
-    try:
-        number = int(str(value))
-    except ValueError:
-        return None
-    return number if 0 <= number < 2**62 else None
-
-
-def _add(names: list[str], value: str) -> int:
+def _revision(names: list[str], value: str | None) -> int:
+    if not value:
+        raise ValueError("revision is empty")
     if value not in names:
         names.append(value)
     return names.index(value)

@@ -147,8 +147,7 @@ def _row(
     known = (one >= 0) & (other >= 0)
     gained = int((known & (one != SUCCESS) & (other == SUCCESS)).sum())
     lost = int((known & (one == SUCCESS) & (other != SUCCESS)).sum())
-    key = f"{a.simulator}/{a.system}/{b.system}/{condition}"
-    change: Interval = Resampler(values, key).intervals([difference(0, 1)])[0]
+    change: Interval = Resampler(values, a.simulator).intervals([difference(0, 1)])[0]
     return (
         *(len(values), float(values[:, 0].mean()), float(values[:, 1].mean())),
         *(change.value, change.low, change.high, gained, lost),

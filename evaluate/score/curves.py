@@ -7,7 +7,7 @@ from typing import Any
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.looks import INK, Look, looks_of, tidy
+from robomme_interference_data.evaluate.score.looks import INK, Look, inches, looks_of, tidy
 from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
 
@@ -30,13 +30,13 @@ class Data:
         self.all, self.families = mine(score.cells), mine(score.family_cells)
         self.difficulty = mine(score.difficulty_cells)
         self.systems = list(dict.fromkeys(system for system, _, _ in self.all))
-        self.conditions = sorted({c for _, c, _ in self.all}, key=condition_rank)
+        self.own_conditions = sorted({c for _, c, _ in self.all}, key=condition_rank)
         self.lift = [c for one in score.effects for c in one.lift if c.simulator == simulator]
         self.published: list[Published] = []
         if score.against_paper:
             self.published = [one for one in published() if one.simulator == simulator]
         shown = {one.condition for one in self.published} if self.published else set()
-        self.conditions = sorted({*self.conditions, *shown}, key=condition_rank)
+        self.conditions = sorted({*self.own_conditions, *shown}, key=condition_rank)
         self.bases = [b for s in self.systems if (b := base_of(s)) is not None]
         self.looks = looks_of([*self.systems, *(b for b in self.bases if b not in self.systems)])
 
@@ -76,14 +76,13 @@ def curve(
             low, high = cell.interval
             axes.plot((x, x), (100 * low, 100 * high), color=look.colour, linewidth=0.9, alpha=0.7)
         face = look.colour if cell.complete else "white"
-        size = 8 if look.marker == "*" else 4.5
-        axes.plot(x, y, look.marker, color=look.colour, markerfacecolor=face, markersize=size)
+        axes.plot(x, y, look.marker, color=look.colour, markerfacecolor=face, markersize=look.size)
     return ys[-1]
 
 
 def as_published(look: Look) -> Look:
     """Return the look of a published curve: hollow points, a loosely dotted line."""
-    return Look(f"{look.label}, published", look.colour, look.marker, (0, (4, 2)), 1.2)
+    return Look(f"{look.label}, published", look.colour, look.marker, (0, (4, 2)), 1.2, True)
 
 
 def published_curves(
@@ -123,11 +122,11 @@ def published_curves(
     return ends
 
 
-def set_axes(axes: Any, data: Data, ylabel: str) -> None:
+def set_axes(axes: Any, data: Data, conditions: Sequence[str], ylabel: str) -> None:
     """Name the conditions, start at zero, and take away what carries nothing."""
     tidy(axes)
-    places = [data.x(condition) for condition in data.conditions]
-    axes.set_xticks(places, [short(condition) for condition in data.conditions])
+    places = [data.x(condition) for condition in conditions]
+    axes.set_xticks(places, [short(condition) for condition in conditions])
     axes.set_xlim(places[0] - 0.4, places[-1] + 0.4)
     axes.set_ylim(0, min(max(axes.get_ylim()[1], 10), 103))
     if ylabel:
@@ -145,12 +144,14 @@ def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
             color=look.colour,
             marker=look.marker,
             linestyle=look.line,
-            markerfacecolor="white" if look.label.endswith("published") else look.colour,
-            markersize=8 if look.marker == "*" else 4.5,
+            markerfacecolor="white" if look.hollow else look.colour,
+            markersize=look.size,
+            linewidth=look.width,
         )
         for look in looks
     ]
-    columns = min(4, max(len(looks), 1))
+    widest = 0.7 + inches(max((look.label for look in looks), key=len))
+    columns = max(1, min(len(looks), int(figure.get_figwidth() / widest)))
     rows = -(-len(looks) // columns)
     height = (0.2 * rows + 0.3) / figure.get_figheight()
     figure.tight_layout(rect=(0, height, 1, 1))
@@ -161,6 +162,7 @@ def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
         ncols=columns,
         fontsize=8,
         frameon=False,
+        handlelength=3.2,  # long enough for a line's dashes to be seen
         bbox_to_anchor=(0.5, 0.16 / figure.get_figheight()),
     )
     if note:

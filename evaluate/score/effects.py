@@ -179,8 +179,7 @@ def effects_of(
         weights = slope_weights([condition_rank(c) for c in histories])
         statistics.append(slope(decaying, weights))
 
-    key = f"{one.simulator}/{one.system}"
-    intervals = iter(Resampler(columns.values, key, draws).intervals(statistics))
+    intervals = iter(Resampler(columns.values, one.simulator, draws).intervals(statistics))
     lift = [replace(found, change=next(intervals)) for found in lift]
     contrasts = [replace(found, change=next(intervals)) for found in contrasts]
     retained = {condition: next(intervals) for condition in kept}

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from robomme_interference_data.constants import FAMILIES
@@ -20,7 +21,7 @@ from robomme_interference_data.evaluate.score.curves import (
     short,
 )
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.looks import GREY, INK, label_ends, tidy
+from robomme_interference_data.evaluate.score.looks import GREY, INK, inches, label_ends, tidy
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.page import ink_on, open_figure, save_figure
 
@@ -71,8 +72,11 @@ def _success(figure: Any, data: Data) -> bool:
     few = len(data.systems) <= _FEW
     shown = [*data.systems, *(b for b in data.bases if b not in data.systems)]
     shifts = {system: shift for shift, system in dodged(shown)}
-    figure.set_size_inches(7.5, 4.2 if few else 5.4)
-    axes = figure.add_axes((0.085, 0.1, 0.63, 0.82))
+    labels = [data.looks[system].label for system in data.systems]
+    labels += [as_published(data.looks[base]).label for base in shown[len(data.systems) :]]
+    width, height, plot = 5.8 + inches(max(labels, key=len)), 4.2 if few else 5.4, 4.7
+    figure.set_size_inches(width, height)
+    axes = figure.add_axes((0.65 / width, 0.42 / height, plot / width, 1 - 0.8 / height))
     ends = [
         (curve(axes, data, data.all, system, "", shifts[system]), data.looks[system])
         for system in data.systems
@@ -80,10 +84,10 @@ def _success(figure: Any, data: Data) -> bool:
     # Beside many systems' own points the published ones would only clutter.
     beside = shifts if few else {b: shifts[b] for b in shown if b not in data.systems}
     ends += published_curves(axes, data, beside)
-    set_axes(axes, data, "success, %")
+    set_axes(axes, data, data.conditions, "success, %")
     ends = [end for end in ends if not math.isnan(end[0])]
     span = axes.get_ylim()[1]
-    label_ends(axes, data.x(data.conditions[-1]) + 0.42, ends, span * (0.05 if few else 0.04))
+    label_ends(axes, plot, ends, span * (0.05 if few else 0.04))
     axes.set_title(
         f"Success by condition, {data.simulator}, with 95% Wilson intervals",
         loc="left",
@@ -120,7 +124,8 @@ def _panels(
         for dodge, system in dodged(data.systems):
             curve(axes, data, cells, system, name, dodge, bars=bars)
     for axes, name in zip(panels, names, strict=False):
-        set_axes(axes, data, "success, %" if axes in panels[:: _columns(panels)] else "")
+        left = axes in panels[:: _columns(panels)]
+        set_axes(axes, data, data.own_conditions, "success, %" if left else "")
         axes.set_title(name, size=9, color=INK)
     for axes in panels[len(names) :]:
         axes.set_axis_off()
@@ -141,10 +146,10 @@ def _retention(figure: Any, data: Data) -> bool:
         (c for c in found if c.condition == last),
         key=lambda c: (c.complete, c.retention.value),
     )
-    figure.set_size_inches(7.5, 1.3 + 0.32 * len(found))
-    axes = figure.add_axes(
-        (0.29, 0.75 / figure.get_figheight(), 0.66, 1 - 1.2 / figure.get_figheight())
-    )
+    labels = [data.looks[c.system].label + ("" if c.complete else " † not ranked") for c in found]
+    left, height = 0.4 + inches(max(labels, key=len)), 1.3 + 0.32 * len(found)
+    figure.set_size_inches(left + 5.3, height)
+    axes = figure.add_axes((left / (left + 5.3), 0.75 / height, 5 / (left + 5.3), 1 - 1.2 / height))
     for place, contrast in enumerate(found):
         look, kept = data.looks[contrast.system], contrast.retention
         if not math.isnan(kept.low):
@@ -157,10 +162,7 @@ def _retention(figure: Any, data: Data) -> bool:
         axes.axvline(value, color=GREY, linewidth=0.8, linestyle=style, zorder=0)
     tidy(axes)
     axes.grid(visible=False)
-    axes.set_yticks(range(len(found)))
-    axes.set_yticklabels(
-        [data.looks[c.system].label + ("" if c.complete else " † not ranked") for c in found]
-    )
+    axes.set_yticks(range(len(found)), labels)
     axes.set_ylim(-0.6, len(found) - 0.4)
     axes.set_xlabel(
         f"({last} − no history) / (k0 − no history), with 95% BCa interval; 0 nothing left, 1 all",
@@ -175,11 +177,11 @@ def _heatmap(figure: Any, data: Data) -> bool:
     names = [name for name in FAMILIES if any(part == name for _, _, part in data.families)]
     wide = min(4, len(data.systems))
     rows = -(-len(data.systems) // wide)
-    figure.set_size_inches(1.3 + 2.1 * wide, 0.6 + (0.6 + 0.24 * len(names)) * rows)
+    figure.set_size_inches(1.3 + 1.65 * wide, 0.6 + (0.6 + 0.24 * len(names)) * rows)
     figure.set_layout_engine("constrained")
     panels = figure.subplots(rows, wide, sharey=True, squeeze=False)
     colours = _colour_map()
-    conditions = [c for c in data.conditions if any(c == condition for _, condition, _ in data.all)]
+    conditions = data.own_conditions
     highest = max(cell.rate for cell in data.families.values())
     for axes, system in zip(panels.flat, data.systems, strict=False):
         rates = [
@@ -203,7 +205,7 @@ def _heatmap(figure: Any, data: Data) -> bool:
         axes.set_yticks(range(len(names)), names, size=7)
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
-        axes.set_title(data.looks[system].label, size=8, color=INK)
+        axes.set_title(fill(data.looks[system].label, 26), size=8, color=INK)
     for axes in panels.flat[len(data.systems) :]:
         axes.set_axis_off()
     figure.suptitle(f"Success in %, {data.simulator}", size=9, color=INK)
@@ -228,7 +230,7 @@ def _retrieval(figure: Any, data: Data) -> bool:
         if not name:
             published_curves(axes, data, {base: 0 for base in shown if base not in data.systems})
     for axes, name in zip(panels, names, strict=False):
-        set_axes(axes, data, "success, %" if axes in panels[::5] else "")
+        set_axes(axes, data, data.conditions, "success, %" if axes in panels[::5] else "")
         axes.set_title(
             name or "All families", size=9, color=INK, weight="normal" if name else "bold"
         )

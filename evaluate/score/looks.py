@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
+from robomme_interference_data.evaluate.systems import SYSTEMS, System, display_name
 
-__all__ = ["GREY", "INK", "Look", "label_ends", "looks_of", "spread", "tidy"]
+__all__ = ["GREY", "INK", "Look", "inches", "label_ends", "looks_of", "spread", "tidy"]
 
 INK, GREY = "#222222", "#767676"
 
@@ -43,6 +43,7 @@ class Look:
         marker: matplotlib's marker.
         line: matplotlib's line style.
         width: Line width in points.
+        hollow: Whether points are white inside, as those of published rates are.
     """
 
     label: str
@@ -50,6 +51,12 @@ class Look:
     marker: str
     line: Any
     width: float = 1.6
+    hollow: bool = False
+
+    @property
+    def size(self) -> float:
+        """Size of its points."""
+        return 8 if self.marker == "*" else 4.5
 
 
 def looks_of(names: Sequence[str]) -> dict[str, Look]:
@@ -61,7 +68,7 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
         if system is not None and system.retrieval:
             looks[name] = Look(display_name(name), "#000000", "*", "-", 2.2)
         elif system is not None:
-            marker, line = _SHAPES.get(system.integration or "", (_OWN_SHAPES[own], "-"))
+            marker, line = _shape(system, _OWN_SHAPES[own])
             colour = _COLOURS.get(system.representation, _OWN[own])
             looks[name] = Look(system.display, colour, marker, line)
         else:
@@ -69,29 +76,52 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
     return looks
 
 
-def label_ends(
-    axes: Any, x: float, ends: Sequence[tuple[float, Look]], gap: float, size: float = 8
-) -> None:
-    """Write labels at the right ends of lines, moved apart to at least `gap` on the y axis."""
+def _shape(system: System, own: str) -> tuple[str, str]:
+    if not system.with_history:
+        return "v", "--"
+    return _SHAPES.get(system.integration or "", (own, "-"))
+
+
+def inches(text: str) -> float:
+    """Return about how wide a text of 8 points is."""
+    return 0.066 * len(text)
+
+
+def label_ends(axes: Any, width: float, ends: Sequence[tuple[float, Look]], gap: float) -> None:
+    """Write labels at the right ends of lines, moved apart to at least `gap` on the y axis.
+
+    Each stands behind the system's marker, in ink: not all colours can be read as letters.
+
+    Args:
+        axes: The axes, with their final limits.
+        width: Their width in inches.
+        ends: Where lines end on the y axis, and how they look.
+        gap: On the y axis.
+    """
     ordered = sorted(ends, key=lambda end: end[0])
     heights = spread([value for value, _ in ordered], gap)
+    places = axes.get_yaxis_transform()  # x in widths of the axes, y in data
     for (value, look), height in zip(ordered, heights, strict=True):
-        axes.annotate(
-            look.label,
-            (x, value),
-            (x + 0.22, height),
-            color=look.colour if look.colour != "#56B4E9" else "#2B86B8",  # enough contrast
-            size=size,
-            va="center",
-            annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-",
-                "color": look.colour,
-                "linewidth": 0.5,
-                "shrinkB": 0,
-                "relpos": (0, 0.5),
-            },
+        axes.plot(
+            (1, 1 + 0.15 / width),
+            (value, height),
+            color=look.colour,
+            linewidth=0.5,
+            clip_on=False,
+            transform=places,
         )
+        axes.plot(
+            1 + 0.23 / width,
+            height,
+            look.marker,
+            color=look.colour,
+            markerfacecolor="white" if look.hollow else look.colour,
+            markersize=look.size,
+            clip_on=False,
+            transform=places,
+        )
+        x = 1 + 0.33 / width
+        axes.text(x, height, look.label, color=INK, size=8, va="center", transform=places)
 
 
 def spread(values: Sequence[float], gap: float) -> list[float]:

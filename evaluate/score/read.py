@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.log import (
     CSV_NAME,
     LOG_NAME,
@@ -109,8 +109,14 @@ def find_sources(paths: Sequence[Path], with_system: bool = False) -> list[Sourc
     Raises:
         MissingFileError: There is no such file, or a folder holds no rows.
         FormatError: A file cannot be read, or lacks columns.
+        InvalidOptionError: A file is given twice.
     """
-    return [_source(path, with_system) for path in paths]
+    sources = [_source(path, with_system) for path in paths]
+    files = [source.path.resolve() for source in sources]
+    for place, source in enumerate(sources):
+        if files[place] in files[:place]:
+            raise InvalidOptionError(f"{source.path} is given twice", "Give each file once.")
+    return sources
 
 
 def _source(path: Path, with_system: bool) -> Source:

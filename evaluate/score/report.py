@@ -13,6 +13,7 @@ from typing import Any
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.rows import condition_rank
 from robomme_interference_data.evaluate.score.bootstrap import DRAWS
+from robomme_interference_data.evaluate.score.cells import MainGrid, main_grids, main_note
 from robomme_interference_data.evaluate.score.episodes import episode_rows
 from robomme_interference_data.evaluate.score.figures import FIGURES
 from robomme_interference_data.evaluate.score.grid import Grid
@@ -63,6 +64,8 @@ def write_report(score: Score, figures: Mapping[str, Path], out: Path) -> None:
     )
     html = environment.from_string(template.read_text(encoding="utf-8")).render(
         simulators=[{"name": s, "headline": headline(score, s)} for s in score.expected],
+        grids=[_grid(grid) for grid in main_grids(score.cells)],
+        note=main_note(score.cells),
         tables=[_table(table) for table in score.tables.values()],
         figures=[_figure(name, path) for name, path in figures.items()],
         conditions=_conditions(score),
@@ -73,6 +76,15 @@ def write_report(score: Score, figures: Mapping[str, Path], out: Path) -> None:
     )
     with atomic_path(out) as partial:
         partial.write_text(html, encoding="utf-8", newline="\n")
+
+
+def _grid(grid: MainGrid) -> dict[str, Any]:
+    """Return the main table of a simulator: of each cell its text, and whether it is the best."""
+    rows = [
+        (system, [(text.replace("**", ""), text.startswith("**")) for text in shown])
+        for system, shown in grid.rows
+    ]
+    return {"simulator": grid.simulator, "conditions": grid.conditions, "rows": rows}
 
 
 def _table(table: Table) -> dict[str, Any]:
@@ -112,6 +124,9 @@ def _figure(name: str, path: Path) -> dict[str, str]:
     return {
         "name": name,
         "title": f"{FIGURES[kind]}, {simulator}",
+        "note": "†: the cell is not complete."
+        if kind == "heatmap"
+        else "Hollow points: published rates, or cells that are not complete.",
         "source": f"data:image/svg+xml;base64,{data}",
     }
 
@@ -164,7 +179,7 @@ def _facts(score: Score) -> list[tuple[str, str]]:
         ),
         ("rows", f"{len(rollouts.packed):,}"),
         ("episodes of a complete cell", _GRIDS[score.grid]),
-        ("bootstrap", f"{DRAWS:,} draws, seeded by simulator and system, clustered by episode"),
+        ("bootstrap", f"{DRAWS:,} draws, seeded by the simulator, clustered by episode"),
     ]
     if len(rollouts.model_seeds) > 1:
         facts.append(("model seeds", ", ".join(map(str, rollouts.model_seeds[:20]))))

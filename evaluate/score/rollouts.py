@@ -1,7 +1,7 @@
 """All rows of a scoring, checked, eight bytes each."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.score.check import (
     field,
     pack,
 )
-from robomme_interference_data.evaluate.score.read import Source, find_sources, read_batches
+from robomme_interference_data.evaluate.score.read import Batch, Source, find_sources, read_batches
 from robomme_interference_data.evaluate.systems import SYSTEMS
 
 __all__ = ["Refusal", "Rollouts", "read_rollouts"]
@@ -89,7 +89,7 @@ class _Reader:
     def __init__(self, lenient: bool):
         self.lenient = lenient
         self.chunks: list[NDArray[np.uint64]] = []
-        self.starts: list[tuple[int, Path, int]] = []  # row number, its file, its line
+        self.starts: list[tuple[int, Path, Batch]] = []  # row number, its file, its batch
         self.refusals: list[Refusal] = []
         self.refused = 0
         self.videos: list[tuple[int, Path]] = []
@@ -105,13 +105,23 @@ class _Reader:
                 line = batch.line(row) if len(self.refusals) < _SHOWN else 0
                 self.refuse(source.path, line, reasons[row])
             self.give_up_if_strict()
-            self.starts.append((self.rows, source.path, batch.first))
+            self.starts.append((self.rows, source.path, replace(batch, columns={})))
             if "video" in batch.columns and source.folder is not None:
                 video = batch.columns["video"]
                 for row in np.flatnonzero(video.is_valid().to_numpy(zero_copy_only=False)).tolist():
                     self.videos.append((self.rows + row, source.folder / video[row].as_py()))
             self.chunks.append(packed)
             self.rows += batch.rows
+
+    def joined(self) -> NDArray[np.uint64]:
+        """Return all rows in one array; the chunks go as they are copied."""
+        packed, start = np.empty(self.rows, np.uint64), 0
+        self.chunks.reverse()
+        while self.chunks:
+            chunk = self.chunks.pop()
+            packed[start : start + len(chunk)] = chunk
+            start += len(chunk)
+        return packed
 
     def refuse(self, path: Path, line: int, reason: str) -> None:
         self.refused += 1
@@ -124,24 +134,25 @@ class _Reader:
             lines = [str(refusal) for refusal in self.refusals]
             lines += [f"… and {more:,} more so far"] if more else []
             raise BadRowsError(
-                "\n".join([f"{self.refused:,} bad rows:", *lines]),
+                "\n".join([f"{self.refused:,} bad row{'s' * (self.refused > 1)}:", *lines]),
                 "Mend them, or leave them out with --lenient.",
             )
 
     def where(self, row: int) -> tuple[Path, int]:
-        """Return file and line of a row by its number; exact where nothing was malformed."""
+        """Return file and line of a row by its number."""
         place = np.searchsorted([start for start, _, _ in self.starts], row, side="right") - 1
-        start, path, line = self.starts[int(place)]
-        return path, line + row - start
+        start, path, batch = self.starts[int(place)]
+        return path, batch.line(row - start)
 
     def refuse_duplicates(self, packed: NDArray[np.uint64]) -> NDArray[np.uint64]:
         """Return the rows, sorted, of each rollout only the first that was read."""
         ordered = np.sort(packed)
-        keys = ordered >> _STATUS_BITS
-        twice = keys[1:] == keys[:-1]
-        twice &= ordered[1:] != REFUSED
-        if not twice.any():
-            return ordered[ordered != REFUSED]
+        ordered = ordered[: np.searchsorted(ordered, REFUSED)]
+        if not any(
+            (np.diff(ordered[start : start + _STEP + 1] >> _STATUS_BITS) == 0).any()
+            for start in range(0, len(ordered), _STEP)
+        ):
+            return ordered
         keys = packed >> _STATUS_BITS
         order = np.argsort(keys, kind="stable")
         keys = keys[order]
@@ -162,7 +173,7 @@ def read_rollouts(
 ) -> Rollouts:
     """Read rows from files and folders of runs, and check each of them.
 
-    Memory grows by 8 bytes a row, three times that while rows are sorted.
+    Memory grows by 8 bytes a row, twice that while rows are sorted.
 
     Args:
         paths: Folders of runs, CSVs and parquet files.
@@ -180,14 +191,13 @@ def read_rollouts(
     checker, reader = Checker(system), _Reader(lenient)
     for source in sources:
         reader.read(source, checker)
-    packed = np.concatenate(reader.chunks) if reader.chunks else np.zeros(0, np.uint64)
-    reader.chunks.clear()
+    packed = reader.joined()
     orders = {
         "simulator": _ranks(checker.simulators, lambda name: name),
         "system": _ranks(checker.systems, _table_order),
         "model_seed": _ranks(checker.model_seeds, lambda seed: seed),
     }
-    packed = _recode(packed, orders)
+    _recode(packed, orders)
     videos = {int(packed[row] >> _STATUS_BITS): path for row, path in reader.videos}
     packed = reader.refuse_duplicates(packed)
     by_name = np.argsort(orders["simulator"])
@@ -230,18 +240,14 @@ def _regrouped[T: np.generic](known: NDArray[T], order: NDArray[np.int64]) -> ND
     return known.reshape(len(order), -1, known.shape[1])[order].reshape(known.shape)
 
 
-def _recode(
-    packed: NDArray[np.uint64], ranks: Mapping[str, NDArray[np.int64]]
-) -> NDArray[np.uint64]:
+def _recode(packed: NDArray[np.uint64], ranks: Mapping[str, NDArray[np.int64]]) -> None:
     """Replace codes in reading order by ranks, so that the order of files makes no difference."""
     changed = {name: rank for name, rank in ranks.items() if (np.diff(rank) != 1).any()}
     if not changed:
-        return packed
-    result = packed.copy()
+        return
     for start in range(0, len(packed), _STEP):
         part = packed[start : start + _STEP]
         sound = part != REFUSED
         codes = {name: field(part[sound], name) for name in BITS}
         codes |= {name: rank[codes[name]] for name, rank in changed.items()}
-        result[start : start + _STEP][sound] = pack(**codes)
-    return result
+        part[sound] = pack(**codes)

@@ -84,6 +84,11 @@ def score(
         BadRowsError: Rows are bad (see `read_rollouts`), or there are none.
     """
     rollouts = read_rollouts(paths, system, lenient)
+    if not len(rollouts.packed) and rollouts.refused:
+        raise BadRowsError(
+            f"all {rollouts.refused:,} rows are bad; the first is {rollouts.refusals[0]}",
+            "Mend them: without any row there is nothing to score.",
+        )
     if not len(rollouts.packed):
         raise BadRowsError(
             f"no rows to score in {', '.join(map(str, paths))}",
