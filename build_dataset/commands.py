@@ -1,28 +1,21 @@
 """Commands that make splits: `build …`."""
 
-import json
 import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from robomme_interference_data.constants import (
-    DEFAULT_K,
     DEMONSTRATIONS,
     DISTRACTORS,
     MANIFESTS,
     POSITION_LIMIT,
 )
-from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.progress import MESSAGES
 
 if TYPE_CHECKING:
-    from robomme_interference_data.build_dataset.build import Filters, Settings
-    from robomme_interference_data.build_dataset.sources import Source
+    pass
 
 __all__ = ["app"]
 
@@ -125,10 +118,12 @@ def demonstrations(
 
     Stopped with Ctrl-C, or killed, a build goes on where it was when the command is run again.
     """
+    from robomme_interference_data.build_dataset.steps import build_one
+
     filters = (families, split, episodes)
     settings = (codec, cameras, version, workers, time_limit)
     opening = (columns, families_file, robomme_python)
-    _build(DEMONSTRATIONS, source, out, filters, settings, opening, as_json=as_json)
+    build_one(DEMONSTRATIONS, source, out, filters, settings, opening, as_json=as_json)
 
 
 @app.command()
@@ -151,10 +146,12 @@ def distractors(
 
     Episodes of fewer than 249 raw frames yield no unit; they are listed in meta/build_report.json.
     """
+    from robomme_interference_data.build_dataset.steps import build_one
+
     filters = (families, split, episodes)
     settings = (codec, cameras, version, workers, time_limit)
     opening = (columns, families_file, None)
-    _build(DISTRACTORS, source, out, filters, settings, opening, as_json=as_json)
+    build_one(DISTRACTORS, source, out, filters, settings, opening, as_json=as_json)
 
 
 @app.command()
@@ -168,7 +165,9 @@ def manifests(
     as_json: AsJson = False,
 ) -> None:
     """Plan the history buffers of all query episodes: the same inputs give the same bytes."""
-    _manifests(demonstrations, distractors, out, k, seed, position_limit, as_json=as_json)
+    from robomme_interference_data.build_dataset.steps import plan_buffers
+
+    plan_buffers(demonstrations, distractors, out, k, seed, position_limit, as_json=as_json)
 
 
 @app.command(name="all")
@@ -196,15 +195,21 @@ def build_all(
     families_file: FamiliesFile = None,
 ) -> None:
     """Build demonstrations, distractors and manifests from the same sources."""
+    from robomme_interference_data.build_dataset.steps import (
+        build_one,
+        check_simulators,
+        plan_buffers,
+    )
+
     settings = (codec, cameras, version, workers, time_limit)
     opening = (columns, families_file, None)
-    _check_simulators(DISTRACTORS, source)  # before the demonstrations are played
+    check_simulators(DISTRACTORS, source)  # before the demonstrations are played
     for kind, filters in (
         (DEMONSTRATIONS, (families, split, episodes)),
         (DISTRACTORS, (None, "train", None)),
     ):
-        _build(kind, source, out / kind, filters, settings, opening, as_json=False)
-    _manifests(
+        build_one(kind, source, out / kind, filters, settings, opening, as_json=False)
+    plan_buffers(
         out / DEMONSTRATIONS,
         out / DISTRACTORS,
         out / MANIFESTS,
@@ -232,191 +237,3 @@ def sample(
         for _ in write_sample(out, train=train, test=test):
             progress.advance(1)
     MESSAGES.print(f"Next: robomme-interference build all --source frames:{out} --out my-split")
-
-
-def _build(
-    kind: str,
-    source: list[str],
-    out: Path,
-    filters: tuple[str | None, str | None, str | None],
-    settings: tuple[str, str | None, str, int, float],
-    opening: tuple[str | None, Path | None, str | None],
-    *,
-    as_json: bool,
-) -> None:
-    from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
-    from robomme_interference_data.build_dataset.encode import get_codec
-    from robomme_interference_data.build_dataset.plan import parse_ranges
-    from robomme_interference_data.build_dataset.sources import open_source
-    from robomme_interference_data.progress import BuildProgress
-    from robomme_interference_data.simulators.registry import SIMULATORS
-
-    families, split, episodes = filters
-    codec, cameras, version, workers, time_limit = settings
-    columns, families_file, robomme_python = opening
-    _check_simulators(kind, source)
-    chosen = Settings(
-        codec=get_codec(codec),
-        cameras=_names(cameras),
-        version=version,
-        workers=workers,
-        time_limit=time_limit,
-    )
-    wanted = Filters(
-        families=_names(families),
-        split=split,
-        numbers=parse_ranges(episodes) if episodes is not None else None,
-    )
-    recordings = out.parent / f".{out.name}.recordings"
-    with _resumable():
-        opened = []
-        for text in source:
-            if text in SIMULATORS:
-                played = _record(text, kind, out, recordings, wanted, chosen, robomme_python)
-                if played is None:
-                    MESSAGES.print(f"{out}: was built before")
-                    return
-                opened.append(played)
-            else:
-                opened.append(
-                    open_source(text, columns=_column_map(columns), families_file=families_file)
-                )
-        with BuildProgress() as progress:
-            result = build_dataset(kind, opened, out, wanted, chosen, progress)
-    shutil.rmtree(recordings, ignore_errors=True)
-    if as_json:
-        _print_json(
-            {
-                "out": str(result.out),
-                "episodes": result.episodes,
-                "frames": result.frames,
-                "skipped": [vars(item) for item in result.skipped],
-                "existed": result.existed,
-            }
-        )
-        return
-    done = "was built before" if result.existed else "built"
-    MESSAGES.print(f"{out}: {done}, {result.episodes} episodes, {result.frames:,} frames")
-    for item in result.skipped[:10]:
-        MESSAGES.print(f"  left out {item.episode_id}: {item.reason}")
-    if len(result.skipped) > 10:
-        MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/meta/build_report.json")
-
-
-def _check_simulators(kind: str, source: list[str]) -> None:
-    """Refuse simulators among the sources that cannot play what is wanted."""
-    from robomme_interference_data.build_dataset.record import check_playable
-    from robomme_interference_data.simulators.registry import SIMULATORS
-
-    for text in source:
-        if text in SIMULATORS:
-            check_playable(text, kind)
-
-
-def _record(
-    simulator: str,
-    kind: str,
-    out: Path,
-    recordings: Path,
-    wanted: "Filters",
-    settings: "Settings",
-    robomme_python: str | None,
-) -> "Source | None":
-    """Play the wanted episodes of a simulator; None if the dataset of them is there already."""
-    from robomme_interference_data.build_dataset.record import (
-        RecordedSource,
-        cameras_to_draw,
-        check_unbuilt,
-        list_episodes,
-        record_episodes,
-    )
-    from robomme_interference_data.progress import BuildProgress
-    from robomme_interference_data.simulators.registry import make_simulator
-
-    options: dict[str, Any] = {"cameras": cameras_to_draw(settings.cameras)}
-    # What is recorded with other cameras is not taken for these.
-    folder = recordings / "-".join((simulator, *options["cameras"]))
-    episodes = list_episodes(simulator, wanted.families, wanted.split, wanted.numbers)
-    if not check_unbuilt(out, kind, episodes):
-        return None
-    if simulator == "robomme":
-        options["python"] = robomme_python
-        make_simulator(simulator, **options).close()  # one error now, or one for each episode
-    with BuildProgress(unit="episodes") as progress:
-        progress.start(f"Playing on {simulator}", len(episodes))
-        for _ in record_episodes(
-            simulator,
-            episodes,
-            folder,
-            live=kind == DISTRACTORS,
-            options=options,
-            workers=settings.workers,
-            time_limit=settings.time_limit,
-        ):
-            progress.advance(1)
-    return RecordedSource(folder, simulator)
-
-
-def _manifests(
-    demonstrations: Path,
-    distractors: Path,
-    out: Path,
-    k: list[int] | None,
-    seed: int,
-    position_limit: str,
-    *,
-    as_json: bool,
-) -> None:
-    from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-    from robomme_interference_data.dataset import Dataset
-    from robomme_interference_data.files import LocalFiles, read_json
-    from robomme_interference_data.progress import BuildProgress
-
-    queries = Dataset(LocalFiles(demonstrations))
-    units = Dataset(LocalFiles(distractors))
-    plan = plan_manifests(queries, units, k or DEFAULT_K, seed, _limit(position_limit))
-    with BuildProgress(unit="queries") as progress:
-        progress.start("Planning buffers", len(queries))
-        for done in write_manifests(plan, out):
-            progress.advance(done)
-    counts = read_json(out / "manifest.json")["counts"]
-    if as_json:
-        _print_json({"out": str(out), **counts})
-    else:
-        MESSAGES.print(f"{out}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
-
-
-def _limit(text: str) -> int | None:
-    if text == "none":
-        return None
-    if not text.isdecimal() or int(text) == 0:
-        raise InvalidOptionError(f"--position-limit {text!r}; expected a positive number or none")
-    return int(text)
-
-
-def _names(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(part.strip() for part in text.split(","))
-
-
-def _column_map(text: str | None) -> dict[str, str] | None:
-    if text is None:
-        return None
-    pairs = [part.partition("=") for part in text.split(",")]
-    if not all(name and equals and column for name, equals, column in pairs):
-        raise InvalidOptionError(
-            f"--columns {text!r} is not NAME=COLUMN,…", "For example: --columns front=image"
-        )
-    return {name.strip(): column.strip() for name, _, column in pairs}
-
-
-@contextmanager
-def _resumable() -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        MESSAGES.print("Stopped. Finished episodes are kept: run the same command again to go on.")
-        raise typer.Exit(130) from None
-
-
-def _print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
