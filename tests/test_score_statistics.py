@@ -10,7 +10,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.evaluate.score.bootstrap import (
+from robomme_interference_data.bootstrap import (
     Resampler,
     Statistic,
     difference,
@@ -210,5 +210,5 @@ def test_the_same_key_gives_the_same_interval_and_the_order_of_episodes_none_oth
 def test_draws_in_chunks_are_the_same_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     statistics = [difference(0, 1), retention(0, 1, 3)]
     whole = Resampler(outcomes(), "x", 500).intervals(statistics)
-    monkeypatch.setattr("robomme_interference_data.evaluate.score.bootstrap._CHUNK", 160)
+    monkeypatch.setattr("robomme_interference_data.bootstrap._CHUNK", 160)
     assert Resampler(outcomes(), "x", 500).intervals(statistics) == whole

@@ -1,4 +1,4 @@
-"""Bootstrap intervals for what is computed from the same episodes under several conditions."""
+"""Bootstrap intervals for what is computed from episodes, under one condition or several."""
 
 import hashlib
 import math
@@ -9,7 +9,16 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DRAWS", "Interval", "Resampler", "Statistic", "difference", "retention", "slope"]
+__all__ = [
+    "DRAWS",
+    "Interval",
+    "Resampler",
+    "Statistic",
+    "difference",
+    "mean",
+    "retention",
+    "slope",
+]
 
 DRAWS = 10_000
 _CHUNK = 4_000_000  # whole numbers drawn at a time: 32 MB
@@ -51,6 +60,11 @@ def _together(columns: Sequence[int]) -> Callable[[Floats], Floats]:
         return chosen
 
     return features
+
+
+def mean(column: int) -> Statistic:
+    """Return the mean of a column, over the episodes that have it."""
+    return Statistic(_together((column,)), lambda s: s[:, 0] / s[:, 1])
 
 
 def difference(first: int, second: int) -> Statistic:
