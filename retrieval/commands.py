@@ -61,10 +61,10 @@ def index(
 
     roots = datasets_in(data)
     made = make_encoder(encoder, device=device, batch=batch)
+    if threads is None:
+        threads = os.cpu_count() or 1
     with BuildProgress(quiet=as_json) as progress:
-        reports = build_index(
-            roots, made, progress, camera=camera, threads=threads or os.cpu_count() or 1
-        )
+        reports = build_index(roots, made, progress, camera=camera, threads=threads)
     if as_json:
         rows = [
             {

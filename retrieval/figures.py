@@ -156,10 +156,10 @@ def _distributions(axes: Any, found: Calibration, own: float) -> None:
     axes.axvspan(*between, color="#eeeeee", zorder=0, label="between the percentiles")
     _thresholds(axes, found, own)
     if found.held_out:
-        values = [one.threshold for one in found.held_out]
+        fitted = [one.threshold for one in found.held_out]
         axes.plot(
-            values,
-            [50] * len(values),
+            fitted,
+            [50] * len(fitted),
             "|",
             color=_PURITY,
             markersize=9,
@@ -190,8 +190,8 @@ def _sweep(axes: Any, found: Calibration, own: float) -> None:
                 label=f"{share} at k{k}" if last else None,
             )
     axes.axhline(100 * PASS_MARK, color=GREY, linewidth=0.9, linestyle=":", zorder=0)
-    first, last = found.sweep[0].threshold, found.sweep[-1].threshold
-    _thresholds(axes, found, own, (first - 0.01, last + 0.01))
+    limits = (found.sweep[0].threshold - 0.01, found.sweep[-1].threshold + 0.01)
+    _thresholds(axes, found, own, limits)
     axes.set_ylim(-4, 104)
     axes.set_xlabel("threshold (thin lines: smaller k)", size=8, color=INK)
     axes.set_ylabel("mean over queries, %", size=8, color=INK)

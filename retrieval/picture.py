@@ -53,7 +53,7 @@ def draw_retrieval(buffer: Buffer, choice: Choice, grade: Grade, encoder: str, o
     found = reasons(buffer, choice, grade)
     colors = session_colors(buffer.sessions)
     with open_page(out, _WIDTH) as page:
-        page.height = 6.05
+        page.height = 6.1
         page.figure.set_size_inches(_WIDTH, page.height)
         top = _head(page, buffer, found, encoder)
         top = _strip(page, buffer, choice, colors, camera, top)
@@ -246,7 +246,7 @@ def _compared(
         image = buffer.frame(frame, camera)
         pictures.append((title, image, colors[int(session[frame])], below))
 
-    add("closest frame: its segment is chosen", found.closest, found.cosine)
+    add("closest frame that was chosen", found.closest, found.cosine)
     if found.other is not None and found.other_cosine is not None:
         add("closest frame outside", found.other, found.other_cosine)
     step = _SPAN / 3

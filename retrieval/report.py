@@ -243,7 +243,7 @@ def calibration_text(found: Calibration, rule: str, own: float, title: str) -> s
     parts = ["\n".join(lines)]
     if found.held_out:
         values = [one.threshold for one in found.held_out]
-        columns = (
+        columns: tuple[Column, ...] = (
             Column("left_out"),
             Column("threshold", "ratio"),
             Column("purity", "rate"),

@@ -7,7 +7,7 @@ true sessions are known to `oracle` alone, which is there to compare with.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ __all__ = [
     "pick",
 ]
 
-ADAPTIVE = "adaptive"
+ADAPTIVE: Final = "adaptive"
 
 
 @dataclass(frozen=True, eq=False)
