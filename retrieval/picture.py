@@ -242,7 +242,7 @@ def _compared(
 
     def add(title: str, frame: int, cosine: float) -> None:
         one = buffer.sessions[int(session[frame])]
-        below = f"frame {frame}, cosine {cosine:.4f}", f"{one.role} {one.source}"
+        below = f"frame {frame}, cosine {cosine:.3f}", f"{one.role} {one.source}"
         image = buffer.frame(frame, camera)
         pictures.append((title, image, colors[int(session[frame])], below))
 

@@ -187,10 +187,10 @@ class Reasons:
             f"{one.episode_id} at k={one.k}, rule {one.rule}: {one.history_frames} history frames, "
             f"cut into {parts} where the cosine of adjacent frames is below {one.threshold:.3f}",
             f"Chosen: frames {one.start} to {one.stop - 1}, of {', '.join(self.sessions)}",
-            f"Why: frame {self.closest} has cosine {self.cosine:.4f} with what the robot sees now"
+            f"Why: frame {self.closest} has cosine {self.cosine:.3f} with what the robot sees now"
             + (
                 f"; the closest one outside is frame {self.other} of {self.other_source}, "
-                f"{self.other_cosine:.4f}"
+                f"{self.other_cosine:.3f}"
                 if self.other is not None
                 else "; nothing lies outside"
             ),
