@@ -55,7 +55,7 @@ Sources = Annotated[
     typer.Option(
         "--source",
         help="KIND:LOCATION, with kind robomme-h5, lerobot or frames, or the name of a simulator: "
-        "tabletop; may be given several times.",
+        "tabletop, or, for demonstrations, robomme; may be given several times.",
     ),
 ]
 Families = Annotated[
@@ -84,6 +84,10 @@ Columns = Annotated[
 ]
 FamiliesFile = Annotated[
     Path | None, typer.Option(help="lerobot sources: file that names each episode's family.")
+]
+RoboMMEPython = Annotated[
+    str | None,
+    typer.Option(help="Source robomme: interpreter that has RoboMME.", envvar="ROBOMME_PYTHON"),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 K = Annotated[
@@ -114,6 +118,7 @@ def demonstrations(
     time_limit: TimeLimit = _TIME_LIMIT,
     columns: Columns = None,
     families_file: FamiliesFile = None,
+    robomme_python: RoboMMEPython = None,
     as_json: AsJson = False,
 ) -> None:
     """Build the query episodes' demonstrations, each with its first live observation at the end.
@@ -122,9 +127,8 @@ def demonstrations(
     """
     filters = (families, split, episodes)
     settings = (codec, cameras, version, workers, time_limit)
-    _build(
-        DEMONSTRATIONS, source, out, filters, settings, (columns, families_file), as_json=as_json
-    )
+    opening = (columns, families_file, robomme_python)
+    _build(DEMONSTRATIONS, source, out, filters, settings, opening, as_json=as_json)
 
 
 @app.command()
@@ -149,7 +153,8 @@ def distractors(
     """
     filters = (families, split, episodes)
     settings = (codec, cameras, version, workers, time_limit)
-    _build(DISTRACTORS, source, out, filters, settings, (columns, families_file), as_json=as_json)
+    opening = (columns, families_file, None)
+    _build(DISTRACTORS, source, out, filters, settings, opening, as_json=as_json)
 
 
 @app.command()
@@ -192,7 +197,8 @@ def build_all(
 ) -> None:
     """Build demonstrations, distractors and manifests from the same sources."""
     settings = (codec, cameras, version, workers, time_limit)
-    opening = (columns, families_file)
+    opening = (columns, families_file, None)
+    _check_simulators(DISTRACTORS, source)  # before the demonstrations are played
     for kind, filters in (
         (DEMONSTRATIONS, (families, split, episodes)),
         (DISTRACTORS, (None, "train", None)),
@@ -234,7 +240,7 @@ def _build(
     out: Path,
     filters: tuple[str | None, str | None, str | None],
     settings: tuple[str, str | None, str, int, float],
-    opening: tuple[str | None, Path | None],
+    opening: tuple[str | None, Path | None, str | None],
     *,
     as_json: bool,
 ) -> None:
@@ -247,7 +253,8 @@ def _build(
 
     families, split, episodes = filters
     codec, cameras, version, workers, time_limit = settings
-    columns, families_file = opening
+    columns, families_file, robomme_python = opening
+    _check_simulators(kind, source)
     chosen = Settings(
         codec=get_codec(codec),
         cameras=_names(cameras),
@@ -265,7 +272,7 @@ def _build(
         opened = []
         for text in source:
             if text in SIMULATORS:
-                played = _record(text, kind, out, recordings / text, wanted, chosen)
+                played = _record(text, kind, out, recordings, wanted, chosen, robomme_python)
                 if played is None:
                     MESSAGES.print(f"{out}: was built before")
                     return
@@ -296,31 +303,45 @@ def _build(
         MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/meta/build_report.json")
 
 
+def _check_simulators(kind: str, source: list[str]) -> None:
+    """Refuse simulators among the sources that cannot play what is wanted."""
+    from robomme_interference_data.build_dataset.record import check_playable
+    from robomme_interference_data.simulators.registry import SIMULATORS
+
+    for text in source:
+        if text in SIMULATORS:
+            check_playable(text, kind)
+
+
 def _record(
     simulator: str,
     kind: str,
     out: Path,
-    folder: Path,
+    recordings: Path,
     wanted: "Filters",
     settings: "Settings",
+    robomme_python: str | None,
 ) -> "Source | None":
     """Play the wanted episodes of a simulator; None if the dataset of them is there already."""
     from robomme_interference_data.build_dataset.record import (
         RecordedSource,
+        cameras_to_draw,
         check_unbuilt,
+        list_episodes,
         record_episodes,
     )
     from robomme_interference_data.progress import BuildProgress
-    from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+    from robomme_interference_data.simulators.registry import make_simulator
 
-    episodes = [
-        episode
-        for family in wanted.families or (None,)
-        for episode in episode_ids(family, wanted.split)
-        if wanted.numbers is None or episode.index in wanted.numbers
-    ]
+    options: dict[str, Any] = {"cameras": cameras_to_draw(settings.cameras)}
+    # What is recorded with other cameras is not taken for these.
+    folder = recordings / "-".join((simulator, *options["cameras"]))
+    episodes = list_episodes(simulator, wanted.families, wanted.split, wanted.numbers)
     if not check_unbuilt(out, kind, episodes):
         return None
+    if simulator == "robomme":
+        options["python"] = robomme_python
+        make_simulator(simulator, **options).close()  # one error now, or one for each episode
     with BuildProgress(unit="episodes") as progress:
         progress.start(f"Playing on {simulator}", len(episodes))
         for _ in record_episodes(
@@ -328,6 +349,7 @@ def _record(
             episodes,
             folder,
             live=kind == DISTRACTORS,
+            options=options,
             workers=settings.workers,
             time_limit=settings.time_limit,
         ):

@@ -1,11 +1,11 @@
-"""Record episodes of a simulator in the `frames` layout: `--source tabletop`.
+"""Record episodes of a simulator in the `frames` layout: `--source tabletop`, `--source robomme`.
 
 Every episode is played in a worker process that may hang or die; one that is recorded is not
 played again. A recording is lossless, and the same on every machine that renders the same.
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,35 @@ import pyarrow.parquet as pq
 from robomme_interference_data.build_dataset.encode import RECORDING, VideoEncoder
 from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.build_dataset.sources.frames import FramesSource
-from robomme_interference_data.constants import FPS, IDENTITY_PATH, REPORT_PATH
+from robomme_interference_data.constants import (
+    DISTRACTORS,
+    FAMILIES,
+    FPS,
+    IDENTITY_PATH,
+    REPORT_PATH,
+)
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.errors import BuildError
+from robomme_interference_data.errors import (
+    BuildError,
+    InvalidOptionError,
+    UnknownNameError,
+    nearest,
+)
 from robomme_interference_data.files import LocalFiles, atomic_path, read_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.base import EpisodeInfo, Simulator, Status
+from robomme_interference_data.simulators.base import CAMERAS, EpisodeInfo, Simulator, Status
 from robomme_interference_data.simulators.registry import own_simulator
+from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 from robomme_interference_data.workers import run_tasks
 
-__all__ = ["RecordedSource", "check_unbuilt", "record_episodes"]
+__all__ = [
+    "RecordedSource",
+    "cameras_to_draw",
+    "check_playable",
+    "check_unbuilt",
+    "list_episodes",
+    "record_episodes",
+]
 
 _PARTS = "parts"
 _TABLE = "frames.parquet"
@@ -60,12 +79,83 @@ class RecordedSource(FramesSource):
         self.provenance = {"kind": simulator}
 
 
+def check_playable(simulator: str, kind: str) -> None:
+    """Check that a simulator can play what a dataset of a kind needs.
+
+    Raises:
+        InvalidOptionError: Distractor units are wanted of RoboMME: they come from whole training
+            episodes, and it has no policy that would play them.
+    """
+    if simulator == "robomme" and kind == DISTRACTORS:
+        raise InvalidOptionError(
+            "robomme plays demonstrations only, and distractor units need whole episodes",
+            "Build the two datasets apart: build demonstrations --source robomme, and "
+            "build distractors --source robomme-h5:DIR, from RoboMME's own training recordings.",
+        )
+
+
+def cameras_to_draw(wanted: Collection[str] | None) -> tuple[str, ...]:
+    """Return the cameras that a recording needs where those of `wanted` are stored (None: all).
+
+    A recording always has the front camera.
+
+    Raises:
+        UnknownNameError: Simulators have no such camera.
+    """
+    for camera in wanted or ():
+        if camera not in CAMERAS:
+            raise UnknownNameError(
+                f"--cameras {camera}: simulators have no such camera", nearest(camera, CAMERAS)
+            )
+    return tuple(name for name in CAMERAS if wanted is None or name in {"front", *wanted})
+
+
+def list_episodes(
+    simulator: str,
+    families: Sequence[str] | None,
+    split: str | None,
+    numbers: Collection[int] | None,
+) -> list[EpisodeId]:
+    """List the episodes that a simulator plays: RoboMME's numbers are those of the tabletop suite.
+
+    Args:
+        simulator: Name of the simulator.
+        families: Task families; None for the nine that have demonstrations.
+        split: `train`, `val` or `test`; None for all.
+        numbers: Indices; None for all.
+
+    Raises:
+        UnknownNameError: There is no such family.
+        InvalidIdError: There is no such split.
+        InvalidOptionError: No episode is left.
+    """
+    for family in families or ():
+        if family not in FAMILIES:
+            raise UnknownNameError(
+                f"{simulator} has no demonstrations of a family {family!r}",
+                nearest(family, FAMILIES),
+            )
+    found = [
+        episode
+        for family in families or FAMILIES
+        for episode in episode_ids(family, split)
+        if numbers is None or episode.index in numbers
+    ]
+    if not found:
+        raise InvalidOptionError(
+            f"{simulator} has no episode of these numbers",
+            "Expected 0 to 99 in train, 0 to 49 in val and test: give others with --episodes.",
+        )
+    return found
+
+
 def record_episodes(
     simulator: str,
     episodes: Sequence[EpisodeId],
     folder: Path,
     *,
     live: bool,
+    options: Mapping[str, Any] | None = None,
     workers: int = 1,
     time_limit: float | None = None,
 ) -> Iterator[EpisodeId]:
@@ -79,6 +169,7 @@ def record_episodes(
         folder: Frames folder, made or gone on with.
         live: Whether to go on after the demonstration, with the oracle until the episode ends;
             without, a recording ends with the first live observation.
+        options: For the simulator, such as `cameras`. A folder holds recordings of one set.
         workers: Processes that play side by side.
         time_limit: Seconds that one episode may take, or None.
 
@@ -92,7 +183,7 @@ def record_episodes(
         else:
             missing.append(episode)
     failed = []
-    function = partial(_record, simulator, live, folder)
+    function = partial(_record, simulator, dict(options or {}), live, folder)
     for outcome in run_tasks(function, missing, workers=workers, time_limit=time_limit):
         if outcome.error is None:
             yield outcome.task
@@ -109,8 +200,11 @@ def record_episodes(
             "(--families, --episodes).",
         )
     parts = [pq.read_table(_part(folder, episode), schema=SCHEMA) for episode in sorted(episodes)]
+    table = pa.concat_tables(parts)
+    if table["action"].null_count == len(table):  # a simulator that does not tell them
+        table = table.drop_columns(["action"])
     with atomic_path(folder / _TABLE) as partial_table:
-        pq.write_table(pa.concat_tables(parts), partial_table)
+        pq.write_table(table, partial_table)
 
 
 def check_unbuilt(out: Path, kind: str, episodes: Sequence[EpisodeId]) -> bool:
@@ -140,9 +234,11 @@ def _part(folder: Path, episode: EpisodeId) -> Path:
     return folder / _PARTS / f"{episode}.parquet"
 
 
-def _record(name: str, live: bool, folder: Path, episode: EpisodeId) -> None:
+def _record(
+    name: str, options: dict[str, Any], live: bool, folder: Path, episode: EpisodeId
+) -> None:
     """Play and record one episode; its rows come last, and say that it is complete."""
-    frames, info = _play(own_simulator(name), episode, live)
+    frames, info = _play(own_simulator(name, **options), episode, live)
     first = next(frames)
     partial_folder = folder / f".{episode.family}.{episode.split}.{episode.index}.partial"
     shutil.rmtree(partial_folder, ignore_errors=True)
@@ -181,13 +277,21 @@ def _record(name: str, live: bool, folder: Path, episode: EpisodeId) -> None:
 def _play(
     simulator: Simulator, episode: EpisodeId, live: bool
 ) -> tuple[Iterator[Frame], EpisodeInfo]:
-    """Play an episode: its demonstration, the first live observation, and the oracle if `live`."""
+    """Play an episode: its demonstration, the first live observation, and the oracle if `live`.
+
+    RoboMME tells no actions of its demonstrations, and has no oracle: there they are None.
+    """
     lesson, first, info = simulator.reset(str(episode))
+    told = len(lesson.actions) == len(lesson)
 
     def frames() -> Iterator[Frame]:
         for index in range(len(lesson)):
             images = {camera: shown[index] for camera, shown in lesson.images.items()}
-            yield Frame(images, lesson.states[index], lesson.actions[index], True)
+            action = lesson.actions[index] if told else None
+            yield Frame(images, lesson.states[index], action, True)
+        if not (told or live):
+            yield Frame(first.images, first.state, None, False)
+            return
         seen, status = first, Status.ONGOING
         while status is Status.ONGOING:
             action = np.asarray(simulator.act("oracle"), np.float32)

@@ -7,8 +7,17 @@ result = run_evaluation("replay", "demo/tabletop", "runs/replay-full", episodes=
 ```
 """
 
+from robomme_interference_data.evaluate.merge import Merged, merge_runs
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.evaluate.runner import RunResult, run_evaluation
 
-__all__ = ["Policy", "Rollout", "RolloutInfo", "RunResult", "run_evaluation"]
+__all__ = [
+    "Merged",
+    "Policy",
+    "Rollout",
+    "RolloutInfo",
+    "RunResult",
+    "merge_runs",
+    "run_evaluation",
+]

@@ -7,11 +7,13 @@ from typing import Any
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
+    PolicyError,
     UnknownNameError,
     nearest,
 )
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.policies.checks import plain
 from robomme_interference_data.evaluate.policies.registry import (
     check_workers,
     make_policy,
@@ -46,17 +48,21 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
     """Make the policy once, ask what it is, and release it.
 
     Raises:
-        InterferenceError: It cannot be made, or its server cannot be reached.
+        InterferenceError: It cannot be made, its server cannot be reached, or it does not say
+            what it is.
     """
     check_workers(parse_policy(config.policy), config.workers)
     options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
     policy = make_policy(config.policy, **options)
     try:
+        said = policy.metadata()
+        if not isinstance(said, Mapping):
+            raise PolicyError(
+                f"policy {config.policy!r}: metadata() returned a {type(said).__name__}",
+                'Expected a dict that says which policy this is, such as {"policy": "mine"}.',
+            )
         return PolicyTraits(
-            tuple(policy.history_cameras),
-            policy.wants_history,
-            policy.privileged,
-            dict(policy.metadata()),
+            tuple(policy.history_cameras), policy.wants_history, policy.privileged, plain(said)
         )
     finally:
         policy.close()
@@ -72,7 +78,7 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
     name = config.simulator
     if name not in SIMULATORS and ":" not in name:
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
-    for setting in ("workers", "history_chunk", "max_errors", "rollout_s"):
+    for setting in ("workers", "history_chunk", "max_errors", "rollout_s", "simulator_s"):
         if getattr(config, setting) <= 0:
             raise InvalidOptionError(
                 f"{setting} {getattr(config, setting)}; expected more than 0",

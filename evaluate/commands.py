@@ -12,7 +12,7 @@ from rich.console import Console
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.progress import MESSAGES
 
-__all__ = ["evaluate"]
+__all__ = ["evaluate", "merge"]
 
 
 def evaluate(
@@ -33,6 +33,9 @@ def evaluate(
     families: Annotated[list[str], typer.Option(help="Task families, or all.")] = ["all"],  # noqa: B006
     episodes: Annotated[str, typer.Option(help="Indices, such as 0-49 or 0,3,10-12.")] = "0-49",
     episode_split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    shard: Annotated[
+        str, typer.Option(help="Part of the plan to run, such as 2/8; see merge.")
+    ] = "1/1",
     system: Annotated[
         str | None, typer.Option(help="Name for the rows; see docs/systems.md.")
     ] = None,
@@ -58,6 +61,13 @@ def evaluate(
         typer.Option(help="Compare each lesson with what the simulator plays, bit for bit."),
     ] = False,
     rollout_timeout: Annotated[float, typer.Option(help="Seconds a rollout may take.")] = 3600.0,
+    simulator_timeout: Annotated[
+        float,
+        typer.Option(help="Seconds a reset, or 16 steps, may take before the simulator hung."),
+    ] = 1800.0,
+    cache: Annotated[
+        bool, typer.Option(help="Keep decoded history frames on disk: a second run is faster.")
+    ] = False,
     history_chunk: Annotated[
         int, typer.Option(min=1, help="Frames of history handed over at a time.")
     ] = 64,
@@ -82,6 +92,8 @@ def evaluate(
 
       robomme-interference evaluate --policy oracle --split S --out runs/oracle --episodes 0-4
       --videos
+
+      robomme-interference evaluate --policy replay --split S --out runs/shard-2 --shard 2/8
     """
     from robomme_interference_data.evaluate.progress import RunProgress, rate_table
     from robomme_interference_data.evaluate.runner import run_evaluation
@@ -104,6 +116,7 @@ def evaluate(
                 families=families,
                 episodes=episodes,
                 episode_split=episode_split,
+                shard=shard,
                 system=system,
                 memory=memory,
                 model_seed=model_seed,
@@ -114,6 +127,8 @@ def evaluate(
                 videos=videos,
                 workers=workers,
                 rollout_s=rollout_timeout,
+                simulator_s=simulator_timeout,
+                cache=cache,
                 history_chunk=history_chunk,
                 max_errors=max_errors,
                 resume=resume,
@@ -138,3 +153,50 @@ def evaluate(
         )
         MESSAGES.print(command)
         raise typer.Exit(1)
+
+
+def merge(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of the shards of a run.")],
+    out: Annotated[Path, typer.Option(help="Folder of the joined run, new.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Write what came out as JSON.")] = False,
+) -> None:
+    """Join shards of a run into one, and tell which rollouts are missing or double.
+
+    The shards must agree in all settings that can change a result. The joined run scores like
+    any other, and evaluate with its folder as --out runs what is missing.
+
+    Example:
+      robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
+    """
+    from robomme_interference_data.evaluate.merge import Cell, merge_runs
+    from robomme_interference_data.evaluate.progress import rate_table
+
+    merged = merge_runs(runs, out)
+    told = {
+        "missing": merged.missing,
+        "broken": merged.broken,
+        "double": merged.double,
+        "differing": merged.differing,
+    }
+    if as_json:
+        typer.echo(json.dumps({"planned": merged.planned, "rows": len(merged.rows), **told}))
+        return
+    Console().print(rate_table(merged.rows))
+
+    def tell(what: str, cells: tuple[Cell, ...]) -> None:
+        shown = ", ".join(f"{family} {condition} {index}" for family, condition, index in cells[:5])
+        more = f" and {len(cells) - 5:,} more" if len(cells) > 5 else ""
+        MESSAGES.print(f"{len(cells):,} {what}: {shown}{more}")
+
+    for name, cells in told.items():
+        if cells:
+            tell(_MERGED[name], cells)
+    typer.echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}/rollouts.csv")
+
+
+_MERGED = {
+    "missing": "missing",
+    "broken": "broken, to be run again",
+    "double": "in more than one run, the first one kept",
+    "differing": "of those did not end alike",
+}

@@ -57,6 +57,8 @@ class RunConfig:
         videos: Whether to write videos.
         workers: Worker processes.
         rollout_s: Seconds that a rollout may take.
+        simulator_s: Seconds that a reset, or up to 16 steps, may take.
+        cache: Whether to keep decoded history frames on disk, for later conditions and runs.
         history_chunk: Frames of history handed over at a time.
         max_errors: Errors in a row after which the run stops.
     """
@@ -77,6 +79,8 @@ class RunConfig:
     videos: bool = False
     workers: int = 1
     rollout_s: float = 3600.0
+    simulator_s: float = 1800.0
+    cache: bool = False
     history_chunk: int = 64
     max_errors: int = 10
 

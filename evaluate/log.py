@@ -26,12 +26,14 @@ from robomme_interference_data.simulators.base import Status
 
 __all__ = [
     "CSV_NAME",
+    "ERRORS_NAME",
     "LOG_NAME",
     "LOG_VERSION",
     "PARQUET_NAME",
     "RUN_NAME",
     "RunLog",
     "open_log",
+    "read_header",
     "read_log",
     "summary",
 ]
@@ -85,6 +87,13 @@ class RunLog:
             with (self.folder / ERRORS_NAME).open("a", encoding="utf-8") as file:
                 file.write(f"{row.finished_at} {row.family}/{row.episode_split}/{row.episode} ")
                 file.write(f"{row.condition}, attempt {row.attempt}\n{traceback.rstrip()}\n\n")
+
+    def replace(self, rows: Iterable[Rollout]) -> None:
+        """Write all rows anew, whole or not at all."""
+        self.rows = {row.key: row for row in rows}
+        with atomic_path(self.folder / LOG_NAME) as partial:
+            lines = [canonical_json(row.as_dict()) + "\n" for row in self.rows.values()]
+            partial.write_text("".join(lines), encoding="utf-8")
 
     def write_tables(self, order: Mapping[tuple[Any, ...], int]) -> None:
         """Write `rollouts.parquet` and `rollouts.csv`.
@@ -152,7 +161,7 @@ def open_log(folder: Path, identity: Mapping[str, Any], resume: bool = True) -> 
                 raise RunFolderError(
                     f"{folder} holds a run already", "Give another --out, or leave out --no-resume."
                 )
-            header = _read_header(path)
+            header = read_header(folder)
             check_same_run(folder, header["identity"], identity)
             _drop_torn_line(folder / LOG_NAME)
             log = RunLog(folder, header, read_log(folder))
@@ -186,7 +195,14 @@ def read_log(folder: Path) -> dict[tuple[Any, ...], Rollout]:
     return rows
 
 
-def _read_header(path: Path) -> dict[str, Any]:
+def read_header(folder: Path) -> dict[str, Any]:
+    """Read `run.json`.
+
+    Raises:
+        FileNotFoundError: There is none.
+        FormatError: It is damaged, or of another format version.
+    """
+    path = folder / RUN_NAME
     header = read_json(path)
     version = header.get("format_version")
     if version != LOG_VERSION:

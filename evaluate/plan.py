@@ -1,5 +1,6 @@
 """What a run has to do: pure, without files or processes."""
 
+import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -8,7 +9,15 @@ from robomme_interference_data.errors import InvalidOptionError, UnknownNameErro
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["WorkItem", "parse_episodes", "plan_work", "select_families"]
+__all__ = [
+    "WorkItem",
+    "parse_episodes",
+    "parse_shard",
+    "plan_work",
+    "select_families",
+    "shuffle_work",
+    "take_shard",
+]
 
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 
@@ -110,6 +119,50 @@ def plan_work(
             )
         items += [WorkItem(condition, episode) for episode in asked for condition in order]
     return tuple(items)
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Read a shard such as `2/8`, the second of eight.
+
+    Raises:
+        InvalidOptionError: The text is something else.
+    """
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text.strip())
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise InvalidOptionError(
+            f"--shard {text} is not a shard",
+            "Expected NUMBER/OF, such as 2/8 for the second of eight.",
+        )
+    return int(match[1]), int(match[2])
+
+
+def shuffle_work(plan: Iterable[WorkItem]) -> tuple[WorkItem, ...]:
+    """Return rollouts in the order in which they are run: episodes shuffled by a fixed seed.
+
+    However early a run is cut off, it has seen all families and difficulties alike. The order of
+    two episodes is always the same, whatever else is planned; an episode's conditions stay
+    together.
+    """
+    return tuple(sorted(plan, key=lambda item: _lot(item.episode)))
+
+
+def take_shard(plan: Sequence[WorkItem], shard: tuple[int, int]) -> tuple[WorkItem, ...]:
+    """Return the rollouts of one shard, in the order of the plan.
+
+    Shards take episodes in turn from the shuffled order, with all their conditions: no two have
+    one in common, together they are the plan, and they differ by one episode at most.
+
+    Args:
+        plan: The whole plan.
+        shard: Which shard, from 1, and of how many.
+    """
+    number, of = shard
+    mine = set(sorted({item.episode for item in plan}, key=_lot)[number - 1 :: of])
+    return tuple(item for item in plan if item.episode in mine)
+
+
+def _lot(episode: EpisodeId) -> bytes:
+    return hashlib.sha256(str(episode).encode()).digest()
 
 
 def _spans(numbers: Sequence[int]) -> str:

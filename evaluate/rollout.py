@@ -1,8 +1,8 @@
 """One rollout: reset, feed the history that the condition prescribes, then the live loop."""
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -17,6 +17,7 @@ from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, Rollout
+from robomme_interference_data.evaluate.watchdog import Watchdog
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.loader import Split
 from robomme_interference_data.retrieval.selector import Selection, Selector
@@ -86,6 +87,7 @@ def run_rollout(
     split: Split,
     selector: Selector | None = None,
     watcher: Watcher | None = None,
+    watchdog: Watchdog | None = None,
 ) -> Rollout:
     """Run one rollout and return its row.
 
@@ -98,9 +100,10 @@ def run_rollout(
         SimulatorCrashError: The simulator broke.
     """
     clock = _Clock()
+    guard = nullcontext if watchdog is None else watchdog.guard
     began = time.perf_counter()
     buffer = None if item.k is None else split.load(item.episode, item.k)
-    with clock.part("reset_s"):
+    with clock.part("reset_s"), guard():
         demonstration, first, info = simulator.reset(
             str(item.episode), demonstration=config.check_lesson
         )
@@ -126,7 +129,7 @@ def run_rollout(
         if buffer is not None:
             for chunk in buffer.stream(config.history_chunk, policy.history_cameras, start, stop):
                 policy.add_history(chunk.frames, chunk.states, stop - start)
-    status, steps = _live(policy, simulator, first, info.goal, clock, watcher)
+    status, steps = _live(policy, simulator, first, info.goal, clock, watcher, guard)
     if status is Status.ERROR:
         raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
     lesson = 0 if buffer is None else _lesson_frames(buffer, start, stop)
@@ -155,6 +158,7 @@ def _live(
     goal: str,
     clock: _Clock,
     watcher: Watcher | None,
+    guard: Callable[[], AbstractContextManager[None]],
 ) -> tuple[Status, int]:
     """Run the live loop; return how it ended and the number of executed steps."""
     seen, steps = [first], 0
@@ -164,18 +168,19 @@ def _live(
             policy.observe(frames, np.stack([one.state for one in seen]))
             actions = _checked(policy.act(seen[-1], goal))[: MAX_STEPS - steps]
         seen = []
-        for number, action in enumerate(actions, 1):
-            decides = number == len(actions)
-            wanted = policy.every_frame or decides
-            with clock.part("simulator_s"):
-                observed, status = simulator.step(action, observe=wanted or watcher is not None)
-            steps += 1
-            if watcher is not None:
-                watcher.step(observed, status, getattr(policy, "subgoal", None))
-            if status is not Status.ONGOING:
-                return status, steps
-            if wanted:
-                seen.append(observed)
+        with guard():
+            for number, action in enumerate(actions, 1):
+                decides = number == len(actions)
+                wanted = policy.every_frame or decides
+                with clock.part("simulator_s"):
+                    observed, status = simulator.step(action, observe=wanted or watcher is not None)
+                steps += 1
+                if watcher is not None:
+                    watcher.step(observed, status, getattr(policy, "subgoal", None))
+                if status is not Status.ONGOING:
+                    return status, steps
+                if wanted:
+                    seen.append(observed)
         if steps >= MAX_STEPS:
             return Status.TIMEOUT, steps
 

@@ -24,11 +24,15 @@ from robomme_interference_data.evaluate.log import RunLog, open_log, summary
 from robomme_interference_data.evaluate.plan import (
     WorkItem,
     parse_episodes,
+    parse_shard,
     plan_work,
     select_families,
+    shuffle_work,
+    take_shard,
 )
 from robomme_interference_data.evaluate.rollout import base_row
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, Rollout
+from robomme_interference_data.evaluate.watchdog import last_words
 from robomme_interference_data.evaluate.worker import RolloutWorker, error_row
 from robomme_interference_data.loader import load_split
 from robomme_interference_data.simulators.base import Status
@@ -81,6 +85,7 @@ def run_evaluation(
     families: Sequence[str] = ("all",),
     episodes: str = "0-49",
     episode_split: str = "test",
+    shard: str = "1/1",
     system: str | None = None,
     memory: str | None = None,
     model_seed: int = 0,
@@ -91,6 +96,8 @@ def run_evaluation(
     videos: bool = False,
     workers: int = 1,
     rollout_s: float = 3600.0,
+    simulator_s: float = 1800.0,
+    cache: bool = False,
     history_chunk: int = 64,
     max_errors: int = 10,
     resume: bool = True,
@@ -113,6 +120,7 @@ def run_evaluation(
         families: Task families, or `all`.
         episodes: Indices, such as `0-49` or `0,3,10-12`; ends are included.
         episode_split: `train`, `val` or `test`.
+        shard: Which part of the plan to run, such as `2/8`; `merge_runs` joins the parts.
         system: Name for the rows; by default the policy's own, `retrieval-…` with retrieval.
         memory: Memory of `replay`: `full`, `framesamp` or `window`.
         model_seed: Seed for the policy.
@@ -123,6 +131,10 @@ def run_evaluation(
         videos: Write a video of each rollout.
         workers: Worker processes, each with a simulator and a policy.
         rollout_s: Seconds that a rollout may take before it is an error.
+        simulator_s: Seconds that a reset, or up to 16 steps, may take before the simulator counts
+            as hung: its process is replaced, and the rollout tried once more.
+        cache: Keep decoded history frames on disk (20 GiB at most): later conditions and runs
+            need not decode them again.
         history_chunk: Frames of history that are handed over at a time.
         max_errors: Errors in a row after which the run stops.
         resume: Go on with a run that is in `out` already.
@@ -155,6 +167,8 @@ def run_evaluation(
         videos=videos,
         workers=workers,
         rollout_s=rollout_s,
+        simulator_s=simulator_s,
+        cache=cache,
         history_chunk=history_chunk,
         max_errors=max_errors,
     )
@@ -168,11 +182,12 @@ def run_evaluation(
         conditions=applicable(config, opened, about) if conditions is None else conditions,
     )
     check_plan(config, opened, about, plan)
+    mine = take_shard(plan, parse_shard(shard))
     with open_log(Path(out), identity(config), resume) as log:
         log.write_header(policy=about.metadata, status="running", **provenance(list(command)))
-        log.header["plans"] = [*log.header["plans"], _plan_of(plan)]
+        log.header["plans"] = [*log.header["plans"], {**_plan_of(plan), "shard": shard}]
         log.write_header()
-        return _run(config, plan, log, listener)
+        return _run(config, mine, log, listener)
 
 
 def _run(
@@ -182,7 +197,7 @@ def _run(
     order = {key: number for number, key in enumerate(keys)}
     finished = log.finished
     done = [log.rows[key] for key in keys if key in finished]
-    todo = [item for key, item in keys.items() if key not in finished]
+    todo = shuffle_work(item for key, item in keys.items() if key not in finished)
     if listener is not None:
         listener.start(plan, done)
     log.write_tables(order)
@@ -224,7 +239,11 @@ def _row(config: RunConfig, outcome: Outcome, log: RunLog) -> tuple[Rollout, str
         row, traceback = outcome.value
     else:
         # The process died or hung: its last words are all there is.
-        row = error_row(config, outcome.task, f"{type(outcome.error).__name__}: {outcome.error}")
+        traceback = last_words(log.folder)
+        text = f"{type(outcome.error).__name__}: {outcome.error}"
+        if traceback is not None:
+            text = f"the simulator hung: no answer for {config.simulator_s:g} s"
+        row = error_row(config, outcome.task, text)
     before = log.rows[row.key].attempt if row.key in log.rows else 0
     now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     return (

@@ -12,6 +12,7 @@ from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout import base_row, run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
+from robomme_interference_data.evaluate.watchdog import Watchdog
 from robomme_interference_data.loader import Split, load_split
 from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.simulators.base import Simulator, Status
@@ -35,6 +36,7 @@ class RolloutWorker:
     def __init__(self, config: RunConfig, out: Path):
         self.config = config
         self._out = out
+        self._watchdog: Watchdog | None = None
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._split: Split | None = None
@@ -60,6 +62,7 @@ class RolloutWorker:
             "policy": self._policy,
             "split": self._split,
             "selector": self._selector,
+            "watchdog": self._watchdog,
         }
         if not self.config.videos:
             return run_rollout(self.config, item, **parts)
@@ -70,8 +73,10 @@ class RolloutWorker:
 
     def _prepare(self) -> None:
         config = self.config
+        if self._watchdog is None:
+            self._watchdog = Watchdog(config.simulator_s, self._out)
         if self._split is None:
-            self._split = load_split(config.split, threads=1)
+            self._split = load_split(config.split, cache=config.cache, threads=1)
         if self._policy is None:
             options: dict[str, Any] = {}
             if config.memory is not None:

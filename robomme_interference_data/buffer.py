@@ -268,6 +268,8 @@ class Buffer:
     ) -> Iterator[Chunk]:
         """Decode the buffer, or a span of it, in chunks, in order, holding one chunk at a time.
 
+        With a cache, frames that it lacks are decoded a whole session at a time.
+
         Args:
             chunk: Frames in a chunk; the last one may be shorter.
             cameras: Names of the cameras; None for all.
@@ -339,10 +341,7 @@ class Buffer:
         dataset = self._datasets[entry.dataset]
         target = out[session.start : session.stop]
         length = entry.stop - entry.start
-        digest = None
-        if self._cache is not None:
-            recorded = dataset.digests(entry.episode_index, entry.start, entry.stop)
-            digest = recorded[feature] if recorded else None
+        digest = self._digest(entry, feature)
         if self._cache is not None and digest is not None:
             cached = self._cache.get(digest, (length, *out.shape[1:]))
             if cached is not None:
@@ -379,14 +378,42 @@ class Buffer:
             entry = session.entry
             stored = entry.start + (first - session.start) // entry.repeat
             end = entry.start + -(-(last - session.start) // entry.repeat)
-            dataset, position = self._datasets[entry.dataset], first
-            for frame in dataset.iter_frames(entry.episode_index, feature, stored, end):
+            position = first
+            for frame in self._stored_frames(entry, feature, stored, end):
                 shown = min(
                     last, position + entry.repeat - (position - session.start) % entry.repeat
                 )
                 while position < shown:
                     yield frame
                     position += 1
+
+    def _stored_frames(
+        self, entry: SessionEntry, feature: str, start: int, stop: int
+    ) -> Generator[NDArray[np.uint8]]:
+        """Yield stored frames, start inclusive, stop exclusive; with a cache, out of it.
+
+        What the cache lacks is decoded into it, the whole session.
+        """
+        dataset = self._datasets[entry.dataset]
+        digest = self._digest(entry, feature)
+        if self._cache is None or digest is None:
+            yield from dataset.iter_frames(entry.episode_index, feature, start, stop)
+            return
+        shape = (entry.stop - entry.start, *self._shape(feature))
+        frames = self._cache.get(digest, shape)
+        if frames is None:
+            frames = np.empty(shape, np.uint8)
+            dataset.read_frames(entry.episode_index, feature, entry.start, frames)
+            self._cache.put(digest, frames)
+        yield from frames[start - entry.start : stop - entry.start]
+
+    def _digest(self, entry: SessionEntry, feature: str) -> str | None:
+        """Return the name of a session's frames in the cache; None without cache or digest."""
+        if self._cache is None:
+            return None
+        dataset = self._datasets[entry.dataset]
+        recorded = dataset.digests(entry.episode_index, entry.start, entry.stop)
+        return recorded[feature] if recorded else None
 
     def _vectors(self, feature: str) -> NDArray[np.float32]:
         parts = []

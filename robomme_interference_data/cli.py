@@ -84,6 +84,7 @@ app.command(name="simulate-score")(simulator_commands.simulate_score)
 app.command()(score_commands.score)
 app.command()(score_commands.compare)
 app.command()(evaluate_commands.evaluate)
+app.command()(evaluate_commands.merge)
 
 
 def main() -> None:

@@ -3,6 +3,8 @@
 import os
 import shutil
 import socket
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -97,3 +99,27 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings in {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def bare_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment with numpy < 2 and nothing else."""
+    folder = tmp_path_factory.mktemp("robomme") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}"
+    command = [sys.executable, "-m", "pip", "--no-input", "install", "--quiet", "--no-deps"]
+    command += ["--only-binary", ":all:", "--target", str(site / "site-packages"), "numpy<2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"no package index gives numpy < 2: {done.stderr.strip()[-500:]}")
+    return folder / "bin" / "python"
+
+
+@pytest.fixture
+def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """That interpreter with the stand-in, a package `robomme` with RoboMME's interface.
+
+    It behaves badly, or ends an episode, where the episode's index asks for it.
+    """
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "robomme_stand_in"))
+    return bare_python

@@ -53,4 +53,25 @@ def one_camera() -> Still:
     return policy
 
 
+def lacking(name: str) -> object:
+    """Return a policy without one of its attributes or methods."""
+    members = {key: value for key, value in vars(Still).items() if key != name}
+    return type("Lacking", (), members)()
+
+
+def changed(name: str, value: Any) -> Still:
+    """Return a policy with another attribute or method."""
+    policy = Still()
+    setattr(policy, name, value)
+    return policy
+
+
 NUMBER = 3
+
+
+def with_array() -> Still:
+    return changed("metadata", lambda: {"policy": "still", "sizes": np.arange(3), 4: np.float32(5)})
+
+
+def with_text() -> Still:
+    return changed("metadata", lambda: "still")

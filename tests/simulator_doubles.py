@@ -24,12 +24,21 @@ class Double:
 
     Args:
         marks: Folder where bad behaviour is marked, so that it happens once only; None: always.
+        cameras: What it draws: the front camera all in the episode's index, others in 99.
+        actions: Whether it tells the actions of its lessons.
     """
 
     chance = 0.25
 
-    def __init__(self, marks: str | None = None, render: bool = True):
+    def __init__(
+        self,
+        marks: str | None = None,
+        render: bool = True,
+        cameras: tuple[str, ...] = ("front",),
+        actions: bool = True,
+    ):
         self.marks = Path(marks) if marks else None
+        self.cameras, self.actions = cameras, actions
         self.left = 0
 
     def reset(
@@ -45,9 +54,9 @@ class Double:
         self.left = STEPS
         self.image = np.full((4, 4, 3), episode.index, np.uint8)
         lesson = Demonstration(
-            {"front": np.stack([self.image] * 5)},
+            {name: np.stack([image] * 5) for name, image in self._images().items()},
             np.zeros((5, 8), np.float32),
-            np.ones((5, 8), np.float32),
+            np.ones((5 if self.actions else 0, 8), np.float32),
         )
         info = EpisodeInfo("goal", ("goal",), "easy", episode.index, "double")
         return lesson, self._observe(), info
@@ -57,13 +66,18 @@ class Double:
         return self._observe(), Status.ONGOING if self.left else Status.SUCCESS
 
     def act(self, policy: str) -> np.ndarray:
+        assert self.actions
         return np.zeros(8, np.float32)
 
     def close(self) -> None:
         pass
 
     def _observe(self) -> Observation:
-        return Observation({"front": self.image}, np.full(8, self.left, np.float32))
+        return Observation(self._images(), np.full(8, self.left, np.float32))
+
+    def _images(self) -> dict[str, np.ndarray]:
+        other = np.full_like(self.image, 99)
+        return {name: self.image if name == "front" else other for name in self.cameras}
 
     def _first_time(self, index: int) -> bool:
         if self.marks is None:

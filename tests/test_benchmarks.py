@@ -159,7 +159,9 @@ def test_made_up_episode_tables_have_the_columns_of_real_ones(
         assert len(list(made_up.records())) == 11
 
 
-@pytest.mark.parametrize("name", ["load", "build", "manifests", "policies", "retrieval"])
+@pytest.mark.parametrize(
+    "name", ["load", "build", "manifests", "policies", "evaluate", "retrieval"]
+)
 def test_help_and_refusals(name: str) -> None:
     shown = run(name, "--help")
     assert shown.returncode == 0 and "--rounds" in shown.stdout

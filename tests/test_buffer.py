@@ -432,8 +432,12 @@ def test_cached_frames_need_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(type(opened().datasets["demonstrations"]), "read_frames", no_decoding)
     np.testing.assert_array_equal(made.frames(), expected)
+    streamed = [chunk.frames["front"] for chunk in made.stream(7, ("front",), 3, 90)]
+    np.testing.assert_array_equal(np.concatenate(streamed), expected[3:90])
     with pytest.raises(AssertionError, match="decoded"):
         made.frames("wrist")
+    with pytest.raises(AssertionError, match="decoded"):
+        next(made.stream(7, ("wrist",)))
 
 
 def test_damaged_cache_files_are_decoded_again(tmp_path: Path) -> None:

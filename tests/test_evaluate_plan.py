@@ -8,8 +8,11 @@ from robomme_interference_data.errors import InvalidIdError, InvalidOptionError,
 from robomme_interference_data.evaluate.plan import (
     WorkItem,
     parse_episodes,
+    parse_shard,
     plan_work,
     select_families,
+    shuffle_work,
+    take_shard,
 )
 from robomme_interference_data.ids import EpisodeId
 
@@ -113,3 +116,57 @@ def test_an_unknown_condition_is_refused() -> None:
             episodes=(0,),
             conditions=("k0", "k64"),
         )
+
+
+# --- shards ------------------------------------------------------------------------------------
+
+
+def whole(
+    episodes: int, conditions: tuple[str, ...] = ("no-history", "k0", "k7")
+) -> tuple[WorkItem, ...]:
+    return plan_work(
+        [EpisodeId("MoveCube", "test", index) for index in range(episodes)],
+        episode_split="test",
+        families=("MoveCube",),
+        episodes=range(episodes),
+        conditions=conditions,
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("1/1", (1, 1)), ("2/8", (2, 8)), (" 8/8 ", (8, 8))]
+)
+def test_shard(text: str, expected: tuple[int, int]) -> None:
+    assert parse_shard(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "0/8", "9/8", "2", "2/", "/8", "-1/8", "2/8/1", "a/b"])
+def test_what_is_no_shard(text: str) -> None:
+    with pytest.raises(InvalidOptionError, match="is not a shard"):
+        parse_shard(text)
+
+
+@given(episodes=st.integers(0, 50), of=st.integers(1, 12))
+def test_shards_are_even_and_together_the_plan(episodes: int, of: int) -> None:
+    plan = whole(episodes)
+    shards = [take_shard(plan, (number, of)) for number in range(1, of + 1)]
+    assert sorted((item for shard in shards for item in shard), key=plan.index) == list(plan)
+    sizes = [len({item.episode for item in shard}) for shard in shards]
+    assert max(sizes) - min(sizes) <= 1
+    # An episode's conditions are never apart, and a shard is in the order of the plan.
+    assert all(len(shard) == 3 * size for shard, size in zip(shards, sizes, strict=True))
+    assert all(list(shard) == sorted(shard, key=plan.index) for shard in shards)
+
+
+SHUFFLED = [1, 9, 5, 0, 8, 10, 6, 3, 2, 7, 11, 4]
+
+
+@given(st.permutations(range(12)))
+def test_the_shuffle_depends_on_nothing_but_the_episodes(order: list[int]) -> None:
+    plan = whole(12, ("k0",))
+    shuffled = shuffle_work([plan[index] for index in order])
+    assert shuffled == shuffle_work(plan)
+    # By the sha256 of "MoveCube/test/0" and so on, worked out apart.
+    assert [item.episode.index for item in shuffled] == SHUFFLED
+    kept = [item for item in shuffled if item.episode.index % 3]
+    assert list(shuffle_work(kept)) == kept  # the order of two never depends on a third

@@ -185,8 +185,6 @@ def test_without_history_the_first_observation_fills_the_queue(vqbet: Path) -> N
 
 @pytest.mark.parametrize("kind", ["vqbet", "diffusion"])
 def test_rollouts_repeat_and_do_not_touch_the_global_generator(kind: str, tmp_path: Path) -> None:
-    if kind == "diffusion":
-        pytest.importorskip("diffusers")
     policy = LeRobotPolicy(str(save_policy(tmp_path, kind, (FRONT,))), device="cpu")
     state = torch.get_rng_state()
     first = play(policy, 4, [1, 3])
@@ -202,7 +200,6 @@ def test_rollouts_repeat_and_do_not_touch_the_global_generator(kind: str, tmp_pa
 
 
 def test_diffusion_gives_what_its_model_gives_for_the_window(tmp_path: Path) -> None:
-    pytest.importorskip("diffusers")
     folder = save_policy(tmp_path, "diffusion", (FRONT,))
     found = play(LeRobotPolicy(str(folder), device="cpu"), 3, [1])[0]
     model, before, after = loaded(folder)

@@ -15,12 +15,16 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
+from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     PolicySpec,
     check_workers,
     make_policy,
     parse_policy,
 )
+
+MEMBERS: frozenset[str] = frozenset(Policy.__protocol_attrs__)  # type: ignore[attr-defined]
+"""What `Policy` lists."""
 
 
 @pytest.mark.parametrize(
@@ -140,7 +144,7 @@ def test_a_factory_that_asks_is_told_its_worker() -> None:
             "object has no cameras, history_cameras, wants_history",
         ),
         ("python:own_policies:nothing", PolicyError, "reset(), add_history()"),
-        ("python:own_policies:all_cameras", PolicyError, "cameras ('front', 'top')"),
+        ("python:own_policies:all_cameras", PolicyError, "cameras are ('front', 'top')"),
         ("python:own_policies:one_camera", PolicyError, "Expected a tuple"),
         ("python:builtins:dict", PolicyError, "dict has no cameras"),
     ],
@@ -149,6 +153,41 @@ def test_a_factory_that_is_none(text: str, error: type[Exception], words: str) -
     with pytest.raises(error) as raised:
         make_policy(text)
     assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("name", sorted(MEMBERS))
+def test_every_member_of_the_protocol_is_asked_for(name: str) -> None:
+    with pytest.raises(PolicyError, match=rf"Lacking has no {name}(\(\))?\n") as raised:
+        make_policy("python:own_policies:lacking", name=name)
+    assert "docs/systems.md has one" in str(raised.value)
+
+
+def test_a_policy_has_what_the_protocol_lists() -> None:
+    assert set(dir(own_policies.Still)) >= MEMBERS
+    assert len(MEMBERS) == 11
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("history_cameras", None, "its history_cameras are None"),
+        ("history_cameras", ("top",), "Expected a tuple of 'front' and 'wrist'"),
+        ("cameras", {"front": 1}, "its cameras are {'front': 1}"),
+        ("wants_history", "no", "its wants_history is 'no'"),
+        ("privileged", None, "Expected True or False"),
+        ("every_frame", 1, "its every_frame is 1"),
+        ("act", 3, r"has no act()"),
+    ],
+)
+def test_a_member_of_another_kind(name: str, value: Any, words: str) -> None:
+    with pytest.raises(PolicyError) as raised:
+        make_policy("python:own_policies:changed", name=name, value=value)
+    assert words in str(raised.value)
+
+
+def test_a_list_of_cameras_will_do() -> None:
+    policy = make_policy("python:own_policies:changed", name="cameras", value=["wrist"])
+    assert policy.cameras == ["wrist"]
 
 
 def test_a_module_that_does_not_import_says_why(

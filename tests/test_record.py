@@ -8,10 +8,13 @@ import pytest
 from robomme_interference_data import Dataset
 from robomme_interference_data.build_dataset.record import (
     RecordedSource,
+    cameras_to_draw,
+    check_playable,
     check_unbuilt,
+    list_episodes,
     record_episodes,
 )
-from robomme_interference_data.errors import BuildError
+from robomme_interference_data.errors import BuildError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.ids import EpisodeId
 
@@ -51,6 +54,58 @@ def test_a_demonstration_ends_with_the_first_live_observation(tmp_path: Path) ->
     list(record_episodes(DOUBLE, [episode(0)], tmp_path, live=False))
     (only,) = RecordedSource(tmp_path, "tabletop").episodes()
     assert (only.raw_length, only.demonstration_length) == (6, 5)
+
+
+def test_a_simulator_that_tells_no_actions(tmp_path: Path) -> None:
+    """The official one: its demonstrations have none, and it has no oracle."""
+    list(record_episodes(DOUBLE, [episode(0)], tmp_path, live=False, options={"actions": False}))
+    source = RecordedSource(tmp_path, "robomme")
+    (only,) = source.episodes()
+    assert (only.raw_length, only.demonstration_length, only.action_size) == (6, 5, None)
+    frames = list(source.read(only))
+    assert [frame.action for frame in frames] == [None] * 6
+    assert [float(frame.state[0]) for frame in frames] == [0, 0, 0, 0, 0, 3]
+
+
+def test_only_the_cameras_that_are_asked_for(tmp_path: Path) -> None:
+    for cameras in (("front",), ("front", "wrist")):
+        folder = tmp_path / "-".join(cameras)
+        list(record_episodes(DOUBLE, [episode(9)], folder, live=True, options={"cameras": cameras}))
+        (only,) = RecordedSource(folder, "tabletop").episodes()
+        assert tuple(only.cameras) == cameras
+    both, front = contents(tmp_path / "front-wrist"), contents(tmp_path / "front")
+    assert both.pop("videos/wrist/MoveCube/train/9.mkv")
+    assert both == front
+
+
+def test_cameras_to_draw() -> None:
+    assert cameras_to_draw(None) == ("front", "wrist")
+    assert cameras_to_draw(("front",)) == ("front",)
+    # A recording has the front camera whatever is stored of it.
+    assert cameras_to_draw(("wrist",)) == ("front", "wrist")
+    with pytest.raises(UnknownNameError, match=r"(?s)--cameras wirst.*'wrist'"):
+        cameras_to_draw(("front", "wirst"))
+
+
+def test_list_episodes() -> None:
+    assert list_episodes("robomme", ("MoveCube",), "test", {0, 49, 50}) == [
+        EpisodeId("MoveCube", "test", 0),
+        EpisodeId("MoveCube", "test", 49),
+    ]
+    assert len(list_episodes("robomme", None, "train", None)) == 9 * 100
+    assert len(list_episodes("tabletop", None, None, None)) == 9 * (100 + 50 + 50)
+    # One of RoboMME's, but without a demonstration.
+    with pytest.raises(UnknownNameError, match="robomme has no demonstrations of a family 'BinF"):
+        list_episodes("robomme", ("MoveCube", "BinFill"), None, None)
+    with pytest.raises(InvalidOptionError, match="tabletop has no episode of these numbers"):
+        list_episodes("tabletop", None, "test", {50})
+
+
+def test_check_playable() -> None:
+    check_playable("robomme", "demonstrations")
+    check_playable("tabletop", "distractors")
+    with pytest.raises(InvalidOptionError, match="--source robomme-h5:DIR"):
+        check_playable("robomme", "distractors")
 
 
 def test_what_is_recorded_is_not_played_again(tmp_path: Path) -> None:
@@ -107,6 +162,27 @@ def test_check_unbuilt(tmp_path: Path) -> None:
     (tmp_path / "other").write_text("not a dataset")
     with pytest.raises(BuildError, match="Choose another --out"):
         check_unbuilt(tmp_path / "other", "distractors", ids)
+
+
+def test_fewer_cameras_of_the_tabletop_simulator_are_the_same_bits(tmp_path: Path) -> None:
+    """Both parts of an episode, the demonstration and the oracle's, in a process each."""
+    pytest.importorskip("mani_skill", reason="needs the extra sim")
+    short = [EpisodeId("VideoUnmask", "train", 0)]
+    for cameras in (("front",), ("front", "wrist")):
+        options = {"cameras": cameras}
+        try:
+            list(
+                record_episodes(
+                    "tabletop", short, tmp_path / cameras[-1], live=True, options=options
+                )
+            )
+        except BuildError as error:
+            if "no Vulkan device" in str(error):
+                pytest.skip(str(error))
+            raise
+    front, both = contents(tmp_path / "front"), contents(tmp_path / "wrist")
+    assert both.pop("videos/wrist/VideoUnmask/train/0.mkv")
+    assert both == front
 
 
 @pytest.mark.slow

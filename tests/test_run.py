@@ -21,6 +21,7 @@ from robomme_interference_data.errors import (
     InvalidIdError,
     InvalidOptionError,
     MissingFileError,
+    PolicyError,
     RunFolderError,
     UnknownNameError,
 )
@@ -62,6 +63,16 @@ def untimed(rows: tuple[Rollout, ...]) -> list[dict[str, Any]]:
     ]
 
 
+def test_what_a_policy_says_of_itself_is_on_record(tmp_path: Path) -> None:
+    changes = {"conditions": ["no-history"], "families": ["MoveCube"], "episodes": "0"}
+    run(tmp_path / "run", policy="python:own_policies:with_array", **changes)
+    header = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert header["policy"] == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
+    with pytest.raises(PolicyError, match=r"metadata\(\) returned a str"):
+        run(tmp_path / "other", policy="python:own_policies:with_text", **changes)
+    assert not (tmp_path / "other").exists()
+
+
 # --- a run -------------------------------------------------------------------------------------
 
 
@@ -82,6 +93,7 @@ def test_a_run_writes_a_row_for_every_rollout(tmp_path: Path) -> None:
             "families": list(factories.FAMILIES),
             "episodes": [0, 1],
             "conditions": ["no-history", "k0"],
+            "shard": "1/1",
         }
     ]
     assert {"numpy", "python", "robomme-interference-data"} <= set(header["versions"])
@@ -101,7 +113,8 @@ def test_the_three_files_agree(tmp_path: Path) -> None:
         assert text["retrieval_model"] == ""
         assert text["wall_s"] == str(row["wall_s"])
     lines = (tmp_path / "run" / "rollouts.jsonl").read_text().splitlines()
-    assert [json.loads(line) for line in lines] == rows
+    logged = [json.loads(line) for line in lines]  # as they ended
+    assert sorted(logged, key=rows.index) == rows
 
 
 def test_several_workers_write_what_one_writes(tmp_path: Path) -> None:
@@ -188,7 +201,7 @@ def test_after_a_torn_line_the_run_goes_on(tmp_path: Path) -> None:
     again = run(out, families=["MoveCube"])
     assert untimed(again.rows) == untimed(first.rows)
     assert len(log.read_bytes().splitlines()) == 4
-    assert list(read_log(out).values()) == list(again.rows)
+    assert read_log(out) == {row.key: row for row in again.rows}
 
 
 # --- refusals ----------------------------------------------------------------------------------
@@ -217,7 +230,7 @@ def test_every_setting_is_classed() -> None:
     """A new setting either makes another run of it, or does not: somebody has to say which."""
     assert set(IDENTITY) | {
         *("split", "robomme_python", "check_lesson", "videos", "workers", "rollout_s"),
-        *("history_chunk", "max_errors"),
+        *("simulator_s", "cache", "history_chunk", "max_errors"),
     } == {field.name for field in dataclasses.fields(RunConfig)}
     assert not set(IDENTITY) & set(EXECUTION)
     assert config_module.IDENTITY is IDENTITY
@@ -374,6 +387,17 @@ def test_a_rollout_that_breaks_is_an_error_and_run_again(
     assert mended.attempt == broken[0].attempt + 1
     table = pq.read_table(tmp_path / "run" / "rollouts.parquet").to_pylist()
     assert [row["status"] for row in table].count("error") == 0
+
+
+def test_a_simulator_that_hangs_is_an_error_with_its_traceback(tmp_path: Path) -> None:
+    trouble(tmp_path, "MoveCube-0", "hang")
+    result = run(tmp_path / "run", families=["MoveCube"], simulator_s=8.0)
+    (broken,) = [row for row in result.rows if row.status == "error"]
+    assert (broken.condition, broken.episode, broken.attempt) == ("no-history", 0, 2)
+    assert broken.error == "the simulator hung: no answer for 8 s"
+    log = (tmp_path / "run" / "errors.log").read_text()
+    assert log.count("Timeout (0:00:08)!") == 2  # it was tried twice
+    assert "rollout_doubles.py" in log and "in step" in log
 
 
 def test_a_worker_that_dies_once_is_replaced(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.simulators import Status, make_simulator, robomme_worker
-from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+from robomme_interference_data.simulators.robomme_client import EPISODES, RoboMMESimulator
 from robomme_interference_data.simulators.worker import RemoteSimulator
 
 STAND_IN = Path(__file__).parent / "robomme_stand_in"
@@ -43,25 +43,14 @@ DIES, HANGS, RAISES, BREAKS, SMALL_WRIST = 40, 41, 42, 43, 44
 ENDS = {45: Status.SUCCESS, 46: Status.FAIL, 47: Status.TIMEOUT}
 
 
-@pytest.fixture(scope="session")
-def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with numpy < 2 and nothing else."""
-    folder = tmp_path_factory.mktemp("robomme") / "venv"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
-    site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}"
-    command = [sys.executable, "-m", "pip", "--no-input", "install", "--quiet", "--no-deps"]
-    command += ["--only-binary", ":all:", "--target", str(site / "site-packages"), "numpy<2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"no package index gives numpy < 2: {done.stderr.strip()[-500:]}")
-    return folder / "bin" / "python"
+@pytest.fixture
+def bare(bare_python: Path) -> Path:
+    return bare_python
 
 
 @pytest.fixture
-def python(bare: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """That interpreter with the stand-in."""
-    monkeypatch.setenv("PYTHONPATH", str(STAND_IN))
-    return bare
+def python(robomme_python: Path) -> Path:
+    return robomme_python
 
 
 @pytest.fixture
@@ -126,6 +115,45 @@ def test_the_same_episode_is_the_same_each_time(simulator: RoboMMESimulator) -> 
     assert first[0].images["front"].tobytes() == again[0].images["front"].tobytes()
     assert first[0].states.tobytes() == again[0].states.tobytes()
     assert first[2] == again[2]
+
+
+def told(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
+    """Play an episode, and return all that came of it."""
+    lesson, first, info = simulator.reset(episode)
+    seen = [first, *(simulator.step(HOLD)[0] for _ in range(2))]
+    frames = [one.images[name].tobytes() for one in seen for name in ("front", "wrist")]
+    states = [one.state.tobytes() for one in seen]
+    images = [lesson.images[name].tobytes() for name in ("front", "wrist")]
+    return (info, lesson.states.tobytes(), images, frames, states)
+
+
+def test_a_worker_plays_few_episodes(simulator: RoboMMESimulator) -> None:
+    # More than twice as many as a worker plays, each with its steps in the middle.
+    episodes = [f"MoveCube/test/{index}" for index in range(2 * EPISODES + 1)]
+    pids, results = [], []
+    for episode in episodes:
+        results.append(told(simulator, episode))
+        assert simulator.pid is not None
+        pids.append(simulator.pid)
+    one, two, three = dict.fromkeys(pids)
+    assert pids == [one] * EPISODES + [two] * EPISODES + [three]
+    assert ended(one) and ended(two)
+    # The same from workers that have played other episodes before, or none.
+    again = [told(simulator, episode) for episode in reversed(episodes)]
+    assert again == results[::-1]
+
+
+def test_a_new_worker_that_does_not_start(
+    simulator: RoboMMESimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(EPISODES):
+        simulator.reset("MoveCube/test/0")
+    with monkeypatch.context() as without:
+        without.delenv("PYTHONPATH")
+        with pytest.raises(MissingExtraError, match="robomme is not installed there"):
+            simulator.reset("MoveCube/test/3")
+        assert simulator.pid is None
+    assert len(simulator.reset("MoveCube/test/3")[0]) == 5
 
 
 def test_environments_are_closed(simulator: RoboMMESimulator) -> None:

@@ -1,5 +1,6 @@
 """What adapters check of the arrays that pass between the harness and a policy."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,7 @@ def check_actions(actions: Any) -> NDArray[np.float32]:
 
 def plain(value: Any) -> Any:
     """Return a value as JSON can hold it: long arrays become a word on their shape."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]

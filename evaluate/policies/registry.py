@@ -15,6 +15,7 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.simulators.base import CAMERAS
 
 __all__ = ["BUILTINS", "FORMS", "PolicySpec", "check_workers", "make_policy", "parse_policy"]
 
@@ -27,6 +28,11 @@ FORMS = {
     "python": "python:module:factory",
 }
 """How the other kinds are written."""
+
+# What a policy has: see `Policy`.
+_CAMERAS = ("cameras", "history_cameras")
+_FLAGS = ("wants_history", "privileged", "every_frame")
+_METHODS = ("reset", "add_history", "observe", "act", "metadata", "close")
 
 _HOST_PORT = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -216,18 +222,24 @@ def _check_options(
 
 
 def _check_protocol(text: str, policy: Any) -> None:
-    methods = ("reset", "add_history", "observe", "act", "metadata", "close")
-    values = ("cameras", "history_cameras", "wants_history", "privileged", "every_frame")
-    missing = [name for name in values if not hasattr(policy, name)]
-    missing += [f"{name}()" for name in methods if not callable(getattr(policy, name, None))]
+    """Refuse what is no `Policy`, so that a slip is told before the first episode."""
+    missing = [name for name in (*_CAMERAS, *_FLAGS) if not hasattr(policy, name)]
+    missing += [f"{name}()" for name in _METHODS if not callable(getattr(policy, name, None))]
     if missing:
         raise PolicyError(
             f"policy {text!r}: {type(policy).__name__} has no {', '.join(missing)}",
             "evaluate/policies/base.py says what a policy must have; docs/systems.md has one.",
         )
-    for cameras in (policy.cameras, policy.history_cameras):
-        if isinstance(cameras, str) or not set(cameras) <= {"front", "wrist"}:
+    for name in _CAMERAS:
+        wanted = getattr(policy, name)
+        if not isinstance(wanted, tuple | list) or not all(one in CAMERAS for one in wanted):
             raise PolicyError(
-                f"policy {text!r} asks for the cameras {cameras!r}",
-                "Expected a tuple of 'front' and 'wrist'.",
+                f"policy {text!r}: its {name} are {wanted!r}",
+                f"Expected a tuple of {' and '.join(map(repr, CAMERAS))}, or an empty one.",
+            )
+    for name in _FLAGS:
+        if not isinstance(getattr(policy, name), bool):
+            raise PolicyError(
+                f"policy {text!r}: its {name} is {getattr(policy, name)!r}",
+                "Expected True or False.",
             )

@@ -7,7 +7,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Demonstration", "EpisodeInfo", "Observation", "Simulator", "Status"]
+__all__ = ["CAMERAS", "Demonstration", "EpisodeInfo", "Observation", "Simulator", "Status"]
+
+CAMERAS = ("front", "wrist")
+"""The cameras of every simulator, in the order in which they are listed."""
 
 
 class Status(StrEnum):

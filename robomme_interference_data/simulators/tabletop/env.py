@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES, FPS
 from robomme_interference_data.errors import UnknownNameError, nearest
-from robomme_interference_data.simulators.base import Demonstration, Observation, Status
+from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation, Status
 from robomme_interference_data.simulators.tabletop.episodes import DIFFICULTIES, difficulty_of
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.family import Family
@@ -25,9 +25,8 @@ from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Scri
 from robomme_interference_data.simulators.tabletop.panda import PANDA, draw_low_polygon
 from robomme_interference_data.simulators.tabletop.shading import SHADER
 
-__all__ = ["CAMERAS", "FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
+__all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 
-CAMERAS = ("front", "wrist")
 FRONT_EYE = (0.54, 0.0, 0.60)  # m
 FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
 FRONT_VIEW = math.radians(43)

@@ -16,12 +16,13 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.base import (
+    CAMERAS,
     Demonstration,
     EpisodeInfo,
     Observation,
     Status,
 )
-from robomme_interference_data.simulators.tabletop.env import CAMERAS, TabletopEnv
+from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
 
 __all__ = ["TabletopSimulator"]

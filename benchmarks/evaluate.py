@@ -1,0 +1,228 @@
+"""Measure what the harness adds to a simulator loop, and what a second worker brings.
+
+    python benchmarks/evaluate.py                    # on the demo's split: some minutes
+    python benchmarks/evaluate.py --split my-split --episodes MoveCube/test/0 --rounds 3
+
+The bare loop takes the same actions in the same simulator and draws the same pictures, and does
+nothing else: no history, no policy, no rows.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from timing import Times, interleave, machine, positive, table
+
+from robomme_interference_data import Split, load_split
+from robomme_interference_data.evaluate import run_evaluation
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.policies.base import Frames, RolloutInfo
+from robomme_interference_data.evaluate.rollout import run_rollout
+from robomme_interference_data.evaluate.rows import Rollout
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import Observation, Status
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+CAMERAS = ("front", "wrist")
+BARE, WITHOUT, K0 = "bare loop", "no-history", "k0"
+
+
+class Recorded:
+    """Takes the oracle's actions of an episode again, and wants every frame, as servers do."""
+
+    cameras: tuple[str, ...] = CAMERAS
+    history_cameras: tuple[str, ...] = ("front",)
+    wants_history = True
+    privileged = False
+    every_frame = True
+
+    def __init__(self, actions: NDArray[np.float32]):
+        self._actions = actions
+        self._next = 0
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Begin again."""
+        self._next = 0
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        """Take it and do nothing."""
+
+    def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
+        """Take it and do nothing."""
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the next 16 actions at most, `(n, 8) float32`."""
+        start, self._next = self._next, self._next + 16
+        return self._actions[start : start + 16]
+
+    def metadata(self) -> dict[str, Any]:
+        """Return its name."""
+        return {"policy": "recorded"}
+
+    def close(self) -> None:
+        """There is nothing to release."""
+
+
+class Clock:
+    """Notes when each row comes."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def start(self, plan: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
+        """Take the plan."""
+
+    def row(self, row: Rollout) -> None:
+        """Note the time."""
+        self.times.append(time.perf_counter())
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parse_options()
+    split = load_split(options.split, threads=1)
+    print(machine("mani-skill", "av"), end="\n\n", flush=True)
+    rows = []
+    with TabletopSimulator(cameras=CAMERAS) as simulator:
+        for name in options.episodes:
+            rows.append(overhead(EpisodeId.parse(name), simulator, split, options.rounds))
+    print(
+        table(
+            "A rollout of the oracle's actions, front and wrist drawn at every step, one process; "
+            f"medians of {options.rounds} rounds; ratios are against the bare loop, aim at k0 "
+            "≤ 1.05.",
+            ("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 but decoding", ">frames"),
+            rows,
+        ),
+        end="\n\n",
+        flush=True,
+    )
+    print(
+        table(
+            f"`replay --memory full`, {options.rollouts} rollouts; the first of each worker, which "
+            "starts its simulator, is left out. Aim ≥ 1.8.",
+            ("<workers", ">s a rollout", ">ratio"),
+            workers(options.split, options.rollouts),
+        )
+    )
+
+
+def parse_options() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--split", type=Path, default=Path("demo/tabletop"))
+    parser.add_argument(
+        "--episodes", nargs="+", default=["MoveCube/test/0", "PatternLock/test/0"], metavar="ID"
+    )
+    parser.add_argument("--rounds", type=positive, default=5)
+    parser.add_argument("--rollouts", type=positive, default=24)
+    return parser.parse_args()
+
+
+def overhead(
+    episode: EpisodeId, simulator: TabletopSimulator, split: Split, rounds: int
+) -> list[str]:
+    """Time an episode's rollout bare and in the harness; return the cells of its line."""
+    actions = oracle_actions(episode, simulator)
+    policy = Recorded(actions)
+    config = RunConfig(
+        system="recorded",
+        policy="python:recorded",
+        memory=None,
+        simulator="tabletop",
+        split=split.name,
+        split_name=split.name,
+        revision=split.revision,
+        episode_split=episode.split,
+        model_seed=0,
+        retrieval=None,
+        retrieval_threshold=None,
+        robomme_python=None,
+        check_lesson=False,
+        videos=False,
+        workers=1,
+        rollout_s=600.0,
+        history_chunk=64,
+        max_errors=1,
+    )
+    decoding: list[float] = []
+
+    def bare() -> None:
+        simulator.reset(str(episode), demonstration=False)
+        for action in actions:
+            _, status = simulator.step(action)
+        assert status is Status.SUCCESS
+
+    def harness(condition: str) -> None:
+        item = WorkItem(condition, episode)
+        row = run_rollout(config, item, simulator=simulator, policy=policy, split=split)
+        assert row.success and row.steps == len(actions)
+        if condition == K0:
+            decoding.append(row.history_s or 0.0)
+
+    ways = {BARE: bare, WITHOUT: lambda: harness(WITHOUT), K0: lambda: harness(K0)}
+    times = interleave(ways, rounds)
+    return [
+        str(episode),
+        str(len(actions)),
+        f"{times.median(BARE):.2f}",
+        f"{times.ratio(WITHOUT, BARE):.3f}",
+        f"{times.ratio(K0, BARE):.3f}",
+        f"{less(times, decoding[1:]).ratio(K0, BARE):.3f}",  # the first one was the warm-up
+        str(len(split.load(episode, 0))),
+    ]
+
+
+def less(times: Times, decoding: Sequence[float]) -> Times:
+    """Take the seconds of decoding the history off those of k0."""
+    rest = [all_ - part for all_, part in zip(times.seconds[K0], decoding, strict=True)]
+    return Times({**times.seconds, K0: rest})
+
+
+def oracle_actions(episode: EpisodeId, simulator: TabletopSimulator) -> NDArray[np.float32]:
+    """Return the actions with which the oracle solves an episode, `(n, 8) float32`."""
+    simulator.reset(str(episode), demonstration=False)
+    actions, status = [], Status.ONGOING
+    while status is Status.ONGOING:
+        actions.append(simulator.act("oracle"))
+        _, status = simulator.step(actions[-1], observe=False)
+    return np.stack(actions)
+
+
+def workers(split: Path, rollouts: int) -> list[list[str]]:
+    """Time a run with one worker and with two; return the lines."""
+    seconds = []
+    opened = load_split(split)
+    conditions = [f"k{k}" for k in opened.k_values]
+    families = list(opened.families)[: max(1, rollouts // len(conditions))]
+    for count in (1, 2):
+        clock = Clock()
+        with tempfile.TemporaryDirectory() as folder:
+            run_evaluation(
+                "replay",
+                split,
+                folder,
+                conditions=conditions,
+                families=families,
+                episodes="0",
+                memory="full",
+                workers=count,
+                listener=clock,
+            )
+        # By the row of number `count`, every worker has most likely started.
+        counted = clock.times[count - 1 :]
+        seconds.append((counted[-1] - counted[0]) / (len(counted) - 1))
+    return [
+        ["1", f"{seconds[0]:.2f}", "1.00"],
+        ["2", f"{seconds[1]:.2f}", f"{seconds[0] / seconds[1]:.2f}"],
+    ]
+
+
+if __name__ == "__main__":
+    main()
