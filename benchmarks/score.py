@@ -31,7 +31,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA
 from robomme_interference_data.evaluate.score.cells import main_markdown
 from robomme_interference_data.evaluate.score.scoring import score
-from robomme_interference_data.evaluate.score.tables import write_tables
+from robomme_interference_data.tables import write_tables
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 KS = (0, 1, 3, 7)

@@ -4,9 +4,10 @@ Every rule is a function of the history's embeddings, the query's embedding and 
 true sessions are known to `oracle` alone, which is there to compare with.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,25 @@ from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.retrieval.segment import (
     Span,
+    adaptive_threshold,
     adjacent_cosines,
     cosines,
     long_enough,
     segments,
 )
 
-__all__ = ["METHODS", "Choice", "choose"]
+__all__ = [
+    "ADAPTIVE",
+    "METHODS",
+    "SEGMENT_METHODS",
+    "Choice",
+    "Rule",
+    "choose",
+    "parse_rules",
+    "pick",
+]
+
+ADAPTIVE: Final = "adaptive"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +99,94 @@ METHODS = {
 SEGMENT_METHODS = tuple(name for name in METHODS if name != "top32")
 
 
+@dataclass(frozen=True)
+class Rule:
+    """A way to choose, and where to cut before; checks itself.
+
+    Attributes:
+        method: One of `METHODS`.
+        cut: Cosine of adjacent frames below which a history is cut; `adaptive` for the cut that
+            adapts to the encoder; None for the one published for the encoder, or, where there is
+            none, the adaptive one.
+
+    Raises:
+        UnknownNameError: There is no such method.
+        InvalidOptionError: The cut is no cosine.
+    """
+
+    method: str = "max"
+    cut: float | Literal["adaptive"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UnknownNameError(
+                f"there is no method {self.method!r}", nearest(self.method, METHODS)
+            )
+        if isinstance(self.cut, float | int) and not -1 <= self.cut <= 1:
+            raise InvalidOptionError(
+                f"threshold {self.cut} is no cosine; expected −1 to 1",
+                "Leave it out for the encoder's own.",
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `METHOD` or `METHOD/CUT`, such as `max`, `mean/0.9` or `max/adaptive`.
+
+        Raises:
+            UnknownNameError, InvalidOptionError: See the class.
+        """
+        method, slash, cut = text.partition("/")
+        if not slash:
+            return cls(method)
+        if cut == ADAPTIVE:
+            return cls(method, ADAPTIVE)
+        try:
+            return cls(method, float(cut))
+        except ValueError as error:
+            if isinstance(error, InvalidOptionError):
+                raise
+            raise InvalidOptionError(
+                f"rule {text!r} cuts at {cut!r}; expected a cosine or {ADAPTIVE}",
+                "For example: max/0.923",
+            ) from None
+
+    def settled(self, published: float | None) -> Self:
+        """Return the rule with its cut named, given the one published for the encoder, if any."""
+        own: float | Literal["adaptive"] = ADAPTIVE if published is None else published
+        return type(self)(self.method, own if self.cut is None else self.cut)
+
+    def threshold(self, typical: float) -> float:
+        """Return the cosine below which a settled rule cuts data of this typical cosine."""
+        if self.cut is None:
+            raise InvalidOptionError("the rule's cut is not settled")
+        return adaptive_threshold(typical) if self.cut == ADAPTIVE else float(self.cut)
+
+    def __str__(self) -> str:
+        """Return what `parse` reads."""
+        if self.cut is None:
+            return self.method
+        return f"{self.method}/{self.cut if self.cut == ADAPTIVE else format(self.cut, 'g')}"
+
+
+def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
+    """Read rules, and settle their cuts; `all` stands for every method, and for both cuts.
+
+    Args:
+        texts: What `Rule.parse` reads, or `all`.
+        published: The cut that was published for the encoder, or None.
+
+    Returns:
+        The rules in the order given, each once.
+    """
+    rules: list[Rule] = []
+    for text in texts:
+        if text == "all":
+            rules += [*map(Rule, METHODS), Rule("max", ADAPTIVE)]
+        else:
+            rules.append(Rule.parse(text))
+    return list(dict.fromkeys(rule.settled(published) for rule in rules))
+
+
 def choose(
     history: NDArray[np.float16],
     query: NDArray[np.floating],
@@ -109,15 +210,46 @@ def choose(
         UnknownNameError: There is no such method.
         InvalidOptionError: The history is empty, or `oracle` is not told the lesson.
     """
-    if method not in METHODS:
-        raise UnknownNameError(f"there is no method {method!r}", nearest(method, METHODS))
     if not len(history):
         raise InvalidOptionError(
             "the history is empty: there is nothing to choose from",
             "Retrieval needs a condition with history, such as k0; leave out no-history.",
         )
-    adjacent = adjacent_cosines(history)
-    alike = cosines(history, query)
+    return pick(
+        adjacent_cosines(history),
+        cosines(history, query),
+        threshold=threshold,
+        method=method,
+        lesson=lesson,
+        lot=lot,
+    )
+
+
+def pick(
+    adjacent: NDArray[np.float32],
+    alike: NDArray[np.float32],
+    *,
+    threshold: float,
+    method: str = "max",
+    lesson: Span | None = None,
+    lot: str = "",
+) -> Choice:
+    """Choose as `choose` does, from cosines that are known: several rules need them once.
+
+    Args:
+        adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
+        alike: Cosine of each frame with the query, `(T,) float32`.
+        threshold: As for `choose`.
+        method: As for `choose`.
+        lesson: As for `choose`.
+        lot: As for `choose`.
+
+    Raises:
+        UnknownNameError: There is no such method.
+        InvalidOptionError: `oracle` is not told the lesson.
+    """
+    if method not in METHODS:
+        raise UnknownNameError(f"there is no method {method!r}", nearest(method, METHODS))
     spans = segments(adjacent, threshold)
     candidates = list(long_enough(spans))
     scores: tuple[float | None, ...] = (None,) * len(spans)

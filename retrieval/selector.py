@@ -10,18 +10,14 @@ from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, INDEX_CENTRE
 from robomme_interference_data.draw import even_sample
 from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    StaleIndexError,
-    UnknownNameError,
-    nearest,
-)
-from robomme_interference_data.retrieval.encoders import make_encoder
+from robomme_interference_data.errors import InvalidOptionError, StaleIndexError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.retrieval.encoders import make_encoder, published_threshold
 from robomme_interference_data.retrieval.encoders.base import fingerprint_digest
-from robomme_interference_data.retrieval.segment import Span, adaptive_threshold
-from robomme_interference_data.retrieval.select import METHODS, Choice, choose
+from robomme_interference_data.retrieval.segment import Span
+from robomme_interference_data.retrieval.select import SEGMENT_METHODS, Choice, Rule, choose
 
-__all__ = ["Selection", "Selector", "true_lesson"]
+__all__ = ["Selection", "Selector", "lot_of", "select", "true_lesson"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,39 +69,23 @@ class Selector:
         method: str = "max",
         device: str | None = None,
     ):
-        if method not in METHODS:
-            raise UnknownNameError(f"there is no method {method!r}", nearest(method, METHODS))
         if method == "top32":
             raise InvalidOptionError(
                 "method 'top32' chooses single frames; a policy is handed a span",
-                "Choose max, mean, last, random or oracle.",
+                f"Choose one of {', '.join(SEGMENT_METHODS)}.",
             )
-        if threshold is not None and not -1 <= threshold <= 1:
-            raise InvalidOptionError(
-                f"threshold {threshold} is no cosine; expected −1 to 1",
-                "Leave it out for the encoder's own.",
-            )
+        self.rule = Rule(method, threshold).settled(published_threshold(encoder))
         self._encoder = make_encoder(encoder, device=device)
-        self._threshold = threshold if threshold is not None else self._encoder.threshold
-        self.method = method
 
     @property
     def name(self) -> str:
         """Encoder and rule, such as `thumbnail/max/adaptive` or `siglip/max/0.923`."""
-        cut = "adaptive" if self._threshold is None else f"{self._threshold:g}"
-        encoder = PurePath(index_folder(self._encoder.name)).name
-        return f"{encoder}/{self.method}/{cut}"
+        return f"{PurePath(index_folder(self._encoder.name)).name}/{self.rule}"
 
     @property
     def camera(self) -> str:
         """Camera whose frames it compares."""
         return "front"
-
-    def threshold_for(self, index: EmbeddingIndex) -> float:
-        """Return the cosine below which histories of this index are cut."""
-        if self._threshold is not None:
-            return self._threshold
-        return adaptive_threshold(index.typical_cosine)
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Selection:
         """Choose the span of a buffer that goes with an image.
@@ -126,24 +106,8 @@ class Selector:
                 f"image of shape {image.shape}, {image.dtype}; expected (H, W, 3) uint8"
             )
         features = self._encoder.features(self._encoder.prepare(image[None]))
-        return self._choose(buffer, normalised(features, index.centre)[0])
-
-    def select_stored(self, buffer: Buffer) -> Selection:
-        """Choose with the stored first live observation, whose embedding is looked up too."""
-        return self._choose(buffer, buffer.query_embedding(self._encoder.name))
-
-    def _choose(self, buffer: Buffer, query: NDArray[np.float16]) -> Selection:
-        name = self._encoder.name
-        choice = choose(
-            buffer.embeddings(name),
-            query,
-            threshold=self.threshold_for(buffer.query_index(name)),
-            method=self.method,
-            lesson=true_lesson(buffer) if self.method == "oracle" else None,
-            lot=f"{buffer.episode_id} k{buffer.k}",
-        )
-        start, stop = choice.span
-        return Selection(start, stop, choice, *_fractions(buffer, start, stop))
+        query = normalised(features, index.centre)[0]
+        return select(buffer, self._encoder.name, self.rule, query)
 
     def _check(self, index: EmbeddingIndex) -> None:
         """Check that the index was made with this very encoder and camera."""
@@ -162,6 +126,38 @@ class Selector:
                 f"Make them again: robomme-interference index --data SPLIT --encoder "
                 f"{self._encoder.name} --camera {self.camera}",
             )
+
+
+def select(
+    buffer: Buffer, encoder: str, rule: Rule, query: NDArray[np.floating] | None = None
+) -> Selection:
+    """Choose the span of a buffer by embeddings that are there; no encoder is needed.
+
+    Args:
+        buffer: The history.
+        encoder: Name of the encoder whose index is looked up.
+        rule: How to choose, its cut settled.
+        query: Embedding of the live observation, `(D,)`; None for the stored first one.
+
+    Raises:
+        MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
+        InvalidOptionError: The buffer is empty, or the rule chooses single frames.
+    """
+    choice = choose(
+        buffer.embeddings(encoder),
+        buffer.query_embedding(encoder) if query is None else query,
+        threshold=rule.threshold(buffer.query_index(encoder).typical_cosine),
+        method=rule.method,
+        lesson=true_lesson(buffer) if rule.method == "oracle" else None,
+        lot=lot_of(buffer.episode_id, buffer.k),
+    )
+    start, stop = choice.span
+    return Selection(start, stop, choice, *_fractions(buffer, start, stop))
+
+
+def lot_of(episode_id: EpisodeId, k: int) -> str:
+    """Return what the method `random` draws by for one buffer."""
+    return f"{episode_id} k{k}"
 
 
 def true_lesson(buffer: Buffer) -> Span:

@@ -22,7 +22,11 @@ from robomme_interference_data.simulators import commands as simulator_commands
 __all__ = ["app", "main"]
 
 
-SEVERAL = {"build": ("--k",), "evaluate": ("--conditions", "--families")}
+SEVERAL = {
+    "build": ("--k",),
+    "evaluate": ("--conditions", "--families"),
+    "retrieval-score": ("--rules",),
+}
 """Options that take several values, by command."""
 
 
@@ -71,6 +75,9 @@ app.command()(check_commands.audit)
 app.command(name="list")(commands.list_buffers)
 app.command()(commands.show)
 app.command()(retrieval_commands.index)
+app.command()(retrieval_commands.retrieve)
+app.command(name="retrieval-score")(retrieval_commands.retrieval_score)
+app.command()(retrieval_commands.calibrate)
 app.command()(commands.doctor)
 app.command()(simulator_commands.simulate)
 app.command(name="simulate-score")(simulator_commands.simulate_score)

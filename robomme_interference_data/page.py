@@ -16,7 +16,19 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
 from robomme_interference_data.files import atomic_path
 
-__all__ = ["Page", "ink_on", "open_figure", "open_page", "save_figure", "tint"]
+__all__ = [
+    "GREY",
+    "INK",
+    "Page",
+    "ink_on",
+    "open_figure",
+    "open_page",
+    "save_figure",
+    "tidy",
+    "tint",
+]
+
+INK, GREY = "#222222", "#767676"
 
 _DPI = 180
 _METADATA = {".png": ("Software",), ".svg": ("Creator", "Date", "Format", "Type")}
@@ -215,6 +227,15 @@ class Page:
 
 def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
+
+
+def tidy(axes: Any) -> None:
+    """Take away from axes what carries nothing."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+    axes.tick_params(colors=INK, labelsize=8, length=3)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
 
 
 def tint(color: str, share: float) -> str:

@@ -28,7 +28,7 @@ FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour
 
 
 def main() -> None:
-    """Build, load, verify, audit and draw; then build from the simulator, evaluate and score."""
+    """Build, load, verify, audit, draw, retrieve; the same simulated, then evaluate and score."""
     began = time.monotonic()
     DEMO.mkdir(exist_ok=True)
     queries, units = recorded_here() if (ROOT / SHARED).is_dir() else self_recorded()
@@ -42,9 +42,18 @@ def main() -> None:
     run(f"show VideoRepick/test/0 --split {SPLIT} --k 7 --out {DEMO}/strip.png")
     run(f"audit {SPLIT}")
     run(f"verify {SPLIT}")
+    retrieve(SPLIT, "VideoUnmask/test/0", DEMO / "retrieval.png")
     simulate()
+    retrieve(DEMO / "tabletop", "MoveCube/test/0", DEMO / "tabletop_retrieval.png")
     evaluate()
     say(f"\nDone in {time.monotonic() - began:.0f} s: {DEMO / 'score' / 'report.html'}")
+
+
+def retrieve(split: Path, episode: str, picture: Path) -> None:
+    """Embed a split, draw why a session was chosen, and grade the choice on all buffers."""
+    run(f"index --data {split} --encoder thumbnail")
+    run(f"retrieve {episode} --k 7 --split {split} --out {picture}")
+    run(f"retrieval-score --split {split} --out {DEMO}/retrieval/{split.name}")
 
 
 def simulate() -> None:

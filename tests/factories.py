@@ -58,7 +58,7 @@ def sample() -> Path:
     Two train and two test episodes a family; VideoRepick/train/1 is too short for a unit, so the
     pool has 7 units. Lessons have 20 (index 0) and 36 (index 1) frames.
     """
-    folder = _temporary() / "sample"
+    folder = temporary() / "sample"
     for _ in write_sample(folder, families=FAMILIES, train=2, test=2, size=64, demonstration=20):
         pass
     return folder
@@ -67,7 +67,7 @@ def sample() -> Path:
 @cache
 def split() -> Path:
     """A split of the sample (8 queries, 7 units, k 0, 1, 3), made once; treat it as read-only."""
-    return build_split(sample(), _temporary() / "split")
+    return build_split(sample(), temporary() / "split")
 
 
 def copy_of_split(folder: Path) -> Path:
@@ -77,7 +77,8 @@ def copy_of_split(folder: Path) -> Path:
 
 
 @cache
-def _temporary() -> Path:
+def temporary() -> Path:
+    """A folder that goes when the process ends."""
     folder = Path(tempfile.mkdtemp(prefix="interference-tests-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder

@@ -162,6 +162,28 @@ def test_all_ways_of_scoring_find_the_same(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.slow
+def test_retrieval_prints_rates_times_and_memory() -> None:
+    pytest.importorskip("transformers")
+    options = ("--model", "tiny", "--device", "cpu", "--rounds", "1", "--queries", "9")
+    sizes = ("--history", "5000", "--size", "16")
+    index, lookup, history = printed("retrieval", "--split", factories.split(), *options, *sizes)
+    assert [row[0] for row in index] == ["index, thumbnail", "index, siglip tiny"]
+    assert [row[2] for row in index] == ["bare decoding", "bare forward pass"]
+    assert index[1][5] == "≥ 0.95"
+    for _, rate, _, other, ratio, _ in index:  # one round: the ratio is that of the rates
+        made, bare = (float(cell.replace(",", "")) for cell in (rate, other))
+        assert float(ratio) == pytest.approx(made / bare, rel=0.05, abs=0.006)
+    # Nine queries at four k; lessons of up to 1,071 frames.
+    assert [row[0] for row in lookup][2] == "grading 36 buffers"
+    assert all(float(row[1].replace(",", "")) > 0 for row in lookup)
+    # A block of 4,096 rows as float32 for one way, all 5,000 for the other; a little around them.
+    block, whole = 4096 * 16 * 4 / 1e6, 5000 * 16 * 4 / 1e6
+    for row in history:
+        assert block <= float(row[2]) + 0.05 and float(row[2]) < 3 * block
+        assert whole <= float(row[5]) + 0.05 and float(row[5]) < 1.5 * whole
+
+
+@pytest.mark.slow
 def test_made_up_episode_tables_have_the_columns_of_real_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,7 +199,9 @@ def test_made_up_episode_tables_have_the_columns_of_real_ones(
         assert len(list(made_up.records())) == 11
 
 
-@pytest.mark.parametrize("name", ["load", "build", "manifests", "policies", "evaluate", "score"])
+@pytest.mark.parametrize(
+    "name", ["load", "build", "manifests", "policies", "evaluate", "score", "retrieval"]
+)
 def test_help_and_refusals(name: str) -> None:
     shown = run(name, "--help")
     assert shown.returncode == 0 and "--rounds" in shown.stdout

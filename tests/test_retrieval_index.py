@@ -28,7 +28,8 @@ from robomme_interference_data.retrieval.encoders import make_encoder
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import adaptive_threshold
-from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.retrieval.select import Rule
+from robomme_interference_data.retrieval.selector import Selector, select
 
 QUIET = BuildProgress(quiet=True)
 EPISODE = "VideoRepick/test/0"
@@ -194,9 +195,11 @@ def test_the_selector(split: Path) -> None:
     assert Selector("thumbnail", threshold=0.9, method="mean").name == "thumbnail/mean/0.9"
     for buffer in load_split(split).buffers(k=3):
         index = buffer.query_index("thumbnail")
-        assert selector.threshold_for(index) == adaptive_threshold(index.typical_cosine)
+        assert selector.rule.threshold(index.typical_cosine) == adaptive_threshold(
+            index.typical_cosine
+        )
         chosen = selector.select(buffer, buffer.query_frame())
-        stored = selector.select_stored(buffer)
+        stored = select(buffer, "thumbnail", selector.rule)
         assert (chosen.start, chosen.stop) == (stored.start, stored.stop)
         # An even sample of the span with the live observation as the last of its frames.
         roles = [*buffer.session_index[chosen.start : chosen.stop], -1]
@@ -205,7 +208,7 @@ def test_the_selector(split: Path) -> None:
         assert chosen.lesson_fraction == sample.count(0) / count
         assert chosen.filler_fraction == sum(role > 0 for role in sample) / count
         assert chosen.query_fraction == 1 / count
-    whole = Selector("thumbnail", threshold=-1.0).select_stored(load_buffer(EPISODE, 1, split))
+    whole = select(load_buffer(EPISODE, 1, split), "thumbnail", Rule(cut=-1.0))
     # One segment of 52 frames; j · 52 // 31 is below 20 for j = 0 … 11, 52 for j = 31.
     assert (whole.start, whole.stop) == (0, 52)
     assert whole.lesson_fraction == 12 / 32
@@ -289,7 +292,7 @@ def test_siglip_makes_an_index(split: Path, model: str) -> None:
     selector = Selector(model, device="cpu")
     assert selector.name == "siglip-tiny/max/adaptive"
     live = selector.select(buffer, buffer.query_frame()).choice.query_cosines
-    stored = selector.select_stored(buffer).choice.query_cosines
+    stored = select(buffer, model, selector.rule).choice.query_cosines
     assert live == pytest.approx(stored, abs=2e-3)
 
 

@@ -10,8 +10,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.evaluate.score import bootstrap
-from robomme_interference_data.evaluate.score.bootstrap import (
+from robomme_interference_data import bootstrap
+from robomme_interference_data.bootstrap import (
     Resampler,
     Statistic,
     difference,

@@ -21,9 +21,9 @@ from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score, score
-from robomme_interference_data.evaluate.score.tables import write_tables
 from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.intervals import newcombe, wilson
+from robomme_interference_data.tables import write_tables
 
 GOLDEN = Path(__file__).parent / "golden" / "score"
 RELEASED = (

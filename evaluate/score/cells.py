@@ -12,9 +12,9 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.rows import condition_rank
 from robomme_interference_data.evaluate.score.check import DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import ERROR, Expected, Outcomes, episode_id
-from robomme_interference_data.evaluate.score.tables import Column, Table, percent
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.intervals import wilson
+from robomme_interference_data.tables import Column, Table, percent
 
 __all__ = ["Cell", "MainGrid", "Part", "cells_by", "coverage_table", "main_grids", "main_markdown"]
 __all__ += ["main_note", "rate_table"]

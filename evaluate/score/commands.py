@@ -63,7 +63,7 @@ def score(
     from robomme_interference_data.evaluate.score.figures import draw_figures
     from robomme_interference_data.evaluate.score.report import write_report
     from robomme_interference_data.evaluate.score.scoring import score as compute
-    from robomme_interference_data.evaluate.score.tables import write_tables
+    from robomme_interference_data.tables import write_tables
 
     found = compute(rows, system, lenient, grid, against is Against.PAPER)
     for refusal in found.rollouts.refusals:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.bootstrap import Interval, Resampler, difference
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.rows import condition_rank
-from robomme_interference_data.evaluate.score.bootstrap import Interval, Resampler, difference
 from robomme_interference_data.evaluate.score.outcomes import (
     SUCCESS,
     Outcomes,
@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.score.outcomes import (
 )
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
 from robomme_interference_data.evaluate.score.statistics import holm, mcnemar
-from robomme_interference_data.evaluate.score.tables import Column, Table
+from robomme_interference_data.tables import Column, Table
 
 __all__ = ["Comparison", "compare"]
 

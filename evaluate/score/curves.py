@@ -7,9 +7,10 @@ from typing import Any
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.looks import INK, Look, inches, looks_of, tidy
+from robomme_interference_data.evaluate.score.looks import Look, inches, looks_of
 from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.page import INK, tidy
 
 __all__ = ["Cells", "Data", "as_published", "curve", "dodged", "legend", "published_curves"]
 __all__ += ["set_axes", "short"]

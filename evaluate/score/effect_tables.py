@@ -8,7 +8,7 @@ import numpy as np
 from robomme_interference_data.evaluate.score.effects import Contrast, Effects
 from robomme_interference_data.evaluate.score.outcomes import ERROR, SUCCESS, Outcomes
 from robomme_interference_data.evaluate.score.statistics import cohens_h, flip_rate, holm
-from robomme_interference_data.evaluate.score.tables import Column, Table
+from robomme_interference_data.tables import Column, Table
 
 __all__ = ["contrast_table", "decay_table", "lift_table", "noise_table"]
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
-from robomme_interference_data.evaluate.score.bootstrap import (
+from robomme_interference_data.bootstrap import (
     DRAWS,
     Interval,
     Resampler,
@@ -21,6 +20,7 @@ from robomme_interference_data.evaluate.score.bootstrap import (
     retention,
     slope,
 )
+from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.outcomes import SUCCESS, Expected, Outcomes
 from robomme_interference_data.evaluate.score.statistics import mcnemar, slope_weights
 from robomme_interference_data.evaluate.systems import SYSTEMS

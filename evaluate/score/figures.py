@@ -21,9 +21,9 @@ from robomme_interference_data.evaluate.score.curves import (
     short,
 )
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.looks import GREY, INK, inches, label_ends, tidy
+from robomme_interference_data.evaluate.score.looks import inches, label_ends
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.page import ink_on, open_figure, save_figure
+from robomme_interference_data.page import GREY, INK, ink_on, open_figure, save_figure, tidy
 
 __all__ = ["FIGURES", "draw_figures"]
 

@@ -7,8 +7,8 @@ from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import START, Contrast, base_of
 from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables import percent, points
 from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.tables import percent, points
 
 __all__ = ["headline"]
 

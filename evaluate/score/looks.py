@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from robomme_interference_data.evaluate.systems import SYSTEMS, System, display_name
+from robomme_interference_data.page import INK
 
-__all__ = ["GREY", "INK", "Look", "inches", "label_ends", "looks_of", "spread", "tidy"]
-
-INK, GREY = "#222222", "#767676"
+__all__ = ["Look", "inches", "label_ends", "looks_of", "spread"]
 
 # Okabe and Ito's colours, safe for the colour-blind: one for what the memory is made of.
 _COLOURS = {
@@ -137,12 +136,3 @@ def spread(values: Sequence[float], gap: float) -> list[float]:
             mean, size = (mean * size + before * count) / (size + count), size + count
         stacks.append((mean, size))
     return [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
-
-
-def tidy(axes: Any) -> None:
-    """Take away what carries nothing."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(GREY)
-    axes.tick_params(colors=INK, labelsize=8, length=3)
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-    axes.set_axisbelow(True)

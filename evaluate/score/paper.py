@@ -8,8 +8,8 @@ from importlib import resources
 
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.tables import Column, Table
 from robomme_interference_data.intervals import newcombe, wilson
+from robomme_interference_data.tables import Column, Table
 
 __all__ = ["SOURCE", "Published", "comparable", "paper_table", "published"]
 

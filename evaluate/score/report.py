@@ -10,9 +10,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.rows import condition_rank
-from robomme_interference_data.evaluate.score.bootstrap import DRAWS
 from robomme_interference_data.evaluate.score.cells import MainGrid, main_grids, main_note
 from robomme_interference_data.evaluate.score.episodes import episode_rows
 from robomme_interference_data.evaluate.score.figures import FIGURES
@@ -20,9 +20,9 @@ from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.read import Source
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables import Table
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import atomic_path, sha256_file
+from robomme_interference_data.tables import Table
 
 __all__ = ["write_report"]
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import BadRowsError
-from robomme_interference_data.evaluate.score.bootstrap import DRAWS
 from robomme_interference_data.evaluate.score.cells import (
     Cell,
     cells_by,
@@ -28,7 +28,7 @@ from robomme_interference_data.evaluate.score.outcomes import (
 )
 from robomme_interference_data.evaluate.score.paper import paper_table
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
-from robomme_interference_data.evaluate.score.tables import Table
+from robomme_interference_data.tables import Table
 
 __all__ = ["Score", "score"]
 

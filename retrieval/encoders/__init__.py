@@ -1,11 +1,15 @@
 """Image encoders by name."""
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.encoders.base import Encoder
+from robomme_interference_data.retrieval.encoders.names import (
+    DEFAULT_MODEL,
+    KINDS,
+    encoder_name,
+    published_threshold,
+)
 
-__all__ = ["KINDS", "Encoder", "make_encoder"]
-
-KINDS = ("siglip", "thumbnail")
+__all__ = ["KINDS", "Encoder", "encoder_name", "make_encoder", "published_threshold"]
 
 
 def make_encoder(name: str, *, device: str | None = None, batch: int | None = None) -> Encoder:
@@ -22,24 +26,13 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
         InvalidOptionError: An option is out of range, or the encoder takes no model.
         MissingExtraError, MissingWeightsError, FormatError: See `siglip.Siglip`.
     """
-    kind, colon, model = name.partition(":")
-    if kind not in KINDS:
-        raise UnknownNameError(f"there is no encoder {name!r}", nearest(kind, KINDS))
+    kind, _, model = encoder_name(name).partition(":")
     if batch is not None and batch < 1:
         raise InvalidOptionError(f"batch={batch}; expected 1 or more")
     if kind == "thumbnail":
-        if colon:
-            raise InvalidOptionError(
-                f"encoder {name!r}: thumbnail has no models", "Type: --encoder thumbnail"
-            )
         from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 
         return Thumbnail()
-    if colon and not model:
-        raise InvalidOptionError(
-            f"encoder {name!r} names no model",
-            "Type siglip for the paper's model, or siglip:ID with an id or a folder.",
-        )
-    from robomme_interference_data.retrieval.encoders.siglip import DEFAULT_MODEL, Siglip
+    from robomme_interference_data.retrieval.encoders.siglip import Siglip
 
     return Siglip(model or DEFAULT_MODEL, device=device, batch=batch)

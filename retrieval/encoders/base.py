@@ -22,14 +22,11 @@ class Encoder(Protocol):
         centred: Whether the mean over a data set is taken off the features before they are
             normalised.
         batch: Images that it takes best at a time.
-        threshold: Cosine of adjacent frames below which a history is cut, if one was published
-            for this encoder; None for the rule that adapts to the data.
     """
 
     name: str
     centred: bool
     batch: int
-    threshold: float | None
 
     @property
     def fingerprint(self) -> dict[str, Any]:

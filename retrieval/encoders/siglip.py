@@ -19,13 +19,9 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     MissingWeightsError,
 )
+from robomme_interference_data.retrieval.encoders.names import DEFAULT_MODEL, encoder_name
 
-__all__ = ["DEFAULT_MODEL", "PAPER_THRESHOLD", "Siglip"]
-
-DEFAULT_MODEL = "google/siglip-so400m-patch14-384"
-
-PAPER_THRESHOLD = 0.923
-"""The paper's cut (section "Adding Retrieval"), made for the default model."""
+__all__ = ["Siglip"]
 
 _FILES = ("*.json", "*.safetensors")
 
@@ -51,8 +47,7 @@ class Siglip:
         self, model: str = DEFAULT_MODEL, *, device: str | None = None, batch: int | None = None
     ):
         torch, transformers = _libraries()
-        self.name = "siglip" if model == DEFAULT_MODEL else f"siglip:{model}"
-        self.threshold = PAPER_THRESHOLD if model == DEFAULT_MODEL else None
+        self.name = encoder_name(f"siglip:{model}")
         self._torch = torch
         folder, self._revision = _locate(model)
         self._model = "/".join(model.partition("@")[0].split("/")[-2:]) if self._revision else None

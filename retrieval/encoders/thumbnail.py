@@ -28,7 +28,6 @@ class Thumbnail:
     name = "thumbnail"
     centred = True
     batch = 64
-    threshold: float | None = None
     computed_in = "numpy"
 
     @property

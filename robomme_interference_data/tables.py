@@ -73,6 +73,19 @@ class Table:
         text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
         return "\n\n".join(part for part in (f"# {self.title}", text, self.note) if part) + "\n"
 
+    def text(self) -> str:
+        """Return the table for a terminal: aligned, under its title, the note below."""
+        heads = [column.name.replace("_", " ") for column in self.columns]
+        lines = [heads, *(self.cells(row) for row in self.rows)]
+        widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+        sides = ["<" if column.kind in ("text", "flag") else ">" for column in self.columns]
+        laid = [
+            "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip()
+            for line in lines
+        ]
+        text = "\n".join([laid[0], "  ".join("-" * width for width in widths), *laid[1:]])
+        return "\n\n".join(part for part in (self.title, text, self.note) if part)
+
 
 def write_tables(tables: Sequence[Table], folder: Path, main: str) -> None:
     """Write each table as `<name>.csv` and `<name>.md`.

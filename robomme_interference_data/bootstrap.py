@@ -1,4 +1,4 @@
-"""Bootstrap intervals for what is computed from the same episodes under several conditions."""
+"""Bootstrap intervals for what is computed from episodes, under one condition or several."""
 
 import hashlib
 import math
@@ -10,7 +10,16 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DRAWS", "Interval", "Resampler", "Statistic", "difference", "retention", "slope"]
+__all__ = [
+    "DRAWS",
+    "Interval",
+    "Resampler",
+    "Statistic",
+    "difference",
+    "mean",
+    "retention",
+    "slope",
+]
 
 DRAWS = 10_000
 _CHUNK = 2**15  # numbers at a time: they stay in the cache, and BLAS starts no threads for them
@@ -54,6 +63,11 @@ def _together(columns: Sequence[int]) -> Callable[[Floats], Floats]:
         return chosen
 
     return features
+
+
+def mean(column: int) -> Statistic:
+    """Return the mean of a column, over the episodes that have it."""
+    return Statistic(_together((column,)), lambda s: s[:, 0] / s[:, 1])
 
 
 def difference(first: int, second: int) -> Statistic:
