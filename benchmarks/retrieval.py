@@ -27,9 +27,15 @@ from timing import Times, interleave, machine, megabytes, positive, table
 
 from robomme_interference_data import Dataset, load_split
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, EPISODES_DIR, MANIFESTS
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    EPISODES_DIR,
+    INFO_PATH,
+    MANIFESTS,
+)
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.files import LocalFiles, read_json, write_json
 from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade, measure
@@ -133,8 +139,11 @@ def index_table(
     """Time the index of the distractor units against decoding, and against the forward pass."""
     root = folder / DISTRACTORS
     shutil.copytree(split / DISTRACTORS, root, ignore=shutil.ignore_patterns("index"))
-    for path in (root / EPISODES_DIR).rglob("*.parquet"):
-        pq.write_table(pq.read_table(path).slice(0, options.units), path)
+    (path,) = (root / EPISODES_DIR).rglob("*.parquet")
+    few = pq.read_table(path).slice(0, options.units)
+    pq.write_table(few, path)
+    info = read_json(root / INFO_PATH)
+    write_json(root / INFO_PATH, info | {"total_episodes": len(few)})
     dataset = Dataset(LocalFiles(root))
     camera = dataset.cameras[0]
     frames = sum(record.length for record in dataset.records())

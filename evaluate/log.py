@@ -88,6 +88,10 @@ class RunLog:
                 file.write(f"{row.finished_at} {row.family}/{row.episode_split}/{row.episode} ")
                 file.write(f"{row.condition}, attempt {row.attempt}\n{traceback.rstrip()}\n\n")
 
+    def reread(self) -> None:
+        """Take the rows as they are on the disk."""
+        self.rows = read_log(self.folder)
+
     def replace(self, rows: Iterable[Rollout]) -> None:
         """Write all rows anew, whole or not at all."""
         self.rows = {row.key: row for row in rows}

@@ -224,6 +224,7 @@ def _run(
             stopped = None
     finally:
         outcomes.close()
+        log.reread()  # Ctrl-C may have come between a row's writing and its counting
         log.write_tables(order)
         rows = tuple(log.rows[key] for key in keys if key in log.rows)
         counts = summary(rows)
