@@ -18,28 +18,12 @@ import pytest
 import typer
 
 from robomme_interference_data import load_split
-from robomme_interference_data.cli import app, main, spread
+from robomme_interference_data.cli import app, spread
 
 EPISODE = "VideoUnmask/test/1"
 SCRIPT = Path(sys.executable).with_name("robomme-interference")
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the command line in this process; returns exit code, stdout and stderr."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        code = ended.value.code
-        return (code if isinstance(code, int) else 0), out, err
-
-    return call
 
 
 @pytest.fixture

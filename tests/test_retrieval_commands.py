@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -17,7 +16,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from robomme_interference_data import load_split
-from robomme_interference_data.cli import main
 from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.progress import BuildProgress
@@ -29,22 +27,6 @@ EPISODE = "VideoRepick/test/0"
 GOLDEN = Path(__file__).parent / "golden" / "index"
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the command line in this process; returns exit code, stdout and stderr."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        code = ended.value.code
-        return (code if isinstance(code, int) else 0), out, err
-
-    return call
 
 
 @cache

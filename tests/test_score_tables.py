@@ -13,6 +13,7 @@ import score_rows as made
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app
+from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import BadRowsError
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.score.cells import main_markdown
@@ -173,19 +174,7 @@ def test_the_benchmarks_grid_finds_all_of_it_incomplete(small: Score, tmp_path: 
 def test_episodes_beside_the_grid_make_a_cell_incomplete(tmp_path: Path) -> None:
     lines = [
         f"my-memory,{family},k0,{episode},{place},easy,fail,0,9"
-        for place, family in enumerate(
-            [
-                "VideoRepick",
-                "VideoPlaceOrder",
-                "VideoPlaceButton",
-                "VideoUnmask",
-                "VideoUnmaskSwap",
-                "MoveCube",
-                "InsertPeg",
-                "PatternLock",
-                "RouteStick",
-            ]
-        )
+        for place, family in enumerate(FAMILIES)
         for episode in range(50)
     ]
     lines = [line.replace(f",{place},easy", ",,easy") for place, line in enumerate(lines)]
