@@ -27,6 +27,7 @@ __all__ = [
     "check_history",
     "display_name",
     "get_system",
+    "is_bound",
     "name_system",
 ]
 
@@ -51,6 +52,8 @@ class System:
         retrieval: Whether a retrieval step chooses what the memory gets.
         position_limit: History and live frames together that the memory holds; None: no limit.
         paper: Whether the paper reports it.
+        bound: Whether it uses no memory at all, and only shows what can be reached with the
+            answer, by chance, or by standing still: such a system is never ranked.
     """
 
     name: str
@@ -63,6 +66,7 @@ class System:
     retrieval: bool = False
     position_limit: int | None = None
     paper: bool = False
+    bound: bool = False
 
 
 def _released(
@@ -87,7 +91,7 @@ def _symbolic(name: str, display: str, representation: str, subgoals: str) -> Sy
     return System(name, display, representation, "subgoals", subgoals=subgoals, paper=True)
 
 
-def _control(name: str, display: str, memory: str = "none", *, retrieval: bool = False) -> System:
+def _control(name: str, display: str, memory: str, *, retrieval: bool = False) -> System:
     return System(name, display, memory, None, no_history=not retrieval, retrieval=retrieval)
 
 
@@ -115,9 +119,9 @@ PAPER_SYSTEMS: tuple[System, ...] = (
 """The twelve systems of the paper's main table in its order, then the one with retrieval."""
 
 _CONTROLS = (
-    _control("oracle", "Oracle"),
-    _control("guess", "Guess"),
-    _control("hold", "Hold"),
+    System("oracle", "Oracle", "none", None, bound=True),
+    System("guess", "Guess", "none", None, bound=True),
+    System("hold", "Hold", "none", None, bound=True),
     _control("replay-full", "Replay-Full", "all frames"),
     _control("replay-framesamp", "Replay-FrameSamp", "frames"),
     _control("replay-window", "Replay-Window", "last frames"),
@@ -179,6 +183,11 @@ def _alike(name: str, known: str) -> bool:
 def display_name(name: str) -> str:
     """Return the name for tables and figures; a name that is not in the table stays as it is."""
     return SYSTEMS[name].display if name in SYSTEMS else name
+
+
+def is_bound(name: str) -> bool:
+    """Whether a system only bounds what a memory can reach; one of your own never does."""
+    return name in SYSTEMS and SYSTEMS[name].bound
 
 
 def check_condition(system: System, condition: str) -> None:

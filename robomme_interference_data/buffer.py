@@ -2,8 +2,7 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -24,38 +23,10 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema import BufferManifest, SessionEntry
+from robomme_interference_data.schema import BufferManifest
+from robomme_interference_data.sessions import Session, SessionReader
 
-__all__ = ["Buffer", "Chunk", "Session"]
-
-_PIECE = 128
-"""Frames that one thread decodes at a time: a multiple of the key frame distance (16)."""
-
-
-@dataclass(frozen=True)
-class Session:
-    """A session of a buffer.
-
-    Attributes:
-        role: `lesson`, `distractor`, … (see `schema.ROLES`).
-        family: Family of the recorded episode.
-        source: Id of the recorded episode.
-        start: First frame of the session in the buffer.
-        stop: Frame after its last one.
-        entry: Where the frames are stored.
-    """
-
-    role: str
-    family: str
-    source: EpisodeId
-    start: int
-    stop: int
-    entry: SessionEntry
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """First frame in the buffer, and the one after the last."""
-        return (self.start, self.stop)
+__all__ = ["Buffer", "Chunk"]
 
 
 @dataclass(frozen=True)
@@ -95,10 +66,9 @@ class Buffer:
     ):
         self.manifest = manifest
         self._datasets = datasets
-        self._cache = cache
-        self._threads = threads if threads is not None else os.cpu_count() or 1
-        if self._threads < 1:
+        if threads is not None and threads < 1:
             raise InvalidOptionError(f"threads={threads}; expected 1 or more")
+        self._reader = SessionReader(datasets, cache, threads or os.cpu_count() or 1)
 
     def __repr__(self) -> str:
         return (
@@ -172,14 +142,7 @@ class Buffer:
         """
         feature = self._feature(camera)
         out = np.empty((len(self), *self._shape(feature)), np.uint8)
-        with ThreadPoolExecutor(self._threads) as pool:
-            try:
-                finish = [self._start_reading(s, feature, out, pool) for s in self.sessions]
-                for step in finish:
-                    step()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        self._reader.read(self.sessions, feature, out)
         return out
 
     def frame(self, index: int, camera: str = "front") -> NDArray[np.uint8]:
@@ -199,11 +162,9 @@ class Buffer:
                 f"has {len(self)} history frames, numbered from 0"
             )
         session = self.sessions[bisect_right(self.sessions, index, key=lambda s: s.start) - 1]
-        entry = session.entry
         feature = self._feature(camera)
         out = np.empty((1, *self._shape(feature)), np.uint8)
-        stored = entry.start + (index - session.start) // entry.repeat
-        self._datasets[entry.dataset].read_frames(entry.episode_index, feature, stored, out)
+        self._reader.read_one(session, feature, index, out)
         return out[0]
 
     def query_frame(self, camera: str = "front") -> NDArray[np.uint8]:
@@ -290,7 +251,10 @@ class Buffer:
             )
         wanted = self.cameras if cameras is None else cameras
         names = {name: self._feature(name) for name in wanted}
-        decoders = {name: self._iter_frames(feature, start, end) for name, feature in names.items()}
+        decoders = {
+            name: self._reader.iter_frames(self.sessions, feature, start, end)
+            for name, feature in names.items()
+        }
         session_index = self.session_index
         try:
             for first in range(start, end, chunk):
@@ -329,92 +293,6 @@ class Buffer:
                 "then run robomme-interference verify SPLIT",
             )
 
-    def _start_reading(
-        self,
-        session: Session,
-        feature: str,
-        out: NDArray[np.uint8],
-        pool: ThreadPoolExecutor,
-    ) -> Callable[[], None]:
-        """Start to read a session into its place in `out`; the result waits until it is done."""
-        entry = session.entry
-        dataset = self._datasets[entry.dataset]
-        target = out[session.start : session.stop]
-        length = entry.stop - entry.start
-        digest = self._digest(entry, feature)
-        if self._cache is not None and digest is not None:
-            cached = self._cache.get(digest, (length, *out.shape[1:]))
-            if cached is not None:
-                copied = pool.submit(_copy_repeated, target, cached, entry.repeat)
-                return copied.result
-        span = target if entry.repeat == 1 else np.empty((length, *out.shape[1:]), np.uint8)
-        piece = _PIECE if self._threads > 1 else length
-        read = [
-            pool.submit(
-                dataset.read_frames,
-                entry.episode_index,
-                feature,
-                entry.start + first,
-                span[first : first + piece],
-            )
-            for first in range(0, length, piece)
-        ]
-
-        def finish() -> None:
-            for future in read:
-                future.result()
-            if span is not target:
-                _copy_repeated(target, span, entry.repeat)
-            if self._cache is not None and digest is not None:
-                self._cache.put(digest, span)
-
-        return finish
-
-    def _iter_frames(self, feature: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
-        for session in self.sessions:
-            first, last = max(start, session.start), min(stop, session.stop)
-            if first >= last:
-                continue
-            entry = session.entry
-            stored = entry.start + (first - session.start) // entry.repeat
-            end = entry.start + -(-(last - session.start) // entry.repeat)
-            position = first
-            for frame in self._stored_frames(entry, feature, stored, end):
-                shown = min(
-                    last, position + entry.repeat - (position - session.start) % entry.repeat
-                )
-                while position < shown:
-                    yield frame
-                    position += 1
-
-    def _stored_frames(
-        self, entry: SessionEntry, feature: str, start: int, stop: int
-    ) -> Generator[NDArray[np.uint8]]:
-        """Yield stored frames, start inclusive, stop exclusive; with a cache, out of it.
-
-        What the cache lacks is decoded into it, the whole session.
-        """
-        dataset = self._datasets[entry.dataset]
-        digest = self._digest(entry, feature)
-        if self._cache is None or digest is None:
-            yield from dataset.iter_frames(entry.episode_index, feature, start, stop)
-            return
-        shape = (entry.stop - entry.start, *self._shape(feature))
-        frames = self._cache.get(digest, shape)
-        if frames is None:
-            frames = np.empty(shape, np.uint8)
-            dataset.read_frames(entry.episode_index, feature, entry.start, frames)
-            self._cache.put(digest, frames)
-        yield from frames[start - entry.start : stop - entry.start]
-
-    def _digest(self, entry: SessionEntry, feature: str) -> str | None:
-        """Return the name of a session's frames in the cache; None without cache or digest."""
-        if self._cache is None:
-            return None
-        dataset = self._datasets[entry.dataset]
-        recorded = dataset.digests(entry.episode_index, entry.start, entry.stop)
-        return recorded[feature] if recorded else None
-
     def _vectors(self, feature: str) -> NDArray[np.float32]:
         parts = []
         for entry in self.manifest.sessions:
@@ -438,8 +316,3 @@ class Buffer:
 
     def _shape(self, feature: str) -> tuple[int, ...]:
         return self._datasets[self.manifest.query.dataset].features[feature]
-
-
-def _copy_repeated(target: NDArray[np.uint8], frames: NDArray[np.uint8], repeat: int) -> None:
-    for offset in range(repeat):
-        target[offset::repeat] = frames

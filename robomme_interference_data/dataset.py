@@ -19,51 +19,30 @@ from robomme_interference_data import parquet, video
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
-    EPISODES_DIR,
-    FORMAT_VERSION,
-    IDENTITY_PATH,
-    INFO_PATH,
     STATE,
+)
+from robomme_interference_data.dataset_meta import (
+    LESSON_SHA,
+    SHA,
+    read_episodes,
+    read_identity,
+    read_info,
 )
 from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import (
     FormatError,
-    MissingFileError,
     TruncatedVideoError,
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.files import Files, check_names, read_json
+from robomme_interference_data.files import Files, check_names
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema import EpisodeRecord
 
 __all__ = ["Dataset"]
 
-_SHA = "sha256/"
-_LESSON_SHA = "lesson_sha256/"
 _ROWS_KEPT = 1024
-
-# What is read of each file; one that lacks any of it is refused at once.
-_INFO_KEYS = ("features", "fps", "total_episodes", "data_path", "video_path")
-_IDENTITY_KEYS = ("kind", "revision")
-_EPISODE_COLUMNS = (
-    "episode_index",
-    "length",
-    "data/chunk_index",
-    "data/file_index",
-    "episode_id",
-    "goals",
-    "seed",
-    "difficulty",
-    "simulator",
-    "raw_length",
-    "exec_start_idx",
-    "exact",
-    "sha256",
-    "lesson_sha256",
-)
-_VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")
 
 
 @dataclass(frozen=True)
@@ -89,33 +68,8 @@ class Dataset:
         self.files = files
         self._rows: dict[int, dict[str, Any]] = {}
         self._indexes: dict[str, EmbeddingIndex] = {}
-        path = files.path(INFO_PATH)
-        self.info = read_json(path)
-        version = self.info.get("codebase_version")
-        if version != "v3.0":
-            raise FormatError(
-                f"{files.describe()} is a LeRobot dataset of version {version!r}; this package "
-                "reads v3.0"
-            )
-        check_names(path, self.info, _INFO_KEYS)
-        try:
-            path = files.path(IDENTITY_PATH)
-        except MissingFileError:
-            raise MissingFileError(
-                f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
-                f"{IDENTITY_PATH} is missing",
-                f"Build one from it: robomme-interference build distractors "
-                f"--source lerobot:{files.describe()} --out DIR",
-            ) from None
-        self.identity = read_json(path)
-        if self.identity.get("format_version") != FORMAT_VERSION:
-            raise FormatError(
-                f"{files.describe()} has format version "
-                f"{self.identity.get('format_version')!r}; this package reads {FORMAT_VERSION}",
-                "Install the version of robomme-interference-data that wrote it, or build it "
-                "again.",
-            )
-        check_names(path, self.identity, _IDENTITY_KEYS)
+        self.info = read_info(files)
+        self.identity = read_identity(files)
 
     @property
     def kind(self) -> str:
@@ -144,32 +98,7 @@ class Dataset:
     @cached_property
     def episodes(self) -> pa.Table:
         """The per-episode columns (see docs/format.md), by episode index; statistics left out."""
-        paths = self.files.list(EPISODES_DIR, ".parquet")
-        if not paths:
-            raise MissingFileError(
-                f"{EPISODES_DIR} holds no parquet file in {self.files.describe()}",
-                "The dataset is not complete: download or build it again.",
-            )
-        expected = [*_EPISODE_COLUMNS, *(_SHA + name for name in self.features)]
-        for camera in self.cameras:
-            expected += [f"videos/{camera}/{name}" for name in _VIDEO_COLUMNS]
-        tables = []
-        for path in map(self.files.path, paths):
-            with parquet.reading(path):
-                file = pq.ParquetFile(path)
-                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-                check_names(path, names, expected)
-                tables.append(file.read(columns=names))
-        with parquet.reading(self.files.path(paths[0])):  # files with columns of different types
-            table = pa.concat_tables(tables)
-        indices = table["episode_index"].to_numpy()
-        if not np.array_equal(indices, np.arange(self.info["total_episodes"])):
-            raise FormatError(
-                f"{self.files.describe()}: {EPISODES_DIR} does not list the episodes 0 to "
-                f"{self.info['total_episodes'] - 1}, one row each and in order",
-                "The dataset is damaged: download or build it again.",
-            )
-        return table
+        return read_episodes(self.files, list(self.features), self.info["total_episodes"])
 
     def __len__(self) -> int:
         return int(self.info["total_episodes"])
@@ -193,10 +122,10 @@ class Dataset:
             exec_start_idx=row["exec_start_idx"],
             exact=row["exact"],
             sha256=row["sha256"],
-            feature_sha256={n: row[_SHA + n] for n in self.features},
+            feature_sha256={n: row[SHA + n] for n in self.features},
             lesson_sha256=row.get("lesson_sha256"),
             lesson_feature_sha256={
-                n: row[_LESSON_SHA + n] for n in self.features if _LESSON_SHA + n in row
+                n: row[LESSON_SHA + n] for n in self.features if LESSON_SHA + n in row
             },
         )
 

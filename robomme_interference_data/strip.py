@@ -5,10 +5,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from robomme_interference_data.buffer import Buffer, Session
+from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
 from robomme_interference_data.draw import even_sample
 from robomme_interference_data.page import Page, ink_on, open_page, tint
+from robomme_interference_data.sessions import Session
 
 __all__ = ["Block", "arrange", "draw_strip", "session_colors", "shown_frames"]
 

@@ -12,8 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from robomme_interference_data import Buffer, DecodedCache, SessionEntry, Split, load_split
-from robomme_interference_data import buffer as module
+from robomme_interference_data import (
+    Buffer,
+    DecodedCache,
+    SessionEntry,
+    Split,
+    load_split,
+    sessions,
+)
 from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import (
     HashMismatchError,
@@ -201,7 +207,7 @@ def test_chunk_must_be_positive(chunk: int) -> None:
 @pytest.mark.parametrize("piece", [1, 7, 16, 128])
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_threads_do_not_matter(threads: int, piece: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PIECE", piece)  # frames that one thread decodes at a time
+    monkeypatch.setattr(sessions, "_PIECE", piece)  # frames that one thread decodes at a time
     made = buffer(3, threads=threads)
     for camera in CAMERAS:
         np.testing.assert_array_equal(

@@ -14,7 +14,7 @@ from recordings import contents
 from typer.testing import CliRunner
 
 from robomme_interference_data import Dataset
-from robomme_interference_data.build_dataset import manifests
+from robomme_interference_data.build_dataset import manifest_rows, manifests
 from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
@@ -114,7 +114,7 @@ def test_batches_do_not_show(
 ) -> None:
     plan = plan_manifests(*pair, K)
     assert list(write_manifests(plan, tmp_path / "one")) == [6]
-    monkeypatch.setattr(manifests, "_BATCH", 4)
+    monkeypatch.setattr(manifest_rows, "BATCH", 4)
     assert list(write_manifests(plan, tmp_path / "two")) == [4, 2]
     jsonl = [(tmp_path / name / "buffers.jsonl").read_bytes() for name in ("one", "two")]
     assert jsonl[0] == jsonl[1]
@@ -142,7 +142,7 @@ def vouched(out: Path) -> None:
 def test_an_abandoned_run_leaves_nothing(
     pair: tuple[Dataset, Dataset], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(manifests, "_BATCH", 2)
+    monkeypatch.setattr(manifest_rows, "BATCH", 2)
     running = write_manifests(plan_manifests(*pair, K), tmp_path / "out")
     assert next(running) == 2
     running.close()

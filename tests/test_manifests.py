@@ -12,11 +12,8 @@ from made_splits import metadata_only, named, queries, units, write
 from recordings import contents, listed
 
 from robomme_interference_data import Dataset
-from robomme_interference_data.build_dataset.manifests import (
-    check_history,
-    expected_rows,
-    plan_manifests,
-)
+from robomme_interference_data.build_dataset.manifest_rows import check_history
+from robomme_interference_data.build_dataset.manifests import expected_rows, plan_manifests
 from robomme_interference_data.errors import (
     HistoryTooLongError,
     InvalidOptionError,

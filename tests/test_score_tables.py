@@ -305,6 +305,27 @@ def test_headlines_of_few_rows(small: Score, tmp_path: Path) -> None:
     assert headline(found, "tabletop") == "No rollout counts yet. 0 of 1 cells are complete."
 
 
+def test_systems_without_a_memory_are_neither_ranked_nor_the_headline(tmp_path: Path) -> None:
+    def lines(*systems: str) -> Path:
+        rows = [
+            f"{system},MoveCube,{condition},0,,easy,{outcome},{int(outcome == 'success')},9"
+            for system, outcome in zip(systems, ("success", "fail", "timeout"), strict=False)
+            for condition in ("k0", "k7")
+        ]
+        return made.released(tmp_path / f"{len(systems)}.csv", rows)
+
+    found = score([lines("oracle", "guess", "my-memory")], grid=Grid.GIVEN, draws=100)
+    assert {c.system: c.rank for c in found.cells} == {
+        "oracle": None,
+        "guess": None,
+        "my-memory": 1,
+    }
+    assert headline(found, "robomme").startswith("my-memory succeeds in 0.0% of 1 episodes")
+    assert "Not ranked either, as they use no memory: Oracle, Guess." in main_markdown(found.cells)
+    found = score([lines("oracle")], grid=Grid.GIVEN, draws=100)
+    assert headline(found, "robomme").startswith("Oracle succeeds in 100.0% of 1 episodes")
+
+
 def test_no_rows_are_no_score(tmp_path: Path) -> None:
     with pytest.raises(BadRowsError, match="no rows to score"):
         score([made.write_csv(tmp_path / "a.csv", [])])

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from robomme_interference_data import load_buffer
-from robomme_interference_data.buffer import Buffer, Session
+from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.draw import even_sample, lesson_share
 from robomme_interference_data.errors import (
@@ -28,6 +28,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.page import ink_on, open_page, tint
+from robomme_interference_data.sessions import Session
 from robomme_interference_data.strip import (
     COLORS,
     LESSON_COLOR,

@@ -12,7 +12,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.rows import condition_rank
 from robomme_interference_data.evaluate.score.check import DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import ERROR, Expected, Outcomes, episode_id
-from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.intervals import wilson
 from robomme_interference_data.tables import Column, Table, percent
 
@@ -43,7 +43,7 @@ class Cell:
         missing: Expected episodes that do not count.
         other: Episodes that count without being expected.
         rank: Place among the complete cells of this simulator, condition and part, 1 for the
-            highest rate; None for an incomplete cell.
+            highest rate; None for an incomplete cell, and for a system that is a bound.
     """
 
     simulator: str
@@ -120,14 +120,18 @@ def _parts(part: Part, what: Outcomes | Expected, unknown: bool) -> dict[str, ND
 def _ranked(cells: list[Cell]) -> list[Cell]:
     rates: dict[tuple[str, str, str], list[float]] = {}
     for cell in cells:
-        if cell.complete:
+        if _takes_part(cell):
             rates.setdefault((cell.simulator, cell.condition, cell.part), []).append(cell.rate)
     return [
         replace(cell, rank=1 + sum(rate > cell.rate for rate in rates[key]))
-        if cell.complete and (key := (cell.simulator, cell.condition, cell.part))
+        if _takes_part(cell) and (key := (cell.simulator, cell.condition, cell.part))
         else cell
         for cell in cells
     ]
+
+
+def _takes_part(cell: Cell) -> bool:
+    return cell.complete and not is_bound(cell.system)
 
 
 def rate_table(cells: Sequence[Cell], name: str, title: str, part: Part = "") -> Table:
@@ -198,7 +202,9 @@ def main_markdown(cells: Sequence[Cell]) -> str:
 def main_note(cells: Sequence[Cell]) -> str:
     """Return how the main table is to be read, and how many rollouts broke."""
     errors = sum(cell.counts[ERROR] for cell in cells)
-    return NOTE + (f" Rollouts that broke: {errors}." if errors else " No rollout broke.")
+    names = dict.fromkeys(display_name(cell.system) for cell in cells if is_bound(cell.system))
+    bounds = f" Not ranked either, as they use no memory: {', '.join(names)}." if names else ""
+    return NOTE + bounds + (f" Rollouts that broke: {errors}." if errors else " No rollout broke.")
 
 
 def _shown(cell: Cell | None, several: bool) -> str:

@@ -7,7 +7,7 @@ from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import START, Contrast, base_of
 from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.tables import percent, points
 
 __all__ = ["headline"]
@@ -16,9 +16,11 @@ __all__ = ["headline"]
 def headline(score: Score, simulator: str) -> str:
     """Return the main finding of one simulator's rows, computed from them.
 
-    Only complete cells are compared with each other; how many there are is said as well.
+    Only complete cells are compared with each other; how many there are is said as well. A
+    system that only bounds what a memory can reach leads where there is no other.
     """
-    cells = [cell for cell in score.cells if cell.simulator == simulator]
+    found = [cell for cell in score.cells if cell.simulator == simulator]
+    cells = [cell for cell in found if not is_bound(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
     sentences = []
     leader = _best(complete, START) or _best(cells, START)
@@ -39,8 +41,9 @@ def headline(score: Score, simulator: str) -> str:
         )
     else:
         sentences.append("No rollout counts yet.")
-    if len(complete) < len(cells):
-        sentences.append(f"{len(complete)} of {len(cells)} cells are complete.")
+    if not all(cell.complete for cell in found):
+        done = sum(cell.complete for cell in found)
+        sentences.append(f"{done} of {len(found)} cells are complete.")
     return " ".join(sentences)
 
 
