@@ -187,11 +187,8 @@ def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
 def _cell(rule: str, family: str, k: int, grades: Sequence[Grade]) -> Cell:
     count, hits = len(grades), sum(one.hit for one in grades)
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
-    if count > 1:
-        # One key: equal values have equal intervals, whatever the rule, family and k.
-        drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
-    else:
-        drawn = [Interval(float(value), np.nan, np.nan) for value in values[0]]
+    # One key: equal values have equal intervals, whatever the rule, family and k.
+    drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
     return Cell(rule, family, k, count, Interval(hits / count, *wilson(hits, count)), *drawn)
 
 

@@ -129,7 +129,8 @@ class Resampler:
         Source: Efron (1987), Better bootstrap confidence intervals, JASA 82, 171–185; Efron and
         Tibshirani (1993), An Introduction to the Bootstrap, chapter 14. Draws in which a ratio has
         no value (a zero denominator) are left out. Where the correction itself has no value, as
-        when all draws lie on one side of the estimate, the bounds are the plain percentiles.
+        when all draws lie on one side of the estimate, the bounds are the plain percentiles. One
+        episode alone has no interval: its bounds are NaN.
         """
         if not len(self._rows) or not statistics:
             return [Interval(math.nan, math.nan, math.nan) for _ in statistics]
@@ -148,7 +149,8 @@ class Resampler:
         whole = self._times @ features
         value = float(_combine(statistic, whole[None])[0])
         drawn = drawn[np.isfinite(drawn)]
-        if not math.isfinite(value) or not len(drawn):
+        counted = int(self._times @ features.any(axis=1))
+        if not math.isfinite(value) or not len(drawn) or counted < 2:
             return Interval(value if math.isfinite(value) else math.nan, math.nan, math.nan)
         below = ((drawn < value).sum() + (drawn <= value).sum()) / (2 * len(drawn))
         # Leaving out any episode of a distinct row gives the same estimate.

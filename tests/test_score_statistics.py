@@ -15,6 +15,7 @@ from robomme_interference_data.bootstrap import (
     Resampler,
     Statistic,
     difference,
+    mean,
     retention,
     slope,
 )
@@ -196,6 +197,16 @@ def test_nothing_to_compare_is_no_number() -> None:
     # Retention without any lift divides by nothing.
     (found,) = Resampler(np.ones((9, 3)), "").intervals([retention(0, 1, 2)])
     assert math.isnan(found.value)
+
+
+def test_one_episode_alone_has_no_interval() -> None:
+    found = Resampler(np.array([[0.0, 1.0], [np.nan, 1.0]]), "key", 100).intervals(
+        [difference(0, 1), mean(1)]
+    )
+    assert found[0].value == 1.0
+    assert math.isnan(found[0].low)
+    assert math.isnan(found[0].high)
+    assert (found[1].value, found[1].low, found[1].high) == (1.0, 1.0, 1.0)
 
 
 def test_the_key_alone_seeds_the_draws() -> None:
