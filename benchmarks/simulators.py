@@ -107,23 +107,25 @@ def resets() -> None:
         print(f"| {family} | {' | '.join(seconds)} | {', '.join(frames)} |", flush=True)
 
 
-def _play(episode: EpisodeId) -> None:
+def _play(episode: EpisodeId | None) -> None:
     simulator = own_simulator("tabletop")
+    if episode is None:  # only start up
+        return
     simulator.reset(str(episode))
     for _ in range(100):
         simulator.step(simulator.act("oracle"))
 
 
-def workers(episodes: int = 12) -> None:
-    """Wall seconds of the same episodes with one worker and with two."""
+def workers(episodes: int = 24) -> None:
+    """Wall seconds of the same episodes with one worker and with two, their start-up left out."""
     taken = []
     todo = [EpisodeId("MoveCube", "train", index) for index in range(episodes)]
     for count in (1, 2):
         started = 0.0
-        for number, _ in enumerate(run_tasks(_play, todo, workers=count)):
-            if number == count - 1:  # by then every worker has started
+        for number, _ in enumerate(run_tasks(_play, [*[None] * count, *todo], workers=count)):
+            if number == 0:  # the others are up at about the same time; if later, it counts
                 started = time.perf_counter()
-        taken.append((time.perf_counter() - started) / (episodes - count))
+        taken.append((time.perf_counter() - started) / episodes)
     print("| workers | seconds per episode |\n| --- | --- |")
     print(f"| 1 | {taken[0]:.2f} |\n| 2 | {taken[1]:.2f} |\n| ratio | {taken[0] / taken[1]:.2f} |")
 

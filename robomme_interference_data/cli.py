@@ -99,6 +99,13 @@ def main() -> None:
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except OSError as error:
+        if error.errno is None:  # not the system's word on a file
+            raise
+        where = f"{error.filename}: " if error.filename is not None else ""
+        typer.secho(f"Error: {where}{error.strerror}", fg=typer.colors.RED, err=True)
+        typer.echo("Check the path, its permissions and the space left on the disk.", err=True)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

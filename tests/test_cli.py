@@ -402,6 +402,16 @@ def test_console_script_fails_without_a_traceback(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_a_folder_that_cannot_be_made_is_one_error(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, out, err = run("build", "sample", "--out", tmp_path / "file" / "sample")
+    assert (code, out) == (1, "")
+    assert err.splitlines()[-2:] == [
+        f"Error: {tmp_path}/file/sample: Not a directory",
+        "Check the path, its permissions and the space left on the disk.",
+    ]
+
+
 def test_console_script_takes_the_split_from_the_environment() -> None:
     environment = {**os.environ, "ROBOMME_INTERFERENCE_SPLIT": str(factories.split())}
     done = script("show", EPISODE, "--k", 3, "--json", env=environment)

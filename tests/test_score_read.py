@@ -271,6 +271,9 @@ def test_missing_and_damaged_files(tmp_path: Path) -> None:
     (tmp_path / "rollouts.jsonl").touch()
     with pytest.raises(MissingFileError, match="go on with it"):
         read_rollouts([tmp_path])
+    (tmp_path / "picture.csv").write_bytes(b"a,b\n1,\xff\n")
+    with pytest.raises(FormatError, match=r"picture\.csv cannot be read: byte 6 is not UTF-8 text"):
+        read_rollouts([tmp_path / "picture.csv"])
     (tmp_path / "rows.txt").touch()
     with pytest.raises(FormatError, match=r"neither \.csv nor \.parquet"):
         read_rollouts([tmp_path / "rows.txt"])

@@ -1,5 +1,6 @@
 """Open files of rollout rows and stream them, whatever wrote them; nothing is judged here."""
 
+import codecs
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -186,8 +187,8 @@ def _match(path: Path, names: list[str], released: bool, with_system: bool) -> d
     if "system" not in ours and not with_system:
         raise FormatError(
             f"{path} names no system: it has no column 'system'",
-            f"Say which it is: robomme-interference score {path} --system "
-            "retrieval-framesamp-modul --out DIR",
+            "Say which it is, such as --system retrieval-framesamp-modul (compare: --system-a, "
+            "--system-b).",
         )
     return {name: ours[name] for name in COLUMNS if name in ours}
 
@@ -242,6 +243,19 @@ def _csv_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
         yield Batch({}, 0, first, skipped[seen:], skipped)
 
 
+def _check_text(path: Path) -> None:
+    """Refuse what is no text at all: pyarrow would show a traceback of its own for it."""
+    with path.open("rb") as file:
+        start = file.read(_BLOCK)
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError as error:
+        raise FormatError(
+            f"{path} cannot be read: byte {error.start} is not UTF-8 text",
+            "Expected a CSV or parquet file of rollout rows (docs/score.md).",
+        ) from None
+
+
 def _open_csv(path: Path, columns: list[str] | None, skipped: list[tuple[int, str]]) -> Any:
     def note(row: Any) -> str:
         expected, actual = row.expected_columns, row.actual_columns
@@ -251,6 +265,7 @@ def _open_csv(path: Path, columns: list[str] | None, skipped: list[tuple[int, st
     # Everything is text at first: what a number should be is judged row by row. Threads would
     # not say on which line a broken one stands.
     text = pa.dictionary(pa.int32(), pa.string())
+    _check_text(path)
     return pa_csv.open_csv(
         path,
         read_options=pa_csv.ReadOptions(use_threads=False, block_size=_BLOCK),
