@@ -1,18 +1,13 @@
 """Scores of made-up rows, worked out by hand, and of the released ones to the last digit."""
 
-import csv
-import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import score_rows as made
-from typer.testing import CliRunner
 
-from robomme_interference_data.cli import app
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import BadRowsError
 from robomme_interference_data.evaluate.rows import NO_HISTORY
@@ -27,10 +22,6 @@ from robomme_interference_data.intervals import newcombe, wilson
 from robomme_interference_data.tables import write_tables
 
 GOLDEN = Path(__file__).parent / "golden" / "score"
-RELEASED = (
-    Path(__file__).parent.parent.parent / "shared" / "data" / "results" / "retrieval_rollouts.csv"
-)
-needs_released = pytest.mark.skipif(not RELEASED.exists(), reason="the released rows are not here")
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +210,7 @@ def test_published_rates_are_the_papers() -> None:
     assert at["retrieval-framesamp-modul", "k1"] == 44.7
 
 
-PAPER = RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"
+PAPER = made.RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
@@ -242,9 +233,9 @@ def _percents(line: str) -> list[str]:
     return [cell.strip().removesuffix("\\%") for cell in cells if "--" not in cell]
 
 
-@needs_released
+@made.needs_released
 def test_the_released_rows_give_the_published_numbers(tmp_path: Path) -> None:
-    found = score([RELEASED], system=made.RETRIEVAL, against_paper=True)
+    found = score([made.RELEASED], system=made.RETRIEVAL, against_paper=True)
     rates = {cell.condition: f"{100 * cell.rate:.1f}" for cell in found.cells}
     assert rates == {"k0": "44.9", "k1": "44.7", "k3": "44.9", "k7": "44.9"}
     assert all(cell.complete and cell.n == 450 for cell in found.cells)
@@ -329,123 +320,3 @@ def test_systems_without_a_memory_are_neither_ranked_nor_the_headline(tmp_path: 
 def test_no_rows_are_no_score(tmp_path: Path) -> None:
     with pytest.raises(BadRowsError, match="no rows to score"):
         score([made.write_csv(tmp_path / "a.csv", [])])
-
-
-Run = Callable[..., Any]
-
-
-def run(*arguments: str | Path) -> Any:
-    return CliRunner().invoke(app, list(map(str, arguments)))
-
-
-@needs_released
-def test_score_and_export_on_the_command_line(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    done = run(
-        *("score", RELEASED, "--system", made.RETRIEVAL, "--against", "paper", "--out", out),
-        *("--export", tmp_path / "export", "--json"),
-    )
-    assert done.exit_code == 0, done.output
-    value = json.loads(done.stdout)
-    assert value["rows"] == 1800
-    assert [record["successes"] for record in value["tables"]["main"]] == [202, 201, 202, 202]
-    assert f"Report: {out / 'report.html'}" in done.stderr
-    names = {path.name for path in (out / "tables").glob("*.csv")}
-    assert names >= {
-        f"{n}.csv" for n in ["main", "family", "difficulty", "lift", "effects", "coverage"]
-    }
-    figures = sorted(path.name for path in (out / "figures").iterdir())
-    kinds = ("difficulty", "families", "heatmap", "retrieval", "success")
-    assert figures == [f"{kind}-robomme{s}" for kind in kinds for s in (".png", ".svg")]
-    # The released rows come back byte for byte.
-    (exported,) = (tmp_path / "export").iterdir()
-    assert exported.read_bytes() == RELEASED.read_bytes()
-
-
-def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
-    path = made.write_parquet(tmp_path / "a.parquet", made.rows())
-    common = ("--grid", "given", "--out", tmp_path / "out")
-    assert run("score", path, *common, "--export", tmp_path / "export").exit_code == 0
-    files = sorted((tmp_path / "export").iterdir())
-    assert [f.name for f in files] == [
-        "my-memory-tabletop_rollouts.csv",
-        "perceptual-framesamp-modul-tabletop_rollouts.csv",
-        "retrieval-framesamp-modul-tabletop_rollouts.csv",
-    ]
-    with files[0].open(newline="") as lines:
-        rows = list(csv.DictReader(lines))
-    assert [row["status"] for row in rows].count("error") == 1
-    found = score([files[1]], system=made.BASE, grid=Grid.GIVEN, draws=100)
-    assert [cell.counts[0] for cell in found.cells] == [1, 7, 5, 3, 2]
-    assert found.cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
-    rows_ = [*made.rows(), *made.repeat(made.rows(), 3)]
-    path = made.write_parquet(tmp_path / "b.parquet", rows_)
-    done = run("score", path, *common, "--export", tmp_path / "export")
-    assert "2 model seeds" in str(done.exception)
-
-
-def test_lenient_on_the_command_line(tmp_path: Path) -> None:
-    lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,MoveCub,k0,1,8,easy,fail,0,9"]
-    path = made.released(tmp_path / "a.csv", lines)
-    common = ("score", path, "--grid", "given", "--out", tmp_path / "out")
-    assert isinstance(run(*common).exception, BadRowsError)
-    assert not (tmp_path / "out").exists()
-    done = run(*common, "--lenient")
-    assert done.exit_code == 0, done.output
-    assert f"left out: {path}, line 3: unknown family 'MoveCub'" in done.stderr
-    assert "| my-memory | 100.0% [20.7, 100.0] n=1 |" in done.stdout
-
-
-def test_compare_on_the_command_line(tmp_path: Path) -> None:
-    rows = made.rows()
-    a = made.write_csv(tmp_path / "a.csv", [r for r in rows if r.system == made.BASE])
-    b = made.write_csv(tmp_path / "b.csv", [r for r in rows if r.system == made.RETRIEVAL])
-    done = run("compare", a, b, "--json")
-    assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
-    assert found["notes"] == []
-    overall = {row["condition"]: row for row in found["rows"] if row["family"] == "all"}
-    assert overall.keys() == {"k0", "k7"}
-    assert (overall["k0"]["gained"], overall["k0"]["lost"], overall["k0"]["p"]) == (1, 1, 1.0)
-    k7 = overall["k7"]
-    assert (k7["n"], k7["rate_a"], k7["rate_b"]) == (12, 2 / 12, 7 / 12)
-    assert (k7["gained"], k7["lost"], k7["p"]) == (5, 0, 2 / 32)
-    assert k7["difference"] == pytest.approx(5 / 12)
-    assert 0 < k7["low"] < 5 / 12 < k7["high"]
-    assert len(found["rows"]) == 6  # both conditions in all, and in the two families
-    assert k7["p_holm"] == pytest.approx(6 * 2 / 32)
-    assert run("compare", a, b).stdout.startswith("# Two runs compared\n\n| simulator |")
-
-
-def test_compare_pairs_repeats_of_one_system_and_says_if_revisions_differ(tmp_path: Path) -> None:
-    rows = [r for r in made.rows() if r.system == made.BASE]
-    changed = [replace(r, revision="cd" * 32, model_seed=9) for r in rows]
-    a, b = made.write_csv(tmp_path / "a.csv", rows), made.write_csv(tmp_path / "b.csv", changed)
-    found = json.loads(run("compare", a, b, "--json").stdout)
-    assert {row["difference"] for row in found["rows"]} == {0.0}
-    assert "are of different splits" in found["notes"][0]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"simulator": "robomme"}, "the rows are of different simulators: tabletop and robomme"),
-        ({"seed": 77}, "MoveCube/test/0 has the seed 0 in one run and 77 in the other"),
-        ({"episode_split": "val"}, "no episode under a common condition"),
-        ({"condition": "k9"}, "no episode under a common condition"),
-    ],
-)
-def test_what_cannot_be_paired_is_not_compared(
-    tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
-    rows = [r for r in made.rows() if r.system == made.BASE and r.condition == "k0"]
-    a = made.write_csv(tmp_path / "a.csv", rows)
-    b = made.write_csv(tmp_path / "b.csv", [replace(r, **change) for r in rows])
-    assert message in str(run("compare", a, b).exception)
-
-
-def test_systems_that_do_not_meet_are_not_compared(tmp_path: Path) -> None:
-    rows = made.rows()
-    a = made.write_csv(tmp_path / "a.csv", [r for r in rows if r.system != made.OWN])
-    b = made.write_csv(tmp_path / "b.csv", [r for r in rows if r.system == made.OWN])
-    assert "no system is in both" in str(run("compare", a, b).exception)

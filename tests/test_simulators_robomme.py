@@ -1,26 +1,17 @@
 """The official simulator's seam, against a stand-in for RoboMME in an environment of its own."""
 
-import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
-from typer.testing import CliRunner
 
-from robomme_interference_data import doctor
-from robomme_interference_data.cli import app
 from robomme_interference_data.errors import (
     InvalidIdError,
     InvalidOptionError,
@@ -28,12 +19,9 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     UnknownNameError,
 )
-from robomme_interference_data.simulators import Status, make_simulator, robomme_worker
+from robomme_interference_data.simulators import Status
 from robomme_interference_data.simulators.robomme_client import EPISODES, RoboMMESimulator
 from robomme_interference_data.simulators.worker import RemoteSimulator
-
-STAND_IN = Path(__file__).parent / "robomme_stand_in"
-"""A package `robomme` with RoboMME's interface, which behaves badly where an index asks for it."""
 
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
 
@@ -41,11 +29,6 @@ DIES, HANGS, RAISES, BREAKS, SMALL_WRIST = 40, 41, 42, 43, 44
 """Indices of episodes that do so; those from 45 on end as `ENDS` says."""
 
 ENDS = {45: Status.SUCCESS, 46: Status.FAIL, 47: Status.TIMEOUT}
-
-
-@pytest.fixture
-def bare(bare_python: Path) -> Path:
-    return bare_python
 
 
 @pytest.fixture
@@ -343,177 +326,3 @@ def test_the_worker_ends_with_us_even_in_a_long_call(python: Path) -> None:
         time.sleep(0.5)
         parent.kill()
     assert ended(pid)
-
-
-# --- interpreters that will not do -------------------------------------------------------------
-
-
-def test_no_interpreter_is_given() -> None:
-    with pytest.raises(InvalidOptionError, match="none is given") as caught:
-        make_simulator("robomme")
-    assert "--robomme-python PATH" in str(caught.value)
-
-
-def test_the_environment_variable_names_it(python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROBOMME_PYTHON", str(python))
-    simulator = make_simulator("robomme")
-    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
-    simulator.close()
-
-
-@pytest.mark.parametrize("name", ["nowhere/python", "folder", "notes.txt"])
-def test_no_interpreter_is_there(tmp_path: Path, name: str) -> None:
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "notes.txt").write_text("not a program")
-    with pytest.raises(InvalidOptionError, match=f"{name} is not an executable file"):
-        RoboMMESimulator(tmp_path / name)
-
-
-def test_a_program_that_is_no_python(tmp_path: Path) -> None:
-    program = tmp_path / "python"
-    program.write_text("#!/bin/sh\necho I am a shell\nexit 3\n")
-    program.chmod(0o755)
-    with pytest.raises(SimulatorCrashError, match=r"(?s)died during start, exit code 3.*a shell"):
-        RoboMMESimulator(program)
-    program.write_bytes(b"\x7fELF of another machine")
-    with pytest.raises(InvalidOptionError, match="cannot be run as RoboMME's Python"):
-        RoboMMESimulator(program)
-
-
-def test_an_interpreter_without_robomme(bare: Path) -> None:
-    with pytest.raises(MissingExtraError, match="robomme is not installed there") as caught:
-        RoboMMESimulator(bare)
-    assert str(bare) in caught.value.message
-
-
-def test_numpy_2_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(STAND_IN))
-    with pytest.raises(MissingExtraError, match=rf"numpy is {np.__version__}; RoboMME needs numpy"):
-        RoboMMESimulator(sys.executable)
-
-
-def test_robomme_that_cannot_be_imported(
-    bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "robomme").mkdir()
-    (tmp_path / "robomme" / "env_record_wrapper.py").write_text("import mplib_is_missing\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(MissingExtraError, match=r"imported: ModuleNotFoundError: .*mplib_is_miss"):
-        RoboMMESimulator(bare)
-
-
-def test_one_that_does_not_start_in_time(python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STAND_IN_IMPORT_SECONDS", "60")
-    with pytest.raises(SimulatorCrashError, match="took more than 1 s to start"):
-        RoboMMESimulator(python, start_s=1)
-
-
-# --- commands ----------------------------------------------------------------------------------
-
-
-def test_simulate_plays_the_demonstration(python: Path) -> None:
-    given_words = ["simulate", "--family", "MoveCube", "--episode", "3", "--json"]
-    given_words += ["--simulator", "robomme", "--robomme-python", str(python)]
-    done = CliRunner().invoke(app, given_words)
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == {
-        "episode": "MoveCube/test/3",
-        "simulator": "robomme",
-        "goal": "move the cube as before",
-        "difficulty": "easy",
-        "seed": 640_003,
-        "policy": "none",
-        "status": "ongoing",
-        "lesson_frames": 5,
-        "steps": 0,
-    }
-
-
-def test_simulate_has_no_oracle_there() -> None:
-    given_words = ["simulate", "--family", "MoveCube", "--policy", "oracle"]
-    done = CliRunner().invoke(app, [*given_words, "--simulator", "robomme"])
-    assert isinstance(done.exception, UnknownNameError)
-    assert "expected none" in str(done.exception)
-
-
-def test_the_doctor_asks_the_interpreter(python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = doctor._robomme()
-    assert (row.ok, row.detail) == (
-        None,
-        "ROBOMME_PYTHON is not set; only --simulator robomme needs it",
-    )
-    monkeypatch.setenv("ROBOMME_PYTHON", str(python))
-    row = doctor._robomme()
-    assert (row.ok, row.fix) == (True, None)
-    assert "numpy 1." in row.detail and row.detail.endswith("4 families")
-    monkeypatch.setenv("ROBOMME_PYTHON", sys.executable)
-    assert "RoboMME needs numpy < 2" in doctor._robomme().detail
-    monkeypatch.setenv("ROBOMME_PYTHON", "/nowhere/python")
-    row = doctor._robomme()
-    assert row.ok is False
-    assert "cannot be asked" in row.detail
-
-
-# --- messages ----------------------------------------------------------------------------------
-
-
-def exchange(
-    head: dict[str, object], arrays: dict[str, object]
-) -> tuple[dict[str, object], dict[str, np.ndarray]]:
-    ours, theirs = socket.socketpair()
-    theirs.settimeout(60)
-    with ours, theirs:
-        # In a thread: what a socket holds without a reader is little.
-        sender = threading.Thread(target=robomme_worker.send, args=(ours, head, arrays))
-        sender.start()
-        received = robomme_worker.receive(theirs)
-        sender.join()
-    return received
-
-
-ARRAYS = npst.arrays(
-    st.sampled_from([np.uint8, np.float32, np.float64, np.int64, np.bool_]),
-    npst.array_shapes(max_dims=4, max_side=5),
-)
-
-
-@given(st.dictionaries(st.text(max_size=5), ARRAYS, max_size=3), st.text())
-def test_messages_arrive_as_they_were_sent(arrays: dict[str, np.ndarray], text: str) -> None:
-    head, found = exchange({"text": text}, dict(arrays))
-    assert head == {"text": text}
-    assert list(found) == list(arrays)
-    for name, array in arrays.items():
-        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
-        assert found[name].tobytes() == array.tobytes()
-
-
-def test_lists_arrive_as_one_array() -> None:
-    _, found = exchange({}, {"a": [np.full((2, 3), 1, np.uint8), np.full((2, 3), 2, np.uint8)]})
-    assert found["a"].tolist() == [[[1] * 3] * 2, [[2] * 3] * 2]
-
-
-def test_the_bytes_of_a_message() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        robomme_worker.send(ours, {"n": 1}, {"a": np.array([[1, 258]], "<u2")})
-        head = b'{"n": 1, "arrays": [["a", "<u2", [1, 2]]]}'
-        assert theirs.recv(1000) == b"\0\0\0" + bytes([len(head)]) + head + b"\1\0\2\1"
-
-
-def test_lists_of_unlike_arrays_are_refused() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs, pytest.raises(ValueError, match="arrays of one shape and type"):
-        robomme_worker.send(ours, {}, {"a": [np.zeros(2), np.zeros(3)]})
-
-
-@pytest.mark.parametrize(
-    ("sent", "error"),
-    [(b"", EOFError), (b"\0\0\0\5{", EOFError), (b"\xff\0\0\0{}", ValueError)],
-)
-def test_what_is_no_message(sent: bytes, error: type[Exception]) -> None:
-    ours, theirs = socket.socketpair()
-    with theirs:
-        with ours:
-            ours.sendall(sent)
-        with pytest.raises(error):
-            robomme_worker.receive(theirs)
