@@ -59,7 +59,6 @@ def retrieve(split: Path, episode: str, picture: Path) -> None:
 def simulate() -> None:
     """Build a small split of all nine families from the embedded simulator."""
     out = DEMO / "tabletop"
-    # Index 2 is a hard episode in every family: those are long enough for a distractor unit.
     played = "--source tabletop --split test --episodes 0"
     run(f"build demonstrations {played} --out {out}/demonstrations")
     run(f"build distractors --source tabletop --episodes 2 --out {out}/distractors")
