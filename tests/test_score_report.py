@@ -224,6 +224,16 @@ def test_no_two_systems_of_the_paper_look_alike() -> None:
     assert len(looks_of(["one", "two", *SYSTEMS])) == len(SYSTEMS) + 2
 
 
+def test_several_systems_with_retrieval_are_stars_in_the_colours_of_their_bases() -> None:
+    memories = [f"replay-{memory}" for memory in ("full", "framesamp", "window")]
+    looks = looks_of([*memories, *(f"retrieval-{name}" for name in memories)])
+    assert len({(look.colour, look.marker, str(look.line)) for look in looks.values()}) == 6
+    for name in memories:
+        assert looks[f"retrieval-{name}"].colour == looks[name].colour
+        assert looks[f"retrieval-{name}"].marker == "*"
+    assert looks_of(["retrieval-replay-full"])["retrieval-replay-full"].colour == "#000000"
+
+
 def test_labels_are_moved_apart_by_as_little_as_need_be() -> None:
     assert spread([1.0, 5.0, 9.0], 2.0) == [1.0, 5.0, 9.0]
     # Two at 5 go to 4 and 6; the one at 7 then is too close: the three lie around their mean.

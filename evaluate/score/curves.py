@@ -77,7 +77,8 @@ def curve(
             low, high = cell.interval
             axes.plot((x, x), (100 * low, 100 * high), color=look.colour, linewidth=0.9, alpha=0.7)
         face = look.colour if cell.complete else "white"
-        axes.plot(x, y, look.marker, color=look.colour, markerfacecolor=face, markersize=look.size)
+        style = {"color": look.colour, "markerfacecolor": face, "markersize": look.size}
+        axes.plot(x, y, look.marker, **style, clip_on=False, zorder=3)  # whole at 0 and at 100%
     return ys[-1]
 
 

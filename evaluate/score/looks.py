@@ -29,6 +29,7 @@ _SHAPES = {
     "expert": ("^", ":"),
     "subgoals": ("D", "-."),
 }
+_RETRIEVAL_LINES = ("-", "--", "-.", ":")
 _OWN_SHAPES = ("v", "P", "X", "<", ">", "h")
 
 
@@ -59,13 +60,21 @@ class Look:
 
 
 def looks_of(names: Sequence[str]) -> dict[str, Look]:
-    """Return the looks of systems; those of the table look the same in every figure."""
+    """Return the looks of systems; those of the table look the same in every figure.
+
+    A system with retrieval is a black star; several are stars in the colours of what they are
+    without it.
+    """
     looks = {}
+    retrieving = [name for name in names if name in SYSTEMS and SYSTEMS[name].retrieval]
     for place, name in enumerate(names):
         system = SYSTEMS.get(name)
         own = place % len(_OWN)
         if system is not None and system.retrieval:
-            looks[name] = Look(display_name(name), "#000000", "*", "-", 2.2)
+            alone = len(retrieving) == 1
+            colour = "#000000" if alone else _COLOURS.get(system.representation, _OWN[own])
+            line = _RETRIEVAL_LINES[retrieving.index(name) % len(_RETRIEVAL_LINES)]
+            looks[name] = Look(display_name(name), colour, "*", line, 2.2)
         elif system is not None:
             marker, line = _shape(system, _OWN_SHAPES[own])
             colour = _COLOURS.get(system.representation, _OWN[own])
