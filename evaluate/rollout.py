@@ -2,18 +2,17 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.buffer import Buffer, Chunk
+from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.draw import even_sample
 from robomme_interference_data.errors import PolicyError, RolloutError
-from robomme_interference_data.evaluate.ahead import ahead
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
@@ -34,10 +33,6 @@ __all__ = ["ACTION_CHUNK", "Watcher", "base_row", "check_lesson", "run_rollout"]
 
 ACTION_CHUNK = 16
 """Actions of a chunk that are executed before the policy is asked again (paper)."""
-
-
-_FRAMES_AHEAD = 256
-"""History frames that are decoded while the simulator resets and the policy takes others."""
 
 
 class Watcher(Protocol):
@@ -108,41 +103,31 @@ def run_rollout(
     guard = nullcontext if watchdog is None else watchdog.guard
     began = time.perf_counter()
     buffer = None if item.k is None else split.load(item.episode, item.k)
+    with clock.part("reset_s"), guard():
+        demonstration, first, info = simulator.reset(
+            str(item.episode), demonstration=config.check_lesson
+        )
+    _check_episode(item.episode, split, info)
+    if config.check_lesson:
+        check_lesson(split.load(item.episode, split.k_values[0]), demonstration, first)
+    if watcher is not None:
+        watcher.begin(buffer, first, info)
     chosen = None
     start, stop = 0, 0 if buffer is None else len(buffer)
-    with ExitStack() as stack:
-
-        def decode() -> Iterator[Chunk]:
-            assert buffer is not None
-            size, cameras = config.history_chunk, policy.history_cameras
-            chunks = buffer.stream(size, cameras, start, stop)
-            return stack.enter_context(ahead(chunks, max(1, _FRAMES_AHEAD // size)))
-
-        # Without a retrieval step it is known by now what will be needed.
-        chunks = decode() if buffer is not None and selector is None else None
-        with clock.part("reset_s"), guard():
-            demonstration, first, info = simulator.reset(
-                str(item.episode), demonstration=config.check_lesson
+    with clock.part("history_s"):
+        if selector is not None and buffer is not None and len(buffer):
+            chosen = selector.select(buffer, first.images[selector.camera])
+            start, stop = chosen.start, chosen.stop
+        policy.reset(
+            RolloutInfo(
+                info.goal,
+                stop - start,
+                config.model_seed,
+                simulator if policy.privileged else None,
             )
-        _check_episode(item.episode, split, info)
-        if config.check_lesson:
-            check_lesson(split.load(item.episode, split.k_values[0]), demonstration, first)
-        if watcher is not None:
-            watcher.begin(buffer, first, info)
-        with clock.part("history_s"):
-            if selector is not None and buffer is not None and len(buffer):
-                chosen = selector.select(buffer, first.images[selector.camera])
-                start, stop = chosen.start, chosen.stop
-                chunks = decode()
-            policy.reset(
-                RolloutInfo(
-                    info.goal,
-                    stop - start,
-                    config.model_seed,
-                    simulator if policy.privileged else None,
-                )
-            )
-            for chunk in chunks or ():
+        )
+        if buffer is not None:
+            for chunk in buffer.stream(config.history_chunk, policy.history_cameras, start, stop):
                 policy.add_history(chunk.frames, chunk.states, stop - start)
     status, steps = _live(policy, simulator, first, info.goal, clock, watcher, guard)
     if status is Status.ERROR:
