@@ -20,6 +20,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.score import read, rollouts
 from robomme_interference_data.evaluate.score.check import BITS, REFUSED, field, pack
+from robomme_interference_data.evaluate.score.columns import distinct
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
 from robomme_interference_data.evaluate.score.scoring import score
 
@@ -362,3 +363,12 @@ def test_nothing_but_bad_rows_says_how_many(tmp_path: Path) -> None:
     path = made.write_csv(tmp_path / "a.csv", [replace(r, family="X") for r in made.rows()[:3]])
     with pytest.raises(BadRowsError, match=r"all 3 rows are bad; the first is .*line 2: unknown"):
         score([path], lenient=True)
+
+
+@given(st.lists(st.integers(-3, 3), max_size=30))
+def test_distinct_values_are_those_of_numpy(values: list[int]) -> None:
+    array = np.array(values, np.int64)
+    found, place = distinct(array)
+    expected, places = np.unique(array, return_inverse=True)
+    assert found.tolist() == expected.tolist()
+    assert place.tolist() == places.tolist()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS, SPLITS
 from robomme_interference_data.errors import nearest
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_rank
-from robomme_interference_data.evaluate.score.columns import Codes, Rows
+from robomme_interference_data.evaluate.score.columns import Codes, Rows, distinct
 from robomme_interference_data.evaluate.score.read import Batch, Source
 from robomme_interference_data.evaluate.systems import name_system
 
@@ -140,7 +140,7 @@ class Checker:
 
     def _seeds(self, rows: Rows) -> Codes:
         seeds = rows.number("model_seed", 2**62, default=0)
-        values, place = np.unique(seeds, return_inverse=True)
+        values, place = distinct(seeds)
         codes = np.zeros(len(values), np.int64)
         for index, value in enumerate(values.tolist()):
             if value not in self.model_seeds:
@@ -178,6 +178,8 @@ class Checker:
             ("difficulty", self.difficulty, difficulty),
             ("seed", self.seeds, seed),
         ):
+            if (known[group, episode] == given).all():  # nothing new, nothing else
+                continue
             said = sound & (given >= 0)
             at = group[said], episode[said]
             before = known[at]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.score.check import BITS, STATUSES, field, pack
+from robomme_interference_data.evaluate.score.columns import distinct
 from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.rollouts import Rollouts
 from robomme_interference_data.ids import EpisodeId, condition_name
@@ -122,9 +123,9 @@ def outcomes_of(rollouts: Rollouts) -> Iterator[Outcomes]:
 def _outcomes(
     rollouts: Rollouts, code: int, simulator: str, system: str, packed: NDArray[np.uint64]
 ) -> Outcomes:
-    conditions, row = np.unique(field(packed, "condition"), return_inverse=True)
+    conditions, row = distinct(field(packed, "condition"))
     keys = (packed >> np.uint64(_EPISODE_SHIFT)).astype(np.int64) & (2**_EPISODE_BITS - 1)
-    episodes, column = np.unique(keys, return_inverse=True)
+    episodes, column = distinct(keys)
     status = field(packed, "status")
     shape = (len(conditions), len(episodes))
     cell = row * len(episodes) + column
