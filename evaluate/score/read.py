@@ -50,6 +50,7 @@ COLUMNS = (
 _NEEDED = ("family", "condition", "episode", "status", "success")
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
 _BLOCK = 16 * 2**20  # bytes of CSV at a time
+_LOOKED_AT = 2**16  # bytes of CSV, to tell whether it is text
 _BATCH = 2**18  # rows of parquet at a time
 
 
@@ -246,7 +247,7 @@ def _csv_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
 def _check_text(path: Path) -> None:
     """Refuse what is no text at all: pyarrow would show a traceback of its own for it."""
     with path.open("rb") as file:
-        start = file.read(_BLOCK)
+        start = file.read(_LOOKED_AT)
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError as error:
