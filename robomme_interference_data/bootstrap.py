@@ -13,15 +13,19 @@ from numpy.typing import NDArray
 __all__ = [
     "DRAWS",
     "Interval",
+    "LEAST",
     "Resampler",
     "Statistic",
     "difference",
+    "enough",
     "mean",
     "retention",
     "slope",
 ]
 
 DRAWS = 10_000
+LEAST = 10
+"""So many episodes must stand out for a paired comparison to have a bootstrap interval."""
 _CHUNK = 2**15  # numbers at a time: they stay in the cache, and BLAS starts no threads for them
 _MANY = 5_000
 """Above so many episodes, equal ones are drawn together."""
@@ -89,6 +93,22 @@ def retention(none: int, start: int, end: int) -> Statistic:
 def slope(columns: Sequence[int], weights: Floats) -> Statistic:
     """Return the weighted sum of the columns' means (see `statistics.slope_weights`)."""
     return Statistic(_together(columns), lambda s: s[:, :-1] @ weights / s[:, -1])
+
+
+def enough(values: Floats) -> bool:
+    """Whether what each episode adds to a comparison varies enough for a bootstrap interval.
+
+    At least `LEAST` episodes must have another value than the commonest one, which for a paired
+    difference is most often 0: as many must differ between the two sides. With fewer, the
+    resampled means fall on a coarse lattice, a share of draws that is not small holds none of the
+    few episodes that matter, and intervals cover less than they promise, down to width zero
+    where all episodes agree.
+
+    Args:
+        values: A number for each episode, `(E,) float64`.
+    """
+    _, counts = np.unique(values.round(12), return_counts=True)
+    return len(values) - int(counts.max(initial=0)) >= LEAST
 
 
 class Resampler:

@@ -2,7 +2,7 @@
 
 import math
 
-__all__ = ["Z95", "newcombe", "wilson"]
+__all__ = ["Z95", "newcombe", "newcombe_paired", "wilson"]
 
 Z95 = 1.959963984540054
 """The 97.5% quantile of the standard normal distribution."""
@@ -54,4 +54,45 @@ def newcombe(
     return (
         rate - other - math.hypot(rate - low, other_high - other),
         rate - other + math.hypot(high - rate, other - other_low),
+    )
+
+
+def newcombe_paired(both: int, first: int, second: int, neither: int) -> tuple[float, float]:
+    """Return the 95% score interval of the difference of two paired rates, first − second.
+
+    With n pairs, rates p = (both + first) / n and q = (both + second) / n and their Wilson
+    intervals (l, u), (l', u'): p − q − √((p − l)² − 2φ (p − l)(u' − q) + (u' − q)²) to
+    p − q + √((u − p)² − 2φ (u − p)(q − l') + (q − l')²). φ estimates the correlation: with
+    A = both · neither − first · second it is A / √(n₁(n − n₁) n₂(n − n₂)), n₁ and n₂ the successes
+    of the two sides, where a positive A is first lowered by n / 2, to no less than 0; φ is 0 where
+    a factor of the root is.
+
+    Source: Newcombe (1998), Improved confidence intervals for the difference between binomial
+    proportions based on paired data, Statistics in Medicine 17, 2635–2650, method 10.
+
+    Args:
+        both: Pairs that succeed on both sides.
+        first: Pairs that succeed on the first side alone.
+        second: Pairs that succeed on the second side alone.
+        neither: Pairs that succeed on neither. Without any pair the interval is `(−1, 1)`.
+    """
+    pairs = both + first + second + neither
+    if pairs == 0:
+        return -1.0, 1.0
+    one, other = both + first, both + second
+    rate, other_rate = one / pairs, other / pairs
+    low, high = wilson(one, pairs)
+    other_low, other_high = wilson(other, pairs)
+    product = one * (pairs - one) * other * (pairs - other)
+    joint: float = both * neither - first * second
+    joint = max(0.0, joint - pairs / 2) if joint > 0 else joint
+    phi = joint / math.sqrt(product) if product else 0.0
+
+    def added(a: float, b: float) -> float:
+        return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
+
+    difference = (first - second) / pairs
+    return (
+        max(-1.0, difference - added(rate - low, other_high - other_rate)),
+        min(1.0, difference + added(high - rate, other_rate - other_low)),
     )

@@ -15,6 +15,7 @@ from robomme_interference_data.bootstrap import (
     Resampler,
     Statistic,
     difference,
+    enough,
     mean,
     retention,
     slope,
@@ -98,6 +99,9 @@ def test_holm_by_hand() -> None:
     assert holm([0.04, 0.01, 0.03, 0.02]) == pytest.approx([0.06, 0.04, 0.06, 0.06])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
     assert holm([]) == []
+    # What was not tested is no test: 2 and not 3 times the smallest.
+    tested = holm([0.01, math.nan, 0.04])
+    assert tested[0] == 0.02 and math.isnan(tested[1]) and tested[2] == 0.04
 
 
 @given(st.lists(st.floats(0, 1), max_size=8))
@@ -172,10 +176,17 @@ def test_intervals_are_scipys_bca(statistic: Statistic, function: Function) -> N
     assert found.high == pytest.approx(expected.high, abs=tolerance)
 
 
-def test_all_episodes_alike_leave_no_doubt() -> None:
-    values = np.tile([0.0, 1.0], (20, 1))
-    (found,) = Resampler(values, "").intervals([difference(0, 1)])
-    assert (found.value, found.low, found.high) == (1.0, 1.0, 1.0)
+def test_ten_episodes_must_stand_out_for_an_interval() -> None:
+    assert not enough(np.zeros(0))
+    assert not enough(np.array([1.0] * 9 + [0.0] * 441))
+    assert enough(np.array([1.0] * 10 + [0.0] * 440))
+    # All gained but nine: the draws are as coarse as where nine are gained.
+    assert not enough(np.array([1.0] * 441 + [0.0] * 9))
+    assert not enough(np.ones(450))
+    # Six differ one way and four the other.
+    assert enough(np.array([1.0] * 6 + [-1.0] * 4 + [0.0] * 20))
+    # What rounding alone tells apart is equal.
+    assert not enough(np.array([0.1 + 0.2] * 10 + [0.3] * 20))
 
 
 def test_missing_episodes_do_not_count() -> None:

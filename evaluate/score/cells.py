@@ -40,7 +40,7 @@ class Cell:
         n: Episodes that count: at least one rollout that is no error.
         rate: Mean over them of the success of their repeats; NaN if n is 0.
         counts: Rollouts by status, as `STATUSES`.
-        missing: Expected episodes that do not count.
+        missing: Expected episodes that do not count with every model seed of the condition.
         other: Episodes that count without being expected.
         rank: Place among the complete cells of this simulator, condition and part, 1 for the
             highest rate; None for an incomplete cell, and for a system that is a bound.
@@ -59,7 +59,7 @@ class Cell:
 
     @property
     def complete(self) -> bool:
-        """Whether exactly the expected episodes count."""
+        """Whether exactly the expected episodes count, with every model seed."""
         return self.n > 0 and not self.missing and not self.other
 
     @property
@@ -86,7 +86,8 @@ def cells_by(
         wanted_parts = _parts(part, wanted, unknown=True)
         for place, condition in enumerate(one.conditions):
             counts = one.scored[place] > 0
-            missing = ~np.isin(wanted.episodes, one.episodes[counts], assume_unique=True)
+            whole = one.episodes[counts & one.whole[place]]
+            missing = ~np.isin(wanted.episodes, whole, assume_unique=True)
             other = counts & ~np.isin(one.episodes, wanted.episodes, assume_unique=True)
             for name, here in parts.items():
                 if not here.any() and not wanted_parts[name].any():
@@ -231,13 +232,13 @@ def coverage_table(outcomes: Sequence[Outcomes], expected: Mapping[str, Expected
         for place, condition in enumerate(one.conditions):
             counts = one.scored[place] > 0
             broke = one.counts[place, :, ERROR] > 0
-            scored = one.episodes[counts]
+            whole = one.episodes[counts & one.whole[place]]
             for rank, family in enumerate(FAMILIES):
                 here = one.families == rank
                 due = wanted.episodes[wanted.families == rank]
                 if not len(due) and not here.any():
                     continue
-                missing = np.setdiff1d(due, scored, assume_unique=True)
+                missing = np.setdiff1d(due, whole, assume_unique=True)
                 other = np.setdiff1d(one.episodes[here & counts], due, assume_unique=True)
                 n, errors = int((here & counts).sum()), int(one.counts[place, here, ERROR].sum())
                 lists = (missing, one.episodes[here & broke], other)
@@ -250,8 +251,8 @@ def coverage_table(outcomes: Sequence[Outcomes], expected: Mapping[str, Expected
                     )
                 )
     note = (
-        "Episodes by split and index. An episode counts if one of its rollouts is no error; one "
-        "whose rollouts all broke is missing."
+        "Episodes by split and index. An episode counts if one of its rollouts is no error. With "
+        "repeats, one that does not count with every model seed of the condition is missing."
     )
     return Table("coverage", "Which episodes count", tuple(columns), tuple(rows), note)
 

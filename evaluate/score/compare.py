@@ -1,26 +1,34 @@
 """Two runs, paired over the episodes that both have."""
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.bootstrap import Interval, Resampler, difference
+from robomme_interference_data.bootstrap import Resampler, difference
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.rows import condition_rank
 from robomme_interference_data.evaluate.score.outcomes import (
-    SUCCESS,
     Outcomes,
     families_of,
     outcomes_of,
 )
+from robomme_interference_data.evaluate.score.paired import (
+    COLUMNS,
+    Tested,
+    interval_of,
+    note_of,
+    pairs_of,
+    tested,
+)
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
-from robomme_interference_data.evaluate.score.statistics import holm, mcnemar
-from robomme_interference_data.tables import Column, Table
+from robomme_interference_data.evaluate.score.statistics import holm
+from robomme_interference_data.intervals import wilson
+from robomme_interference_data.tables import Column, Table, percent
 
 __all__ = ["Comparison", "compare"]
 
@@ -31,7 +39,8 @@ class Comparison:
 
     Attributes:
         table: A row per condition, then per condition and family.
-        notes: What a reader must know, such as that the revisions differ.
+        notes: What a reader must know: that revisions differ, how many episodes flip between two
+            runs of one system, what only one of the runs holds.
     """
 
     table: Table
@@ -56,42 +65,40 @@ def compare(
         BadRowsError: Rows are bad.
     """
     one, other = (read_rollouts([p], s) for p, s in zip((first, second), systems, strict=True))
-    pairs = list(_pairs(one, other))
-    rows, p_values = [], []
-    for a, b in pairs:
-        episodes = np.intersect1d(a.episodes, b.episodes, assume_unique=True)
-        shared = [c for c in a.conditions if c in b.conditions]
+    seeds = _seeds(one, other)
+    rows: list[tuple[Any, ...]] = []
+    notes = list(_differing(one, other))
+    met = list(_pairs(one, other))
+    for a, b in met:
+        shared = sorted((c for c in a.conditions if c in b.conditions), key=condition_rank)
+        found = [_Condition(a, b, condition, seeds) for condition in shared]
         for part in ("", *FAMILIES):
-            here = episodes if not part else episodes[families_of(episodes) == FAMILIES.index(part)]
-            for condition in sorted(shared, key=condition_rank):
-                row = _row(a, b, condition, here)
-                if row is not None:
-                    names = (a.simulator, a.system, b.system, part or "all", condition)
-                    rows.append((*names, *row))
-                    p_values.append(row[-1])
+            for here in found:
+                if numbers := here.row(part):
+                    names = (a.simulator, a.system, b.system, part or "all", here.condition)
+                    rows.append((*names, *numbers))
+        if a.system == b.system and a.simulator not in _revised(one, other):
+            notes += _noise(a, found, one, other)
     if not rows:
         raise InvalidOptionError(
             f"{first} and {second} have no episode under a common condition that counts in both",
             "Compare runs over the same episodes.",
         )
-    known = [place for place, p in enumerate(p_values) if not math.isnan(p)]
-    corrected = dict(zip(known, holm([p_values[place] for place in known]), strict=True))
+    notes += _left_out("a", one, met) + _left_out("b", other, [(b, a) for a, b in met])
     columns = (
         *(Column(n) for n in ("simulator", "system_a", "system_b", "family", "condition")),
         *(Column("n", "count"), Column("rate_a", "rate"), Column("rate_b", "rate")),
-        *(Column("difference", "points"), Column("low", "points"), Column("high", "points")),
-        *(Column("gained", "count"), Column("lost", "count")),
-        *(Column("p", "p"), Column("p_holm", "p")),
+        *(Column("difference", "points"), *COLUMNS),
     )
     note = (
-        f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is b − a "
-        "with its 95% BCa bootstrap interval, clustered by episode. gained and lost: from a to b; "
-        "p: McNemar's exact test; p_holm: corrected for the number of tests in this table."
+        f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
+        "b − a, gained and lost are from a to b. "
     )
-    found = tuple((*row, corrected.get(i, math.nan)) for i, row in enumerate(rows))
-    return Comparison(
-        Table("compare", "Two runs compared", columns, found, note), _notes(one, other)
-    )
+    place, pairs = (next(i for i, c in enumerate(columns) if c.name == n) for n in ("n", "pairs"))
+    note += note_of([(row[place], row[pairs]) for row in rows])
+    corrected = holm([row[-1] for row in rows])
+    whole = tuple((*row, p) for row, p in zip(rows, corrected, strict=True))
+    return Comparison(Table("compare", "Two runs compared", columns, whole, note), tuple(notes))
 
 
 def _pairs(one: Rollouts, other: Rollouts) -> Iterator[tuple[Outcomes, Outcomes]]:
@@ -136,30 +143,126 @@ def _check_episodes(one: Rollouts, other: Rollouts, simulators: set[str]) -> Non
             )
 
 
-def _row(
-    a: Outcomes, b: Outcomes, condition: str, episodes: NDArray[np.int64]
-) -> tuple[float, ...] | None:
-    values = np.stack([a.column(condition, episodes), b.column(condition, episodes)], axis=1)
-    values = values[~np.isnan(values).any(axis=1)]
-    if not len(values):
-        return None
-    one, other = a.first(condition, episodes), b.first(condition, episodes)
-    known = (one >= 0) & (other >= 0)
-    gained = int((known & (one != SUCCESS) & (other == SUCCESS)).sum())
-    lost = int((known & (one == SUCCESS) & (other != SUCCESS)).sum())
-    change: Interval = Resampler(values, a.simulator).intervals([difference(0, 1)])[0]
-    return (
-        *(len(values), float(values[:, 0].mean()), float(values[:, 1].mean())),
-        *(change.value, change.low, change.high, gained, lost),
-        mcnemar(gained, lost) if known.any() else math.nan,
-    )
+@dataclass(frozen=True)
+class _Seeds:
+    """Numbers that stand for the model seeds of the two runs, by their codes."""
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    shared: bool
 
 
-def _notes(one: Rollouts, other: Rollouts) -> tuple[str, ...]:
-    differing = [
-        f"The rows of {simulator} are of different splits (revisions {revision} and "
-        f"{other.revisions[simulator]}): the histories differ."
-        for simulator, revision in one.revisions.items()
-        if other.revisions.get(simulator, revision) != revision
-    ]
-    return tuple(differing)
+def _seeds(one: Rollouts, other: Rollouts) -> _Seeds:
+    """Match the model seeds of two runs; if they share none, the lowest with the lowest."""
+    a, b = (np.array(r.model_seeds, np.int64) for r in (one, other))
+    if not np.isin(a, b).any():
+        return _Seeds(np.arange(len(a)), np.arange(len(b)), False)
+    known = np.union1d(a, b)
+    return _Seeds(np.searchsorted(known, a), np.searchsorted(known, b), True)
+
+
+class _Condition:
+    """One condition of a system in both runs, over the episodes that both have."""
+
+    def __init__(self, a: Outcomes, b: Outcomes, condition: str, seeds: _Seeds):
+        self.condition = condition
+        self._simulator = a.simulator
+        episodes = np.intersect1d(a.episodes, b.episodes, assume_unique=True)
+        columns = [one.column(condition, episodes) for one in (a, b)]
+        self._values = np.stack(columns, axis=1)
+        known = ~np.isnan(self._values).any(axis=1)
+        self._values, self._episodes = self._values[known], episodes[known]
+        self._once = a.once(condition, self._episodes) & b.once(condition, self._episodes)
+        self._pairs = pairs_of(
+            a.counted(condition, seeds.first), b.counted(condition, seeds.second)
+        )
+
+    def tested(self, part: str = "") -> Tested:
+        """Return McNemar's exact test in all pairs, or in those of a family."""
+        return tested(self._pairs, _of(part, self._pairs.episodes))
+
+    def row(self, part: str) -> tuple[Any, ...]:
+        """Return the numbers of all episodes, or of a family; none if no episode counts."""
+        here = _of(part, self._episodes)
+        values = self._values[here]
+        if not len(values):
+            return ()
+        (drawn,) = Resampler(values, self._simulator).intervals([difference(0, 1)])
+        change, kind = interval_of(values, bool(self._once[here].all()), drawn)
+        test = self.tested(part)
+        return (
+            *(len(values), float(values[:, 0].mean()), float(values[:, 1].mean())),
+            *(change.value, change.low, change.high, kind),
+            *(test.pairs, test.gained, test.lost, test.flips, test.p),
+        )
+
+
+def _of(part: str, episodes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    if not part:
+        return np.ones(len(episodes), bool)
+    return families_of(episodes) == FAMILIES.index(part)
+
+
+def _revised(one: Rollouts, other: Rollouts) -> list[str]:
+    return [s for s, r in one.revisions.items() if other.revisions.get(s, r) != r]
+
+
+def _differing(one: Rollouts, other: Rollouts) -> Iterator[str]:
+    for simulator in _revised(one, other):
+        yield (
+            f"The rows of {simulator} are of different splits (revisions "
+            f"{one.revisions[simulator]} and {other.revisions[simulator]}): the histories differ."
+        )
+
+
+def _noise(
+    a: Outcomes, found: Sequence[_Condition], one: Rollouts, other: Rollouts
+) -> Iterator[str]:
+    """Say how many episodes flip between two runs of the same system: the noise floor."""
+    shares = []
+    for here in found:
+        test = here.tested()
+        if test.pairs:
+            low, high = wilson(test.gained + test.lost, test.pairs)
+            shares.append(
+                f"{here.condition} {percent(test.flips)} of {test.pairs} "
+                f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
+            )
+    if shares:
+        same = set(one.model_seeds) & set(other.model_seeds)
+        seeds = "the same model seeds" if same else "other model seeds"
+        yield (
+            f"{a.system} ran in both, with {seeds}, in {a.simulator}. If nothing else differs, "
+            f"this share of episodes flips by itself, which is the noise floor: "
+            f"{', '.join(shares)}."
+        )
+
+
+def _left_out(name: str, rollouts: Rollouts, met: Sequence[tuple[Outcomes, Outcomes]]) -> list[str]:
+    """Say what one run has and the comparison leaves out, nothing if that is nothing."""
+    parts = []
+    compared = {(a.simulator, a.system) for a, _ in met}
+    alone = [o for o in outcomes_of(rollouts) if (o.simulator, o.system) not in compared]
+    if alone:
+        parts.append(_counted("system", [f"{o.system} in {o.simulator}" for o in alone]))
+    for a, b in met:
+        only = [c for c in a.conditions if c not in b.conditions]
+        found = [_counted("condition", only)] if only else []
+        found += _episodes_of_one(a, b)
+        parts += [f"of {a.system} in {a.simulator} {' and '.join(found)}"] if found else []
+    return [f"Only in {name}, and left out: {'; '.join(parts)}."] if parts else []
+
+
+def _episodes_of_one(a: Outcomes, b: Outcomes) -> Iterator[str]:
+    """Count the episodes that count under a shared condition in the first run alone."""
+    under: dict[int, list[str]] = {}
+    for condition in (c for c in a.conditions if c in b.conditions):
+        here, there = (np.unique(o.counted(condition)[0]) for o in (a, b))
+        if lone := len(np.setdiff1d(here, there, assume_unique=True)):
+            under.setdefault(lone, []).append(condition)
+    for lone, conditions in under.items():
+        yield f"{lone:,} episode{'s' * (lone > 1)} under {', '.join(conditions)}"
+
+
+def _counted(what: str, names: Sequence[str]) -> str:
+    return f"{len(names)} {what}{'s' * (len(names) > 1)} ({', '.join(names)})"

@@ -5,24 +5,16 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.effects import Contrast, Effects
-from robomme_interference_data.evaluate.score.outcomes import ERROR, SUCCESS, Outcomes
+from robomme_interference_data.bootstrap import LEAST
+from robomme_interference_data.evaluate.score.effects import SURE, Contrast, Effects
+from robomme_interference_data.evaluate.score.outcomes import Outcomes
+from robomme_interference_data.evaluate.score.paired import COLUMNS, note_of
 from robomme_interference_data.evaluate.score.statistics import cohens_h, flip_rate, holm
 from robomme_interference_data.tables import Column, Table
 
 __all__ = ["contrast_table", "decay_table", "lift_table", "noise_table"]
 
 _CELL = (Column("simulator"), Column("system"), Column("condition"))
-_TESTS = (
-    *(Column("low", "points"), Column("high", "points")),
-    *(Column("gained", "count"), Column("lost", "count")),
-    *(Column("p", "p"), Column("p_holm", "p")),
-)
-_PAIRED = (
-    "Over the n episodes that count on both sides. 95% intervals: BCa bootstrap, clustered by "
-    "episode. gained and lost: episodes whose outcome differs; p: McNemar's exact test on them; "
-    "p_holm: corrected for the number of tests in this table."
-)
 
 
 def lift_table(effects: Iterable[Effects]) -> Table:
@@ -32,7 +24,7 @@ def lift_table(effects: Iterable[Effects]) -> Table:
         *_CELL,
         *(Column("no_history_of"), Column("n", "count")),
         *(Column("rate", "rate"), Column("no_history_rate", "rate"), Column("lift", "points")),
-        *_TESTS,
+        *COLUMNS,
         *(Column("retention", "ratio"), Column("retention_low", "ratio")),
         *(Column("retention_high", "ratio"), Column("complete", "flag")),
     )
@@ -42,11 +34,13 @@ def lift_table(effects: Iterable[Effects]) -> Table:
             *_tested(c, p),
             *(c.retention.value, c.retention.low, c.retention.high, c.complete),
         )
-        for c, p in zip(found, _corrected(found), strict=True)
+        for c, p in zip(found, holm([c.test.p for c in found]), strict=True)
     ]
     note = (
-        f"{_PAIRED} retention: lift divided by the lift at k0, where that one's interval is above "
-        "zero. A system with retrieval is, without history, the system without it."
+        f"{_note(found)} retention: lift divided by the lift at k0, where that one is above zero "
+        f"with p < {SURE}; its BCa interval, where any two of no-history, k0 and the condition "
+        f"differ in at least {LEAST} episodes. A system with retrieval is, without history, the "
+        "system without it."
     )
     return Table("lift", "Lift over no history", columns, tuple(rows), note)
 
@@ -58,7 +52,7 @@ def contrast_table(effects: Iterable[Effects]) -> Table:
         *_CELL,
         *(Column("against_system"), Column("against_condition"), Column("n", "count")),
         *(Column("rate", "rate"), Column("against_rate", "rate"), Column("difference", "points")),
-        *_TESTS,
+        *COLUMNS,
         *(Column("cohens_h", "ratio"), Column("complete", "flag")),
     )
     rows = [
@@ -68,9 +62,9 @@ def contrast_table(effects: Iterable[Effects]) -> Table:
             cohens_h(c.rate, c.against_rate) if c.n else math.nan,
             c.complete,
         )
-        for c, p in zip(found, _corrected(found), strict=True)
+        for c, p in zip(found, holm([c.test.p for c in found]), strict=True)
     ]
-    return Table("effects", "Effects between conditions", columns, tuple(rows), _PAIRED)
+    return Table("effects", "Effects between conditions", columns, tuple(rows), _note(found))
 
 
 def decay_table(outcomes: Sequence[Outcomes], effects: Sequence[Effects]) -> Table:
@@ -91,7 +85,7 @@ def decay_table(outcomes: Sequence[Outcomes], effects: Sequence[Effects]) -> Tab
     note = (
         "slope: change of the success rate with each doubling of the sessions in the buffer, the "
         "lesson included: the least-squares line over log2(k + 1). 95% BCa bootstrap interval, "
-        "clustered by episode."
+        f"clustered by episode, where at least {LEAST} episodes add to the slope."
     )
     return Table("decay", "Decay over sessions", columns, tuple(rows), note)
 
@@ -105,27 +99,29 @@ def noise_table(outcomes: Iterable[Outcomes]) -> Table:
     )
     rows = []
     for one in outcomes:
-        for place, condition in enumerate(one.conditions):
-            pair = one.repeats[:, place]
-            both = np.isin(pair, (-1, ERROR), invert=True).all(axis=0)
-            if both.any():
-                numbers = flip_rate(*(pair[:, both] == SUCCESS))
-                rows.append((one.simulator, one.system, condition, int(both.sum()), *numbers))
+        for condition in one.conditions:
+            episodes, _, success = one.counted(condition)
+            lowest = np.flatnonzero(np.diff(episodes, prepend=-1))
+            twice = lowest[np.diff(lowest, append=len(episodes)) > 1]
+            if len(twice):
+                numbers = flip_rate(success[twice], success[twice + 1])
+                rows.append((one.simulator, one.system, condition, len(twice), *numbers))
     note = (
-        "Repeats differ in the model seed alone; the two lowest are compared. Differences between "
-        "conditions below the flip rate are noise."
+        "Repeats differ in the model seed alone; in each episode the two lowest that count are "
+        "compared. A share of flips between conditions (flips in the tables of effects) that is "
+        "not above this rate is noise. A flip rate is gross, a difference is net, gained less "
+        "lost: one that is smaller than this rate can still be real, and p tells."
     )
     return Table("noise", "Flips between repeats", columns, tuple(rows), note)
 
 
-def _tested(contrast: Contrast, corrected: float) -> tuple[float, ...]:
+def _tested(contrast: Contrast, corrected: float) -> tuple[float | str, ...]:
     change = contrast.change
-    tests = (contrast.gained, contrast.lost, contrast.p, corrected)
-    return (change.value, change.low, change.high, *tests)
+    test = contrast.test
+    numbers = (test.pairs, test.gained, test.lost, test.flips, test.p, corrected)
+    return (change.value, change.low, change.high, contrast.interval, *numbers)
 
 
-def _corrected(contrasts: Sequence[Contrast]) -> list[float]:
-    """Correct the p-values that there are; NaN stays."""
-    known = [place for place, contrast in enumerate(contrasts) if not math.isnan(contrast.p)]
-    adjusted = dict(zip(known, holm([contrasts[place].p for place in known]), strict=True))
-    return [adjusted.get(place, math.nan) for place in range(len(contrasts))]
+def _note(contrasts: Sequence[Contrast]) -> str:
+    counts = [(contrast.n, contrast.test.pairs) for contrast in contrasts]
+    return f"Over the n episodes that count on both sides. {note_of(counts)}"

@@ -17,17 +17,27 @@ from robomme_interference_data.bootstrap import (
     Resampler,
     Statistic,
     difference,
+    enough,
     retention,
     slope,
 )
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
-from robomme_interference_data.evaluate.score.outcomes import SUCCESS, Expected, Outcomes
-from robomme_interference_data.evaluate.score.statistics import mcnemar, slope_weights
+from robomme_interference_data.evaluate.score.outcomes import Expected, Outcomes
+from robomme_interference_data.evaluate.score.paired import (
+    Rows,
+    Tested,
+    interval_of,
+    pairs_of,
+    tested,
+)
+from robomme_interference_data.evaluate.score.statistics import slope_weights
 from robomme_interference_data.evaluate.systems import SYSTEMS
 
 __all__ = ["Contrast", "Effects", "base_of", "effects_of"]
 
 START = "k0"
+SURE = 0.05
+"""Below this p of McNemar's exact test, a lift is one that retention can be a share of."""
 _NONE = Interval(math.nan, math.nan, math.nan)
 
 
@@ -43,11 +53,10 @@ class Contrast:
         n: Episodes that count under both.
         rate: Mean success over them.
         against_rate: The same of `against`.
-        change: `rate` − `against_rate` with its bootstrap interval.
-        gained: Episodes that succeed only here; with repeats, in those of the lowest model seeds.
-        lost: Episodes that succeed only there, likewise.
-        p: Of McNemar's exact test on these.
+        test: McNemar's exact test: gained are pairs that succeed only here.
         complete: Whether both cells are complete.
+        change: `rate` − `against_rate` with its interval.
+        interval: Kind of that interval (see `paired.interval_of`).
         retention: Under `against` at `no-history`: what is left of the lift at k0.
     """
 
@@ -58,11 +67,10 @@ class Contrast:
     n: int
     rate: float
     against_rate: float
-    change: Interval
-    gained: int
-    lost: int
-    p: float
+    test: Tested
     complete: bool
+    change: Interval = _NONE
+    interval: str = ""
     retention: Interval = _NONE
 
 
@@ -74,7 +82,8 @@ class Effects:
         lift: Each condition with history against `no-history`.
         contrasts: Each k against k0, and under each condition a system with retrieval against the
             one without.
-        decay: Change of the rate with each doubling of the sessions in the buffer.
+        decay: Change of the rate with each doubling of the sessions in the buffer; its interval is
+            given where at least ten episodes add to it (see `bootstrap.enough`).
         decay_conditions: The conditions that it is computed from.
         decay_episodes: The number of episodes.
         decay_complete: Whether all these cells are complete.
@@ -105,29 +114,27 @@ class _Columns:
         self.episodes: NDArray[np.int64] = np.unique(np.concatenate(both))
         self.cells: list[tuple[str, str]] = []
         self.complete: dict[tuple[str, str], bool] = {}
-        self.first: list[NDArray[np.int8]] = []
+        self.once: list[NDArray[np.bool_]] = []
+        self.counted: list[Rows] = []
         columns = []
         for outcomes in [one] if base is None else [one, base]:
             for condition in outcomes.conditions:
                 column = outcomes.column(condition, self.episodes)
                 cell = (outcomes.system, condition)
-                counts = self.episodes[~np.isnan(column)]
-                self.complete[cell] = np.array_equal(counts, expected.episodes)
+                self.complete[cell] = outcomes.complete(condition, expected)
                 self.cells.append(cell)
-                self.first.append(outcomes.first(condition, self.episodes))
+                self.once.append(outcomes.once(condition, self.episodes))
+                self.counted.append(outcomes.counted(condition))
                 columns.append(column)
         self.values = np.stack(columns, axis=1)
 
-    def place(self, cell: tuple[str, str]) -> int | None:
-        return self.cells.index(cell) if cell in self.cells else None
+    def together(self, places: Sequence[int]) -> NDArray[np.bool_]:
+        """Whether each episode counts in all of these cells."""
+        return np.asarray(~np.isnan(self.values[:, list(places)]).any(axis=1))
 
     def contrast(self, here: tuple[str, str], there: tuple[str, str]) -> Contrast:
         a, b = self.cells.index(here), self.cells.index(there)
-        values = self.values[~np.isnan(self.values[:, [a, b]]).any(axis=1)]
-        one, other = self.first[a], self.first[b]
-        known = (one >= 0) & (other >= 0)
-        gained = int((known & (one == SUCCESS) & (other != SUCCESS)).sum())
-        lost = int((known & (one != SUCCESS) & (other == SUCCESS)).sum())
+        values = self.values[self.together([a, b])]
         return Contrast(
             self.one.simulator,
             *here,
@@ -135,12 +142,30 @@ class _Columns:
             len(values),
             float(values[:, a].mean()) if len(values) else math.nan,
             float(values[:, b].mean()) if len(values) else math.nan,
-            _NONE,
-            gained,
-            lost,
-            mcnemar(gained, lost) if known.any() else math.nan,
+            tested(pairs_of(self.counted[b], self.counted[a])),
             self.complete[here] and self.complete[there],
         )
+
+    def bounded(self, found: Contrast, drawn: Interval) -> Contrast:
+        """Give a comparison the interval that its data bear."""
+        places = [self.cells.index(c) for c in (found.against, (found.system, found.condition))]
+        known = self.together(places)
+        once = np.logical_and(*(self.once[place] for place in places))
+        values = self.values[known][:, places]
+        change, kind = interval_of(values, bool(once[known].all()), drawn)
+        return replace(found, change=change, interval=kind)
+
+    def retained(self, places: Sequence[int], drawn: Interval) -> Interval:
+        """Give a retention its interval, if any two of its three conditions differ enough.
+
+        Where two hardly differ, the ratio sticks to 0 or 1 in most draws, or divides by next to
+        nothing.
+        """
+        values = self.values[self.together(places)][:, list(places)]
+        pairs = [values[:, i] - values[:, j] for i, j in ((1, 0), (2, 0), (2, 1))]
+        if all(map(enough, pairs)) and drawn.low < drawn.high:
+            return drawn
+        return Interval(drawn.value, math.nan, math.nan)
 
 
 def effects_of(
@@ -170,25 +195,29 @@ def effects_of(
     statistics: list[Statistic] = []
     for found in (*lift, *contrasts):
         statistics.append(difference(at(found.against), at((found.system, found.condition))))
-    kept = [c for c in histories if c != START] if floor and START in histories else []
-    for condition in kept:
-        cells = (floor, (one.system, START), (one.system, condition))
-        statistics.append(retention(*(at(cell) for cell in cells if cell)))
+    kept: dict[str, tuple[int, int, int]] = {}
+    if floor and START in histories:
+        ends = (at(floor), at((one.system, START)))
+        kept = {c: (*ends, at((one.system, c))) for c in histories if c != START}
+    statistics += [retention(*places) for places in kept.values()]
     decaying = [at((one.system, c)) for c in histories] if len(histories) > 1 else []
+    weights = slope_weights([condition_rank(c) for c in histories]) if decaying else np.zeros(0)
     if decaying:
-        weights = slope_weights([condition_rank(c) for c in histories])
         statistics.append(slope(decaying, weights))
 
     intervals = iter(Resampler(columns.values, one.simulator, draws).intervals(statistics))
-    lift = [replace(found, change=next(intervals)) for found in lift]
-    contrasts = [replace(found, change=next(intervals)) for found in contrasts]
-    retained = {condition: next(intervals) for condition in kept}
+    lift = [columns.bounded(found, next(intervals)) for found in lift]
+    contrasts = [columns.bounded(found, next(intervals)) for found in contrasts]
+    retained = {c: columns.retained(places, next(intervals)) for c, places in kept.items()}
     lift = [replace(f, retention=_defined(f, lift, retained)) for f in lift]
-    together = ~np.isnan(columns.values[:, decaying]).any(axis=1)
+    together = columns.together(decaying)
+    decay = next(intervals) if decaying else _NONE
+    if not enough(columns.values[together][:, decaying] @ weights):
+        decay = Interval(decay.value, math.nan, math.nan)
     return Effects(
         tuple(lift),
         tuple(contrasts),
-        next(intervals) if decaying else _NONE,
+        decay,
         tuple(histories) if decaying else (),
         int(together.sum()) if decaying else 0,
         all(columns.complete[columns.cells[place]] for place in decaying),
@@ -198,8 +227,13 @@ def effects_of(
 def _defined(
     found: Contrast, lift: Sequence[Contrast], retained: Mapping[str, Interval]
 ) -> Interval:
-    """Return the retention, none where k0 is not surely above no-history: a ratio to nothing."""
+    """Return the retention, none where k0 is not surely above no-history: a ratio to nothing.
+
+    Surely means a lift above zero with p < 0.05 in McNemar's exact test.
+    """
     start = next((other for other in lift if other.condition == START), None)
-    if found.condition not in retained or start is None or not start.change.low > 0:
+    if found.condition not in retained or start is None:
+        return _NONE
+    if not (start.change.value > 0 and start.test.p < SURE):
         return _NONE
     return retained[found.condition]

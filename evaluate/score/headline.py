@@ -50,16 +50,17 @@ def headline(score: Score, simulator: str) -> str:
 def _from_start(leader: Cell, contrast: Contrast) -> str:
     k = condition_rank(contrast.condition)
     sessions = "distractor session" + ("s" if k > 1 else "")
-    test = "" if math.isnan(contrast.p) else f", McNemar p = {_p(contrast.p)}"
+    test, p = contrast.test, contrast.test.p
+    tested = "" if math.isnan(p) else f", McNemar p = {_p(p)}"
     change = contrast.change
-    # One episode alone has no interval.
+    # Not every difference has an interval.
     bounds = "" if math.isnan(change.low) else f"{points(change.low)} to {points(change.high)}; "
     return (
         f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} episodes "
         f"when the history holds the lesson alone ({START}, 95% interval {_interval(leader)}), and "
         f"in {percent(contrast.rate)} with {k} {sessions} behind it ({contrast.condition}): "
-        f"{points(change.value)} points ({bounds}{contrast.gained} episodes gained, "
-        f"{contrast.lost} lost{test})."
+        f"{points(change.value)} points ({bounds}{test.gained} episodes gained, "
+        f"{test.lost} lost{tested})."
     )
 
 

@@ -46,8 +46,7 @@ class Outcomes:
         difficulty: Code of each episode, −1 unknown, `(E,) int8`.
         counts: Rollouts by condition, episode and status, `(C, E, 4) int32`; more than one where
             there are repeats with other model seeds.
-        repeats: Status of the rollouts with the two lowest model seeds, −1 for none,
-            `(2, C, E) int8`.
+        packed: Rows of each condition, sorted, `(N,) uint64` (see `check`).
     """
 
     simulator: str
@@ -56,7 +55,7 @@ class Outcomes:
     episodes: NDArray[np.int64]
     difficulty: NDArray[np.int8]
     counts: NDArray[np.int32]
-    repeats: NDArray[np.int8]
+    packed: tuple[NDArray[np.uint64], ...]
 
     @cached_property
     def scored(self) -> NDArray[np.int64]:
@@ -69,10 +68,23 @@ class Outcomes:
         with np.errstate(invalid="ignore"):
             return self.counts[..., SUCCESS] / self.scored
 
+    @cached_property
+    def whole(self) -> NDArray[np.bool_]:
+        """Whether an episode counts with every model seed of the condition, `(C, E) bool`."""
+        seeds = [np.count_nonzero(np.bincount(field(p, "model_seed"))) for p in self.packed]
+        return self.scored == np.array(seeds)[:, None]
+
     @property
     def families(self) -> NDArray[np.int64]:
         """Place of each episode's family in `FAMILIES`, `(E,) int64`."""
         return families_of(self.episodes)
+
+    def complete(self, condition: str, expected: "Expected") -> bool:
+        """Whether exactly the expected episodes count, with every model seed of the condition."""
+        place = self.conditions.index(condition)
+        counts = self.scored[place] > 0
+        exactly = np.array_equal(self.episodes[counts], expected.episodes)
+        return exactly and bool(self.whole[place][counts].all())
 
     def column(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the rates under a condition at the given packed episodes, NaN where none."""
@@ -84,16 +96,29 @@ class Outcomes:
             found[at] = self.rates[self.conditions.index(condition)][there]
         return found
 
-    def first(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.int8]:
-        """Return the status with the lowest model seed at the episodes, −1 where none counts."""
-        found = np.full(len(episodes), -1, np.int8)
-        if condition in self.conditions:
-            _, there, at = np.intersect1d(
-                self.episodes, episodes, assume_unique=True, return_indices=True
-            )
-            found[at] = self.repeats[0, self.conditions.index(condition)][there]
-        found[found == ERROR] = -1
-        return found
+    def once(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether just one rollout counts under a condition, at each of the episodes."""
+        counts = self.scored[self.conditions.index(condition)] == 1
+        return np.isin(episodes, self.episodes[counts], assume_unique=True)
+
+    def counted(
+        self, condition: str, seeds: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the rollouts under a condition that are no errors, by episode, then seed.
+
+        Args:
+            condition: Its name.
+            seeds: A number for each model seed of the rows, ascending; by default its place.
+
+        Returns:
+            The packed episode of each, the number of its model seed, and whether it succeeded.
+        """
+        rows = self.packed[self.conditions.index(condition)]
+        status = field(rows, "status")
+        rows, status = rows[status != ERROR], status[status != ERROR]
+        places = field(rows, "model_seed")
+        numbers = places if seeds is None else seeds[places]
+        return _episodes_of(rows), numbers, status == SUCCESS
 
 
 def families_of(episodes: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -124,18 +149,11 @@ def _outcomes(
     rollouts: Rollouts, code: int, simulator: str, system: str, packed: NDArray[np.uint64]
 ) -> Outcomes:
     conditions, row = distinct(field(packed, "condition"))
-    keys = (packed >> np.uint64(_EPISODE_SHIFT)).astype(np.int64) & (2**_EPISODE_BITS - 1)
-    episodes, column = distinct(keys)
+    episodes, column = distinct(_episodes_of(packed))
     status = field(packed, "status")
     shape = (len(conditions), len(episodes))
     cell = row * len(episodes) + column
     counts = np.bincount(cell * len(STATUSES) + status, minlength=shape[0] * shape[1] * 4)
-    # Rows are sorted by model seed within a cell: the first two of each are the lowest seeds.
-    begins = np.flatnonzero(np.diff(cell, prepend=-1))
-    repeats = np.full((2, shape[0] * shape[1]), -1, np.int8)
-    repeats[0, cell[begins]] = status[begins]
-    again = begins[np.diff(begins, append=len(cell)) > 1]
-    repeats[1, cell[again]] = status[again + 1]
     return Outcomes(
         simulator,
         system,
@@ -143,8 +161,12 @@ def _outcomes(
         episodes,
         rollouts.difficulty_of(code, episodes),
         counts.reshape(*shape, len(STATUSES)).astype(np.int32),
-        repeats.reshape(2, *shape),
+        tuple(np.split(packed, np.searchsorted(row, np.arange(1, len(conditions))))),
     )
+
+
+def _episodes_of(packed: NDArray[np.uint64]) -> NDArray[np.int64]:
+    return (packed >> np.uint64(_EPISODE_SHIFT)).astype(np.int64) & (2**_EPISODE_BITS - 1)
 
 
 @dataclass(frozen=True)

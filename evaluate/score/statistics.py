@@ -43,14 +43,16 @@ def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values adjusted for their number by Holm's step-down method, in the same order.
 
     Sorted upwards, p(i) becomes max over j ≤ i of min(1, (m − j + 1) · p(j)), with m p-values.
+    NaN, where there was nothing to test, stays and is no test.
 
     Source: Holm (1979), A simple sequentially rejective multiple test procedure, Scandinavian
     Journal of Statistics 6, 65–70.
     """
-    order = sorted(range(len(p_values)), key=lambda index: p_values[index])
-    adjusted, largest = [0.0] * len(p_values), 0.0
+    known = [index for index, p in enumerate(p_values) if not math.isnan(p)]
+    order = sorted(known, key=lambda index: p_values[index])
+    adjusted, largest = [math.nan] * len(p_values), 0.0
     for place, index in enumerate(order):
-        largest = max(largest, min(1.0, (len(p_values) - place) * p_values[index]))
+        largest = max(largest, min(1.0, (len(known) - place) * p_values[index]))
         adjusted[index] = largest
     return adjusted
 
@@ -89,8 +91,9 @@ def flip_rate(
 ) -> tuple[int, float, float, float]:
     """Return how often two repeats of the same rollouts disagree: flips, rate, 95% interval.
 
-    The rate is flips / pairs with its Wilson interval: the noise floor, below which a difference
-    between conditions means nothing. NaN for a rate without pairs.
+    The rate is flips / pairs with its Wilson interval: the noise floor. A share of flips between
+    conditions that is not above it is noise. It says less of a difference, which is net (gained
+    less lost) where a flip rate is gross. NaN for a rate without pairs.
 
     Args:
         first: Whether each episode succeeded in one repeat, `(N,) bool`.
