@@ -176,11 +176,14 @@ def test_episodes_beside_the_grid_make_a_cell_incomplete(tmp_path: Path) -> None
     ]
     lines = [line.replace(f",{place},easy", ",,easy") for place, line in enumerate(lines)]
     whole = score([made.released(tmp_path / "a.csv", lines)], draws=100)
-    assert whole.cells[0].complete
+    (k0,) = (cell for cell in whole.cells if cell.condition == "k0")
+    assert k0.complete
     more = [*lines, "my-memory,MoveCube,k0,50,,easy,success,1,9"]
     found = score([made.released(tmp_path / "b.csv", more)], draws=100)
-    assert (found.cells[0].n, found.cells[0].other, found.cells[0].complete) == (451, 1, False)
-    assert find(found, "coverage", family="MoveCube")["other_episodes"] == "test 50"
+    (k0,) = (cell for cell in found.cells if cell.condition == "k0")
+    assert (k0.n, k0.other, k0.complete) == (451, 1, False)
+    lacking = find(found, "coverage", condition="k0", family="MoveCube")
+    assert lacking["other_episodes"] == "test 50"
 
 
 def test_tabletop_rows_are_never_set_against_the_paper(tmp_path: Path) -> None:
@@ -287,15 +290,17 @@ def test_headlines_of_few_rows(small: Score, tmp_path: Path) -> None:
     assert headline(small, "tabletop").startswith(
         "FrameSamp-Modul succeeds in 58.3% of 12 episodes when the history holds the lesson alone"
     )
-    assert "The highest rate at k7 is 58.3%, of Retrieval-FrameSamp-Modul." in headline(
-        small, "tabletop"
+    # Both have 7 of 12 at k0. Of 5 + 4 + 5 expected cells, retrieval lacks k1 and k3, and the
+    # own memory k1, k3 and k7, and part of k0.
+    assert headline(small, "tabletop").endswith(
+        "Under k0, Retrieval-FrameSamp-Modul has the same rate. The highest rate at k7 is 58.3%, "
+        "of Retrieval-FrameSamp-Modul. 8 of 14 cells are complete."
     )
-    assert headline(small, "tabletop").endswith("8 of 9 cells are complete.")
     rows = [row for row in made.rows() if row.condition == NO_HISTORY]
     found = score([made.write_csv(tmp_path / "a.csv", rows)], grid=Grid.GIVEN, draws=100)
     assert headline(found, "tabletop") == (
         "FrameSamp-Modul succeeds in 8.3% of 12 episodes under no history (95% interval 1.5 to "
-        "35.4)."
+        "35.4). Under no history, my-memory has the same rate."
     )
     rows = [r for r in made.rows() if r.status == "error"]
     found = score([made.write_csv(tmp_path / "b.csv", rows)], grid=Grid.GIVEN, draws=100)

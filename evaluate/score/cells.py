@@ -24,7 +24,7 @@ Part = Literal["", "family", "difficulty"]
 NOTE = (
     "Rates with 95% Wilson intervals. n is the number of episodes that count: an error is neither "
     "success nor failure. A cell marked † lacks episodes, or has others than the grid, and is not "
-    "ranked."
+    "ranked; one without any rollout is missing."
 )
 
 
@@ -75,13 +75,15 @@ def cells_by(
 
     Args:
         outcomes: By system and simulator.
-        expected: Simulator to the episodes of a complete cell.
-        part: `family` or `difficulty` for a cell of each; empty for all episodes together. An
-            expected episode of unknown difficulty is missing in all three.
+        expected: Simulator to its cells, and to the episodes of a complete one.
+        part: `family` or `difficulty` for a cell of each; empty for all episodes together, where
+            expected cells without any rollout come as well. An expected episode of unknown
+            difficulty is missing in all three.
     """
     cells: list[Cell] = []
-    for one in outcomes:
-        wanted = expected[one.simulator]
+    for given in outcomes:
+        wanted = expected[given.simulator]
+        one = given if part else given.filled(wanted.conditions_of(given))
         parts = _parts(part, one, unknown=False)
         wanted_parts = _parts(part, wanted, unknown=True)
         for place, condition in enumerate(one.conditions):
@@ -213,7 +215,7 @@ def _shown(cell: Cell | None, several: bool) -> str:
         return "–"
     errors = f", errors: {cell.counts[ERROR]}" if cell.counts[ERROR] else ""
     if not cell.n:
-        return f"no result†{errors}"
+        return f"no result†{errors}" if any(cell.counts) else "missing†"
     low, high = cell.interval
     rate = f"**{percent(cell.rate)}**" if several and cell.rank == 1 else percent(cell.rate)
     mark = "" if cell.complete else "†"
@@ -221,14 +223,18 @@ def _shown(cell: Cell | None, several: bool) -> str:
 
 
 def coverage_table(outcomes: Sequence[Outcomes], expected: Mapping[str, Expected]) -> Table:
-    """Return which episodes each cell of a family lacks, and in which the rollout broke."""
+    """Return which episodes each cell of a family lacks, and in which the rollout broke.
+
+    Expected cells without any rollout are listed as well: they lack all episodes.
+    """
     columns = [Column(name) for name in ("simulator", "system", "condition", "family")]
     columns += [Column(name, "count") for name in ("expected", "n", "errors")]
     columns += [Column("complete", "flag"), Column("missing_episodes"), Column("error_episodes")]
     columns += [Column("other_episodes")]
     rows = []
-    for one in outcomes:
-        wanted = expected[one.simulator]
+    for given in outcomes:
+        wanted = expected[given.simulator]
+        one = given.filled(wanted.conditions_of(given))
         for place, condition in enumerate(one.conditions):
             counts = one.scored[place] > 0
             broke = one.counts[place, :, ERROR] > 0

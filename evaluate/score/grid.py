@@ -1,4 +1,4 @@
-"""Which episodes a complete cell has."""
+"""Which cells are expected, and which episodes a complete one has."""
 
 from enum import StrEnum
 
@@ -6,10 +6,11 @@ __all__ = ["Grid"]
 
 
 class Grid(StrEnum):
-    """Which episodes a complete cell has.
+    """Which cells are expected, and which episodes a complete one has.
 
-    `benchmark`: the paper's nine families × test episodes 0 to 49; `given`: those episodes that
-    any of the rows of the simulator is of.
+    `benchmark`: the paper's five conditions, each with its nine families × test episodes 0 to 49;
+    `given`: those conditions and episodes that any of the rows of the simulator is of. A condition
+    that does not apply to a system is not expected of it.
     """
 
     BENCHMARK = "benchmark"

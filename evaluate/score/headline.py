@@ -1,6 +1,7 @@
 """What the rows say, in a sentence or two for each simulator."""
 
 import math
+from collections.abc import Sequence
 
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.cells import Cell
@@ -16,35 +17,71 @@ __all__ = ["headline"]
 def headline(score: Score, simulator: str) -> str:
     """Return the main finding of one simulator's rows, computed from them.
 
-    Only complete cells are compared with each other; how many there are is said as well. A
-    system that only bounds what a memory can reach leads where there is no other.
+    Only complete cells are compared with each other, and only they lead; how many there are is
+    said as well. Of several with the same rate the first in the order of tables leads, and the
+    others are named. A system that only bounds what a memory can reach leads where there is no
+    other.
     """
     found = [cell for cell in score.cells if cell.simulator == simulator]
     cells = [cell for cell in found if not is_bound(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
-    sentences = []
-    leader = _best(complete, START) or _best(cells, START)
-    contrast = _last_contrast(score, leader) if leader else None
-    if leader and contrast:
-        sentences.append(_from_start(leader, contrast))
-        last = _best(complete, contrast.condition)
-        if last and last.system != leader.system:
-            sentences.append(
-                f"The highest rate at {last.condition} is {percent(last.rate)}, of "
-                f"{display_name(last.system)}."
-            )
-        sentences += _beside_base(score, contrast)
-    elif best := (leader or _best(complete, None) or _best(cells, None)):
-        sentences.append(
-            f"{display_name(best.system)} succeeds in {percent(best.rate)} of {best.n} episodes "
-            f"under {_named(best.condition)} (95% interval {_interval(best)})."
-        )
+    if complete:
+        sentences = _leading(score, complete)
     else:
-        sentences.append("No rollout counts yet.")
+        sentences = [_nothing_complete(cells, len(score.expected[simulator].episodes))]
     if not all(cell.complete for cell in found):
         done = sum(cell.complete for cell in found)
         sentences.append(f"{done} of {len(found)} cells are complete.")
     return " ".join(sentences)
+
+
+def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
+    """Say what the best system reaches at k0 and how far it falls, or the best rate there is."""
+    best = _best(complete, START) or _best(complete, _best(complete)[0].condition)
+    leader, others = best[0], best[1:]
+    contrast = _last_contrast(score, leader) if leader.condition == START else None
+    if contrast is None:
+        first = (
+            f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} "
+            f"episodes under {_named(leader.condition)} (95% interval {_interval(leader)})."
+        )
+        return [first, *_alike(others)]
+    sentences = [_from_start(leader, contrast), *_alike(others)]
+    if contrast.complete:
+        best = _best(complete, contrast.condition)
+        if all(cell.system != leader.system for cell in best):
+            sentences.append(
+                f"The highest rate at {contrast.condition} is {percent(best[0].rate)}, of "
+                f"{_listed(best)}."
+            )
+        else:
+            sentences += _alike([cell for cell in best if cell.system != leader.system])
+    return sentences + _beside_base(score, contrast)
+
+
+def _alike(others: Sequence[Cell]) -> list[str]:
+    if not others:
+        return []
+    have = "has" if len(others) == 1 else "have"
+    return [f"Under {_named(others[0].condition)}, {_listed(others)} {have} the same rate."]
+
+
+def _listed(cells: Sequence[Cell]) -> str:
+    *names, last = (display_name(cell.system) for cell in cells)
+    return f"{', '.join(names)} and {last}" if names else last
+
+
+def _nothing_complete(cells: Sequence[Cell], expected: int) -> str:
+    counting = [cell for cell in cells if cell.n]
+    if not counting:
+        return "No rollout counts yet."
+    nearest = min(counting, key=lambda cell: (cell.missing + cell.other, -cell.n))
+    other = f", and {nearest.other} that count are not of the grid" if nearest.other else ""
+    return (
+        f"No cell is complete, so no system leads. Nearest to it is "
+        f"{display_name(nearest.system)} under {_named(nearest.condition)}: {nearest.missing} of "
+        f"{expected} episodes are missing{other}."
+    )
 
 
 def _from_start(leader: Cell, contrast: Contrast) -> str:
@@ -55,10 +92,11 @@ def _from_start(leader: Cell, contrast: Contrast) -> str:
     change = contrast.change
     # Not every difference has an interval.
     bounds = "" if math.isnan(change.low) else f"{points(change.low)} to {points(change.high)}; "
+    over = "" if contrast.complete else f", not complete, over the {contrast.n} episodes it has"
     return (
         f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} episodes "
         f"when the history holds the lesson alone ({START}, 95% interval {_interval(leader)}), and "
-        f"in {percent(contrast.rate)} with {k} {sessions} behind it ({contrast.condition}): "
+        f"in {percent(contrast.rate)} with {k} {sessions} behind it ({contrast.condition}{over}): "
         f"{points(change.value)} points ({bounds}{test.gained} episodes gained, "
         f"{test.lost} lost{tested})."
     )
@@ -90,9 +128,12 @@ def _last_contrast(score: Score, leader: Cell) -> Contrast | None:
     return max(found, key=lambda contrast: condition_rank(contrast.condition), default=None)
 
 
-def _best(cells: list[Cell], condition: str | None) -> Cell | None:
-    found = [c for c in cells if c.n and (condition is None or c.condition == condition)]
-    return max(found, key=lambda cell: cell.rate, default=None)
+def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:
+    """Return the cells of the highest rate, in the order of tables, under one condition or all."""
+    found = [cell for cell in cells if condition in (None, cell.condition)]
+    # Rounded: means of repeats that are equal may differ in the last bit.
+    highest = max((round(cell.rate, 12) for cell in found), default=math.nan)
+    return [cell for cell in found if round(cell.rate, 12) == highest]
 
 
 def _interval(cell: Cell) -> str:

@@ -1,18 +1,19 @@
 """What each system did on each episode under each condition."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FAMILIES, SPLITS
-from robomme_interference_data.evaluate.rows import NO_HISTORY
+from robomme_interference_data.constants import DEFAULT_K, FAMILIES, SPLITS
+from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.check import BITS, STATUSES, field, pack
 from robomme_interference_data.evaluate.score.columns import distinct
 from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.rollouts import Rollouts
+from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.ids import EpisodeId, condition_name
 
 __all__ = [
@@ -85,6 +86,15 @@ class Outcomes:
         counts = self.scored[place] > 0
         exactly = np.array_equal(self.episodes[counts], expected.episodes)
         return exactly and bool(self.whole[place][counts].all())
+
+    def filled(self, conditions: Sequence[str]) -> "Outcomes":
+        """Return the same with these conditions, among them all it has: in new ones nothing ran."""
+        old = [conditions.index(condition) for condition in self.conditions]
+        counts = np.zeros((len(conditions), *self.counts.shape[1:]), np.int32)
+        counts[old] = self.counts
+        packed = dict(zip(self.conditions, self.packed, strict=True))
+        parts = tuple(packed.get(condition, np.zeros(0, np.uint64)) for condition in conditions)
+        return replace(self, conditions=tuple(conditions), counts=counts, packed=parts)
 
     def column(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the rates under a condition at the given packed episodes, NaN where none."""
@@ -171,13 +181,15 @@ def _episodes_of(packed: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Expected:
-    """The episodes that a complete cell has.
+    """The cells of one simulator, and the episodes that a complete one has.
 
     Attributes:
+        conditions: Those that every system should have, as far as they apply to it.
         episodes: Packed, ascending, `(E,) int64`.
         difficulty: Code of each, −1 where no row tells, `(E,) int8`.
     """
 
+    conditions: tuple[str, ...]
     episodes: NDArray[np.int64]
     difficulty: NDArray[np.int8]
 
@@ -186,19 +198,33 @@ class Expected:
         """Place of each episode's family in `FAMILIES`, `(E,) int64`."""
         return families_of(self.episodes)
 
+    def conditions_of(self, one: Outcomes) -> list[str]:
+        """Return what a system should have and what it has, in the order of tables."""
+        system = SYSTEMS.get(one.system)
+        due = {
+            condition
+            for condition in self.conditions
+            if system is None
+            or (system.no_history if condition == NO_HISTORY else system.with_history)
+        }
+        return sorted(due | set(one.conditions), key=condition_rank)
+
 
 def expected_episodes(
     rollouts: Rollouts, outcomes: Sequence[Outcomes], grid: Grid
 ) -> dict[str, Expected]:
-    """Return for each simulator what a complete cell has (see `Grid`)."""
+    """Return for each simulator the expected cells, and what a complete one has (see `Grid`)."""
     expected = {}
     for code, simulator in enumerate(rollouts.simulators):
         if grid is Grid.GIVEN:
-            parts = [one.episodes for one in outcomes if one.simulator == simulator]
+            here = [one for one in outcomes if one.simulator == simulator]
+            conditions = tuple({c: None for one in here for c in one.conditions})
+            parts = [one.episodes for one in here]
             episodes = np.unique(np.concatenate([*parts, np.zeros(0, np.int64)]))
         else:
+            conditions = (NO_HISTORY, *map(condition_name, DEFAULT_K))
             family, index = np.divmod(np.arange(len(FAMILIES) * TEST_EPISODES), TEST_EPISODES)
             place = family << BITS["episode_split"] | SPLITS.index("test")
             episodes = place << BITS["episode"] | index
-        expected[simulator] = Expected(episodes, rollouts.difficulty_of(code, episodes))
+        expected[simulator] = Expected(conditions, episodes, rollouts.difficulty_of(code, episodes))
     return expected

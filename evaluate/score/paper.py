@@ -89,7 +89,11 @@ def comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Published]]:
 
 
 def paper_table(cells: Sequence[Cell]) -> Table:
-    """Return our rates beside the published ones."""
+    """Return our rates beside the published ones.
+
+    Args:
+        cells: Ours, with completeness by the benchmark's grid, which the published rates are over.
+    """
     columns = (
         *(Column("system"), Column("condition"), Column("published_system"), Column("n", "count")),
         *(Column("rate", "rate"), Column("low", "rate"), Column("high", "rate")),
@@ -113,7 +117,8 @@ def paper_table(cells: Sequence[Cell]) -> Table:
         f" Rows of {', '.join(others)} are not set against the paper's RoboMME." if others else ""
     )
     note = (
-        f"Published: {SOURCE}. 95% intervals: Wilson for rates; Newcombe's hybrid score for "
+        f"Published: {SOURCE}. complete: over the benchmark's 450 episodes, as the published rates "
+        "are. 95% intervals: Wilson for rates; Newcombe's hybrid score for "
         "differences, which takes both sides as independent samples: the paper's rows are not at "
         f"hand to be paired.{left}"
     )
