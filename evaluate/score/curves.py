@@ -7,13 +7,19 @@ from typing import Any
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.looks import Look, inches, looks_of
+from robomme_interference_data.evaluate.score.looks import (
+    INCOMPLETE,
+    PUBLISHED,
+    Look,
+    inches,
+    looks_of,
+)
 from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.page import INK, tidy
 
-__all__ = ["Cells", "Data", "as_published", "curve", "dodged", "legend", "published_curves"]
-__all__ += ["set_axes", "short"]
+__all__ = ["Cells", "Data", "as_published", "curve", "dodged", "explain", "keys"]
+__all__ += ["legend", "published_curves", "set_axes", "short"]
 
 Cells = Mapping[tuple[str, str, str], Cell]
 """System, condition and part to the cell, of one simulator."""
@@ -83,8 +89,19 @@ def curve(
 
 
 def as_published(look: Look) -> Look:
-    """Return the look of a published curve: hollow points, a loosely dotted line."""
-    return Look(f"{look.label}, published", look.colour, look.marker, (0, (4, 2)), 1.2, True)
+    """Return the look of a published curve: short dashes as points, a dashed line."""
+    return Look(f"{look.label}, published", look.colour, "_", (0, (4, 2)), 1.2)
+
+
+def keys(cells: Cells, *, published: bool) -> list[Look]:
+    """Return what a legend has to explain beside the systems, as far as it is drawn.
+
+    Args:
+        cells: Those that the figure draws.
+        published: Whether it draws published rates.
+    """
+    incomplete = any(not cell.complete for cell in cells.values())
+    return [INCOMPLETE] * incomplete + [PUBLISHED] * published
 
 
 def published_curves(
@@ -92,8 +109,8 @@ def published_curves(
 ) -> list[tuple[float, Look]]:
     """Draw published rates at the systems' shifts; return the ends of curves and their looks.
 
-    Those of a system whose rows are not here, but stand behind a retrieval step, are a curve;
-    those of the others are larger hollow points.
+    Points are short dashes. Those of a system whose rows are not here, but stand behind a
+    retrieval step, are joined to a curve.
     """
     ends = []
     for system, shift in shifts.items():
@@ -117,9 +134,8 @@ def published_curves(
             ys,
             look.marker,
             color=look.colour,
-            markerfacecolor="white" if absent else "none",
-            markersize=5 if absent else 9,
-            markeredgewidth=1 if absent else 0.6,
+            markersize=look.size,
+            markeredgewidth=look.edge,
         )
     return ends
 
@@ -137,6 +153,16 @@ def set_axes(axes: Any, data: Data, conditions: Sequence[str], ylabel: str) -> N
 
 def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
     """Lay out the panels above a legend."""
+    widest = 0.7 + inches(max((look.label for look in looks), key=len))
+    columns = max(1, min(len(looks), int(figure.get_figwidth() / widest)))
+    rows = -(-len(looks) // columns)
+    height = (0.2 * rows + 0.3) / figure.get_figheight()
+    figure.tight_layout(rect=(0, height, 1, 1))
+    explain(figure, looks, note, columns)
+
+
+def explain(figure: Any, looks: Sequence[Look], note: str = "", columns: int = 2) -> None:
+    """Write a legend at the foot of a figure, and a note under it."""
     from matplotlib.lines import Line2D
 
     handles = [
@@ -148,25 +174,22 @@ def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
             linestyle=look.line,
             markerfacecolor="white" if look.hollow else look.colour,
             markersize=look.size,
+            markeredgewidth=look.edge,
             linewidth=look.width,
         )
         for look in looks
     ]
-    widest = 0.7 + inches(max((look.label for look in looks), key=len))
-    columns = max(1, min(len(looks), int(figure.get_figwidth() / widest)))
-    rows = -(-len(looks) // columns)
-    height = (0.2 * rows + 0.3) / figure.get_figheight()
-    figure.tight_layout(rect=(0, height, 1, 1))
-    figure.legend(
-        handles,
-        [look.label for look in looks],
-        loc="lower center",
-        ncols=columns,
-        fontsize=8,
-        frameon=False,
-        handlelength=3.2,  # long enough for a line's dashes to be seen
-        bbox_to_anchor=(0.5, 0.16 / figure.get_figheight()),
-    )
+    if looks:
+        figure.legend(
+            handles,
+            [look.label for look in looks],
+            loc="lower center",
+            ncols=columns,
+            fontsize=8,
+            frameon=False,
+            handlelength=3.2,  # long enough for a line's dashes to be seen
+            bbox_to_anchor=(0.5, (0.16 if note else 0.02) / figure.get_figheight()),
+        )
     if note:
         place = 0.06 / figure.get_figheight()
         figure.text(0.5, place, note, size=7.5, color=INK, ha="center", va="bottom")

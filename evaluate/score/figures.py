@@ -15,12 +15,14 @@ from robomme_interference_data.evaluate.score.curves import (
     as_published,
     curve,
     dodged,
+    explain,
+    keys,
     legend,
     published_curves,
     set_axes,
     short,
 )
-from robomme_interference_data.evaluate.score.effects import base_of
+from robomme_interference_data.evaluate.score.effects import SURE, Contrast, base_of
 from robomme_interference_data.evaluate.score.looks import inches, label_ends
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.page import GREY, INK, ink_on, open_figure, save_figure, tidy
@@ -74,16 +76,22 @@ def _success(figure: Any, data: Data) -> bool:
     shifts = {system: shift for shift, system in dodged(shown)}
     labels = [data.looks[system].label for system in data.systems]
     labels += [as_published(data.looks[base]).label for base in shown[len(data.systems) :]]
-    width, height, plot = 5.8 + inches(max(labels, key=len)), 4.2 if few else 5.4, 4.7
+    # Beside many systems' own points the published ones would only clutter.
+    beside = shifts if few else {b: shifts[b] for b in shown if b not in data.systems}
+    published = {one.system for one in data.published}
+    explained = keys(data.all, published=bool(published & set(beside)))
+    shared = published & set(data.systems)
+    note = "" if shared <= set(beside) else "published rates: in the table"
+    foot = 0.65 if explained or note else 0.42
+    width, height, plot = 5.8 + inches(max(labels, key=len)), foot + (3.8 if few else 5.0), 4.7
     figure.set_size_inches(width, height)
-    axes = figure.add_axes((0.65 / width, 0.42 / height, plot / width, 1 - 0.8 / height))
+    axes = figure.add_axes((0.65 / width, foot / height, plot / width, 1 - (foot + 0.38) / height))
     ends = [
         (curve(axes, data, data.all, system, "", shifts[system]), data.looks[system])
         for system in data.systems
     ]
-    # Beside many systems' own points the published ones would only clutter.
-    beside = shifts if few else {b: shifts[b] for b in shown if b not in data.systems}
     ends += published_curves(axes, data, beside)
+    explain(figure, explained, note)
     set_axes(axes, data, data.conditions, "success, %")
     ends = [end for end in ends if not math.isnan(end[0])]
     span = axes.get_ylim()[1]
@@ -130,7 +138,8 @@ def _panels(
     for axes in panels[len(names) :]:
         axes.set_axis_off()
     note = "" if bars else "95% intervals: in the table"
-    legend(figure, [data.looks[system] for system in data.systems], note)
+    looks = [data.looks[system] for system in data.systems]
+    legend(figure, [*looks, *keys(cells, published=False)], note)
 
 
 def _columns(panels: Sequence[Any]) -> int:
@@ -147,9 +156,15 @@ def _retention(figure: Any, data: Data) -> bool:
         key=lambda c: (c.complete, c.retention.value),
     )
     labels = [data.looks[c.system].label + ("" if c.complete else " † not ranked") for c in found]
-    left, height = 0.4 + inches(max(labels, key=len)), 1.3 + 0.32 * len(found)
+    left = 0.4 + inches(max(labels, key=len))
+    note = _left_out(data, found, last, int((left + 5) / 0.058))
+    below = 0.6 + 0.15 * len(note.splitlines())
+    height = below + 0.45 + 0.32 * max(2, len(found))
     figure.set_size_inches(left + 5.3, height)
-    axes = figure.add_axes((left / (left + 5.3), 0.75 / height, 5 / (left + 5.3), 1 - 1.2 / height))
+    size = (5 / (left + 5.3), 1 - (below + 0.45) / height)
+    axes = figure.add_axes((left / (left + 5.3), below / height, *size))
+    if note:
+        figure.text(0.1 / (left + 5.3), 0.1 / height, note, size=7.5, color=INK, va="bottom")
     for place, contrast in enumerate(found):
         look, kept = data.looks[contrast.system], contrast.retention
         if not math.isnan(kept.low):
@@ -165,12 +180,22 @@ def _retention(figure: Any, data: Data) -> bool:
     axes.set_yticks(range(len(found)), labels)
     axes.set_ylim(-0.6, len(found) - 0.4)
     axes.set_xlabel(
-        f"({last} − no history) / (k0 − no history), with 95% BCa interval; 0 nothing left, 1 all",
+        f"({last} − no history) / (k0 − no history); 0 nothing left, 1 all; bars: 95% intervals",
         size=8,
         color=INK,
     )
     axes.set_title(f"Retention at {last}, {data.simulator}", loc="left", size=10, color=INK)
     return True
+
+
+def _left_out(data: Data, found: Sequence[Contrast], last: str, width: int) -> str:
+    """Name the systems without a retention, in lines of so many letters."""
+    shown = {contrast.system for contrast in found}
+    absent = [data.looks[system].label for system in data.systems if system not in shown]
+    if not absent:
+        return ""
+    why = f"no lift at k0 with p < {SURE}, or rows missing at {last}"
+    return fill(f"Not shown ({why}): {', '.join(absent)}", width)
 
 
 def _heatmap(figure: Any, data: Data) -> bool:
@@ -238,7 +263,9 @@ def _retrieval(figure: Any, data: Data) -> bool:
         axes.set_axis_off()
     looks = [data.looks[name] for name in shown if name in data.systems]
     absent = [data.looks[name] for name in shown if name not in data.systems]
-    legend(figure, [*looks, *map(as_published, absent)], "with 95% Wilson intervals")
+    looks += [*map(as_published, absent)]
+    mine = {key: cell for key, cell in data.families.items() if key[0] in shown}
+    legend(figure, [*looks, *keys(mine, published=False)], "with 95% Wilson intervals")
     return True
 
 

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.evaluate.systems import SYSTEMS, System, display_name
-from robomme_interference_data.page import INK
+from robomme_interference_data.evaluate.systems import SYSTEMS, System
+from robomme_interference_data.page import GREY, INK
 
-__all__ = ["Look", "inches", "label_ends", "looks_of", "spread"]
+__all__ = ["INCOMPLETE", "PUBLISHED", "Look", "inches", "label_ends", "looks_of", "spread"]
 
 # Okabe and Ito's colours, safe for the colour-blind: one for what the memory is made of.
 _COLOURS = {
@@ -30,7 +30,8 @@ _SHAPES = {
     "subgoals": ("D", "-."),
 }
 _RETRIEVAL_LINES = ("-", "--", "-.", ":")
-_OWN_SHAPES = ("v", "P", "X", "<", ">", "h")
+# Of those that share no shape with the paper's, each has its own pair of marker and line.
+_OWN_SHAPES = [(m, line) for line in ("-", "--", "-.", ":") for m in "vPX<>dph"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Look:
         marker: matplotlib's marker.
         line: matplotlib's line style.
         width: Line width in points.
-        hollow: Whether points are white inside, as those of published rates are.
+        hollow: Whether points are white inside, as those of incomplete cells are.
     """
 
     label: str
@@ -56,38 +57,55 @@ class Look:
     @property
     def size(self) -> float:
         """Size of its points."""
-        return 8 if self.marker == "*" else 4.5
+        return {"*": 8, "_": 10}.get(self.marker, 4.5)
+
+    @property
+    def edge(self) -> float:
+        """Width of the outline of its points, which is all there is of a dash, in points."""
+        return 2 if self.marker == "_" else 1
+
+
+INCOMPLETE = Look("cell not complete", GREY, "o", "none", hollow=True)
+PUBLISHED = Look("published rate", GREY, "_", "none")
+"""What legends say of points that are no system's own complete cells."""
 
 
 def looks_of(names: Sequence[str]) -> dict[str, Look]:
     """Return the looks of systems; those of the table look the same in every figure.
 
     A system with retrieval is a black star; several are stars in the colours of what they are
-    without it.
+    without it. Systems that are not in the table differ from each other and from the rest by
+    marker or line, up to two dozen; beyond that colours tell them apart.
     """
     looks = {}
+    fixed = (_fixed(system) for system in SYSTEMS.values() if not system.retrieval)
+    taken = {(look.marker, look.line) for look in fixed}
+    free = [shape for shape in _OWN_SHAPES if shape not in taken]
     retrieving = [name for name in names if name in SYSTEMS and SYSTEMS[name].retrieval]
-    for place, name in enumerate(names):
+    own = 0
+    for name in names:
         system = SYSTEMS.get(name)
-        own = place % len(_OWN)
-        if system is not None and system.retrieval:
+        if system is None:
+            colour = _OWN[(own + own // len(free)) % len(_OWN)]
+            looks[name] = Look(name, colour, *free[own % len(free)])
+            own += 1
+        elif system.retrieval:
             alone = len(retrieving) == 1
-            colour = "#000000" if alone else _COLOURS.get(system.representation, _OWN[own])
+            colour = "#000000" if alone else _COLOURS[system.representation]
             line = _RETRIEVAL_LINES[retrieving.index(name) % len(_RETRIEVAL_LINES)]
-            looks[name] = Look(display_name(name), colour, "*", line, 2.2)
-        elif system is not None:
-            marker, line = _shape(system, _OWN_SHAPES[own])
-            colour = _COLOURS.get(system.representation, _OWN[own])
-            looks[name] = Look(system.display, colour, marker, line)
+            looks[name] = Look(system.display, colour, "*", line, 2.2)
         else:
-            looks[name] = Look(name, _OWN[own], _OWN_SHAPES[own], "-")
+            looks[name] = _fixed(system)
     return looks
 
 
-def _shape(system: System, own: str) -> tuple[str, str]:
-    if not system.with_history:
-        return "v", "--"
-    return _SHAPES.get(system.integration or "", (own, "-"))
+def _fixed(system: System) -> Look:
+    """Return the look of a system of the table, without regard to what else is drawn."""
+    marker, line = _SHAPES.get(system.integration or "", ("", ""))
+    if not marker:
+        others = [name for name, s in SYSTEMS.items() if s.integration is None and not s.retrieval]
+        marker, line = _OWN_SHAPES[others.index(system.name)]
+    return Look(system.display, _COLOURS[system.representation], marker, line)
 
 
 def inches(text: str) -> float:
@@ -125,6 +143,7 @@ def label_ends(axes: Any, width: float, ends: Sequence[tuple[float, Look]], gap:
             color=look.colour,
             markerfacecolor="white" if look.hollow else look.colour,
             markersize=look.size,
+            markeredgewidth=look.edge,
             clip_on=False,
             transform=places,
         )

@@ -124,9 +124,7 @@ def _figure(name: str, path: Path) -> dict[str, str]:
     return {
         "name": name,
         "title": f"{FIGURES[kind]}, {simulator}",
-        "note": "†: the cell is not complete."
-        if kind == "heatmap"
-        else "Hollow points: published rates, or cells that are not complete.",
+        "note": "†: the cell is not complete." if kind == "heatmap" else "",
         "source": f"data:image/svg+xml;base64,{data}",
     }
 
