@@ -19,6 +19,7 @@ from robomme_interference_data.evaluate.score.outcomes import (
 )
 from robomme_interference_data.evaluate.score.paired import (
     COLUMNS,
+    Side,
     Tested,
     interval_of,
     note_of,
@@ -173,9 +174,7 @@ class _Condition:
         known = ~np.isnan(self._values).any(axis=1)
         self._values, self._episodes = self._values[known], episodes[known]
         self._once = a.once(condition, self._episodes) & b.once(condition, self._episodes)
-        self._pairs = pairs_of(
-            a.counted(condition, seeds.first), b.counted(condition, seeds.second)
-        )
+        self._pairs = pairs_of(Side(a, condition, seeds.first), Side(b, condition, seeds.second))
 
     def tested(self, part: str = "") -> Tested:
         """Return McNemar's exact test in all pairs, or in those of a family."""
@@ -257,7 +256,7 @@ def _episodes_of_one(a: Outcomes, b: Outcomes) -> Iterator[str]:
     """Count the episodes that count under a shared condition in the first run alone."""
     under: dict[int, list[str]] = {}
     for condition in (c for c in a.conditions if c in b.conditions):
-        here, there = (np.unique(o.counted(condition)[0]) for o in (a, b))
+        here, there = (o.episodes[o.scored[o.conditions.index(condition)] > 0] for o in (a, b))
         if lone := len(np.setdiff1d(here, there, assume_unique=True)):
             under.setdefault(lone, []).append(condition)
     for lone, conditions in under.items():

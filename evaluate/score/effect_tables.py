@@ -3,11 +3,9 @@
 import math
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-
 from robomme_interference_data.bootstrap import LEAST
 from robomme_interference_data.evaluate.score.effects import SURE, Contrast, Effects
-from robomme_interference_data.evaluate.score.outcomes import Outcomes
+from robomme_interference_data.evaluate.score.outcomes import SUCCESS, Outcomes
 from robomme_interference_data.evaluate.score.paired import COLUMNS, note_of
 from robomme_interference_data.evaluate.score.statistics import cohens_h, flip_rate, holm
 from robomme_interference_data.tables import Column, Table
@@ -99,13 +97,13 @@ def noise_table(outcomes: Iterable[Outcomes]) -> Table:
     )
     rows = []
     for one in outcomes:
-        for condition in one.conditions:
-            episodes, _, success = one.counted(condition)
-            lowest = np.flatnonzero(np.diff(episodes, prepend=-1))
-            twice = lowest[np.diff(lowest, append=len(episodes)) > 1]
-            if len(twice):
-                numbers = flip_rate(success[twice], success[twice + 1])
-                rows.append((one.simulator, one.system, condition, len(twice), *numbers))
+        for place, condition in enumerate(one.conditions):
+            pair = one.repeats[:, place]
+            pair = pair[:, (pair >= 0).all(axis=0)] == SUCCESS
+            if pair.size:
+                rows.append(
+                    (one.simulator, one.system, condition, pair.shape[1], *flip_rate(*pair))
+                )
     note = (
         "Repeats differ in the model seed alone; in each episode the two lowest that count are "
         "compared. A share of flips between conditions (flips in the tables of effects) that is "

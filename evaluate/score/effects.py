@@ -24,7 +24,7 @@ from robomme_interference_data.bootstrap import (
 from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 from robomme_interference_data.evaluate.score.outcomes import Expected, Outcomes
 from robomme_interference_data.evaluate.score.paired import (
-    Rows,
+    Side,
     Tested,
     interval_of,
     pairs_of,
@@ -115,7 +115,7 @@ class _Columns:
         self.cells: list[tuple[str, str]] = []
         self.complete: dict[tuple[str, str], bool] = {}
         self.once: list[NDArray[np.bool_]] = []
-        self.counted: list[Rows] = []
+        self.sides: list[Side] = []
         columns = []
         for outcomes in [one] if base is None else [one, base]:
             for condition in outcomes.conditions:
@@ -124,7 +124,7 @@ class _Columns:
                 self.complete[cell] = outcomes.complete(condition, expected)
                 self.cells.append(cell)
                 self.once.append(outcomes.once(condition, self.episodes))
-                self.counted.append(outcomes.counted(condition))
+                self.sides.append(Side(outcomes, condition))
                 columns.append(column)
         self.values = np.stack(columns, axis=1)
 
@@ -142,7 +142,7 @@ class _Columns:
             len(values),
             float(values[:, a].mean()) if len(values) else math.nan,
             float(values[:, b].mean()) if len(values) else math.nan,
-            tested(pairs_of(self.counted[b], self.counted[a])),
+            tested(pairs_of(self.sides[b], self.sides[a])),
             self.complete[here] and self.complete[there],
         )
 

@@ -21,6 +21,7 @@ __all__ = [
     "Outcomes",
     "SUCCESS",
     "episode_id",
+    "episodes_of",
     "expected_episodes",
     "families_of",
     "outcomes_of",
@@ -47,6 +48,9 @@ class Outcomes:
         difficulty: Code of each episode, −1 unknown, `(E,) int8`.
         counts: Rollouts by condition, episode and status, `(C, E, 4) int32`; more than one where
             there are repeats with other model seeds.
+        repeats: Status of the two rollouts with the lowest model seeds that count, −1 for none,
+            `(2, C, E) int8`.
+        lowest: Place of the lowest of these model seeds, −1 for none, `(C, E) int32`.
         packed: Rows of each condition, sorted, `(N,) uint64` (see `check`).
     """
 
@@ -56,6 +60,8 @@ class Outcomes:
     episodes: NDArray[np.int64]
     difficulty: NDArray[np.int8]
     counts: NDArray[np.int32]
+    repeats: NDArray[np.int8]
+    lowest: NDArray[np.int32]
     packed: tuple[NDArray[np.uint64], ...]
 
     @cached_property
@@ -94,7 +100,18 @@ class Outcomes:
         counts[old] = self.counts
         packed = dict(zip(self.conditions, self.packed, strict=True))
         parts = tuple(packed.get(condition, np.zeros(0, np.uint64)) for condition in conditions)
-        return replace(self, conditions=tuple(conditions), counts=counts, packed=parts)
+        repeats = np.full((2, *counts.shape[:2]), -1, np.int8)
+        repeats[:, old] = self.repeats
+        lowest = np.full(counts.shape[:2], -1, np.int32)
+        lowest[old] = self.lowest
+        return replace(
+            self,
+            conditions=tuple(conditions),
+            counts=counts,
+            repeats=repeats,
+            lowest=lowest,
+            packed=parts,
+        )
 
     def column(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the rates under a condition at the given packed episodes, NaN where none."""
@@ -111,24 +128,11 @@ class Outcomes:
         counts = self.scored[self.conditions.index(condition)] == 1
         return np.isin(episodes, self.episodes[counts], assume_unique=True)
 
-    def counted(
-        self, condition: str, seeds: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the rollouts under a condition that are no errors, by episode, then seed.
-
-        Args:
-            condition: Its name.
-            seeds: A number for each model seed of the rows, ascending; by default its place.
-
-        Returns:
-            The packed episode of each, the number of its model seed, and whether it succeeded.
-        """
+    def rows(self, condition: str, episodes: NDArray[np.int64]) -> NDArray[np.uint64]:
+        """Return the packed rows of some episodes under a condition, errors left out."""
         rows = self.packed[self.conditions.index(condition)]
-        status = field(rows, "status")
-        rows, status = rows[status != ERROR], status[status != ERROR]
-        places = field(rows, "model_seed")
-        numbers = places if seeds is None else seeds[places]
-        return _episodes_of(rows), numbers, status == SUCCESS
+        chosen = np.isin(episodes_of(rows), episodes) & (field(rows, "status") != ERROR)
+        return rows[chosen]
 
 
 def families_of(episodes: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -159,11 +163,21 @@ def _outcomes(
     rollouts: Rollouts, code: int, simulator: str, system: str, packed: NDArray[np.uint64]
 ) -> Outcomes:
     conditions, row = distinct(field(packed, "condition"))
-    episodes, column = distinct(_episodes_of(packed))
+    episodes, column = distinct(episodes_of(packed))
     status = field(packed, "status")
     shape = (len(conditions), len(episodes))
     cell = row * len(episodes) + column
     counts = np.bincount(cell * len(STATUSES) + status, minlength=shape[0] * shape[1] * 4)
+    # Rows are sorted by model seed within a cell: the first two that count are the lowest seeds.
+    counting = np.flatnonzero(status != ERROR)
+    cell, status = cell[counting], status[counting]
+    begins = np.flatnonzero(np.diff(cell, prepend=-1))
+    repeats = np.full((2, shape[0] * shape[1]), -1, np.int8)
+    repeats[0, cell[begins]] = status[begins]
+    lowest = np.full(shape[0] * shape[1], -1, np.int32)
+    lowest[cell[begins]] = field(packed[counting[begins]], "model_seed")
+    again = begins[np.diff(begins, append=len(cell)) > 1]
+    repeats[1, cell[again]] = status[again + 1]
     return Outcomes(
         simulator,
         system,
@@ -171,11 +185,14 @@ def _outcomes(
         episodes,
         rollouts.difficulty_of(code, episodes),
         counts.reshape(*shape, len(STATUSES)).astype(np.int32),
+        repeats.reshape(2, *shape),
+        lowest.reshape(shape),
         tuple(np.split(packed, np.searchsorted(row, np.arange(1, len(conditions))))),
     )
 
 
-def _episodes_of(packed: NDArray[np.uint64]) -> NDArray[np.int64]:
+def episodes_of(packed: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Return the packed episode of each packed row, `(N,) int64`."""
     return (packed >> np.uint64(_EPISODE_SHIFT)).astype(np.int64) & (2**_EPISODE_BITS - 1)
 
 

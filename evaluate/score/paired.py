@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.bootstrap import LEAST, Interval, enough
+from robomme_interference_data.evaluate.score.check import field
+from robomme_interference_data.evaluate.score.outcomes import SUCCESS, Outcomes, episodes_of
 from robomme_interference_data.evaluate.score.statistics import mcnemar
 from robomme_interference_data.intervals import newcombe_paired
 from robomme_interference_data.tables import Column
 
-__all__ = ["COLUMNS", "Pairs", "Rows", "Tested", "interval_of", "note_of", "pairs_of", "tested"]
+__all__ = ["COLUMNS", "Pairs", "Side", "Tested", "interval_of", "note_of", "pairs_of", "tested"]
 
 COLUMNS = (
     *(Column("low", "points"), Column("high", "points"), Column("interval")),
@@ -28,8 +30,42 @@ _NOTE = (
     "p: McNemar's exact test on them; p_holm: corrected for the number of tests in this table."
 )
 
-Rows = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]
-"""Rollouts of a cell, as `Outcomes.counted` returns them: episodes, model seeds, success."""
+
+@dataclass(frozen=True)
+class Side:
+    """One of two cells that are compared.
+
+    Attributes:
+        outcomes: Its system.
+        condition: Its condition.
+        seeds: A number for each model seed of its rows, ascending, by which seeds of different
+            runs are matched; None for their places.
+    """
+
+    outcomes: Outcomes
+    condition: str
+    seeds: NDArray[np.int64] | None = None
+
+    def lowest(self, episodes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the lowest seed that counts in each of the system's episodes, −1 for none.
+
+        Returns:
+            Its number, and whether that rollout succeeded.
+        """
+        row = self.outcomes.conditions.index(self.condition)
+        at = np.searchsorted(self.outcomes.episodes, episodes)
+        places = self.outcomes.lowest[row, at].astype(np.int64)
+        success = self.outcomes.repeats[0, row, at] == SUCCESS
+        return np.where(places >= 0, self._numbers(places), -1), success
+
+    def rollouts(self, episodes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return all that count: episode and seed in one ascending number, and the success."""
+        rows = self.outcomes.rows(self.condition, episodes)
+        numbers = self._numbers(field(rows, "model_seed"))
+        return episodes_of(rows) << 32 | numbers, field(rows, "status") == SUCCESS
+
+    def _numbers(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        return places if self.seeds is None else self.seeds[places]
 
 
 @dataclass(frozen=True)
@@ -72,18 +108,24 @@ class Tested:
         return mcnemar(self.gained, self.lost) if self.pairs else math.nan
 
 
-def pairs_of(first: Rows, second: Rows) -> Pairs:
-    """Pair rollouts, in each episode those of the lowest model seed that counts on both sides.
-
-    Args:
-        first: Rollouts of one cell.
-        second: Those of the other.
-    """
-    keys, other = (episodes << 32 | seeds for episodes, seeds, _ in (first, second))
-    shared, here, there = np.intersect1d(keys, other, assume_unique=True, return_indices=True)
-    episodes = shared >> 32
-    lowest = np.flatnonzero(np.diff(episodes, prepend=-1))
-    return Pairs(episodes[lowest], first[2][here[lowest]], second[2][there[lowest]])
+def pairs_of(first: Side, second: Side) -> Pairs:
+    """Pair rollouts, in each episode those of the lowest model seed that counts on both sides."""
+    sides = (first, second)
+    episodes = np.intersect1d(first.outcomes.episodes, second.outcomes.episodes, assume_unique=True)
+    (seeds, here), (others, there) = (side.lowest(episodes) for side in sides)
+    paired = (seeds >= 0) & (seeds == others)
+    # Seldom, the lowest that counts is another one on each side.
+    rest = (seeds >= 0) & (others >= 0) & ~paired
+    if rest.any():
+        (keys, one), (other_keys, other) = (side.rollouts(episodes[rest]) for side in sides)
+        shared, at, other_at = np.intersect1d(
+            keys, other_keys, assume_unique=True, return_indices=True
+        )
+        found = np.flatnonzero(np.diff(shared >> 32, prepend=-1))
+        places = np.searchsorted(episodes, shared[found] >> 32)
+        paired[places] = True
+        here[places], there[places] = one[at[found]], other[other_at[found]]
+    return Pairs(episodes[paired], here[paired], there[paired])
 
 
 def tested(pairs: Pairs, chosen: NDArray[np.bool_] | None = None) -> Tested:
