@@ -113,6 +113,9 @@ def test_the_released_layout(tmp_path: Path) -> None:
             "episode '-1'; expected a whole number from 0 to",
         ),
         ("my-memory,MoveCube,k0,1.5,7,easy,fail,0,9", "episode '1.5'; expected a whole number"),
+        ("my-memory,MoveCube,k0,1_0,7,easy,fail,0,9", "episode '1_0'; expected a whole number"),
+        ("my-memory,MoveCube,k0,٣,7,easy,fail,0,9", "episode '٣'; expected a whole number"),
+        ("my-memory,MoveCube,k0, 3,7,easy,fail,0,9", "episode ' 3'; expected a whole number"),
         (
             "my-memory,MoveCube,k0,131072,7,easy,fail,0,9",
             "episode '131072'; expected a whole number",

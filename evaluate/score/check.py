@@ -84,18 +84,18 @@ class Checker:
         rows = Rows(batch)
         default = None if "system" in source.columns else self._system
         codes = {
-            "simulator": rows.text(
+            "simulator": rows.code(
                 "simulator", self._named(self.simulators, "simulator"), "robomme"
             ),
-            "system": rows.text("system", self._named_system, default),
-            "condition": rows.text("condition", _condition),
-            "family": rows.text("family", _family),
-            "episode_split": rows.text("episode_split", _split, "test"),
+            "system": rows.code("system", self._named_system, default),
+            "condition": rows.code("condition", _condition),
+            "family": rows.code("family", _family),
+            "episode_split": rows.code("episode_split", _split, "test"),
             "episode": rows.number("episode", 2 ** BITS["episode"] - 1),
             "model_seed": self._seeds(rows),
-            "status": rows.text("status", _status),
+            "status": rows.code("status", _status),
         }
-        success = rows.text("success", _success)
+        success = rows.code("success", _success)
         rows.refuse(
             (success >= 0) & (codes["status"] >= 0) & (success != _EXPECTED[codes["status"]]),
             lambda row: (
@@ -103,7 +103,7 @@ class Checker:
                 f"{rows.shown('status', row)}"
             ),
         )
-        rows.number("steps", MAX_STEPS, default=0)
+        rows.number("steps", MAX_STEPS, absent=0, empty=0)
         if "protocol_version" in batch.columns:
             version = rows.number("protocol_version", 2**31)
             rows.refuse(
@@ -139,10 +139,12 @@ class Checker:
         return self._named(self.systems, "system")(name_system(value or "").name)
 
     def _seeds(self, rows: Rows) -> Codes:
-        seeds = rows.number("model_seed", 2**62, default=0)
+        seeds = rows.number("model_seed", 2**62, absent=0)
         values, place = distinct(seeds)
         codes = np.zeros(len(values), np.int64)
         for index, value in enumerate(values.tolist()):
+            if value < 0:  # refused
+                continue
             if value not in self.model_seeds:
                 self.model_seeds.append(value)
             codes[index] = self.model_seeds.index(value)
@@ -152,7 +154,7 @@ class Checker:
 
     def _check_revisions(self, rows: Rows, simulator: Codes) -> None:
         revisions: list[str] = []
-        code = rows.text("revision", lambda v: _revision(revisions, v))
+        code = rows.code("revision", lambda v: _revision(revisions, v))
         sound = (simulator >= 0) & (code >= 0)
         for pair in np.unique((simulator * max(len(revisions), 1) + code)[sound]).tolist():
             number, place = divmod(pair, len(revisions))
@@ -166,9 +168,9 @@ class Checker:
 
     def _check_episodes(self, rows: Rows, codes: dict[str, Codes]) -> None:
         """Hold seed and difficulty against what other rows of the same episode say."""
-        difficulty = rows.text("difficulty", _difficulty, default="")
+        difficulty = rows.code("difficulty", _difficulty, default="")
         difficulty = np.where(difficulty == _UNSAID, -1, difficulty)
-        seed = rows.number("seed", 2**62, default=-1)
+        seed = rows.number("seed", 2**62, absent=-1, empty=-1)
         episode = np.maximum(codes["episode"], 0)
         self._grow(int(episode.max(initial=0)))
         group = episode_group(*(np.maximum(codes[n], 0) for n in _GROUP))

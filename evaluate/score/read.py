@@ -48,6 +48,7 @@ COLUMNS = (
 """What scoring reads of a file, as far as it is there."""
 
 _NEEDED = ("family", "condition", "episode", "status", "success")
+_NUMBERS = ("episode", "model_seed", "protocol_version", "seed", "steps")
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
 _BLOCK = 16 * 2**20  # bytes of CSV at a time
 _LOOKED_AT = 2**16  # bytes of CSV, to tell whether it is text
@@ -140,9 +141,12 @@ def _source(path: Path, with_system: bool) -> Source:
         raise MissingFileError(f"there is no file or folder {path}", "Check the path.")
     if (path.parent / RUN_NAME).is_file() and path.name in (PARQUET_NAME, CSV_NAME):
         folder, record = path.parent, _record(path.parent / RUN_NAME)
-    names = _column_names(path)
-    released = "simulator" not in names
-    return Source(path, folder, record, _match(path, names, released, with_system), released)
+    schema = _schema(path)
+    released = "simulator" not in schema.names
+    columns = _match(path, schema.names, released, with_system)
+    if path.suffix.lower() == ".parquet":  # a CSV's cells are all text
+        _check_types(path, schema, columns)
+    return Source(path, folder, record, columns, released)
 
 
 def _record(path: Path) -> dict[str, Any]:
@@ -156,16 +160,16 @@ def _record(path: Path) -> dict[str, Any]:
     return record
 
 
-def _column_names(path: Path) -> list[str]:
+def _schema(path: Path) -> Any:
     if path.suffix.lower() == ".parquet":
         with reading(path):
-            return list(pq.read_schema(path).names)
+            return pq.read_schema(path)
     if path.suffix.lower() != ".csv":
         raise FormatError(
             f"{path} is neither .csv nor .parquet", "Rows are read from CSV and parquet files."
         )
     with reading(path), _open_csv(path, None, []) as reader:
-        return list(reader.schema.names)
+        return reader.schema
 
 
 def _match(path: Path, names: list[str], released: bool, with_system: bool) -> dict[str, str]:
@@ -194,6 +198,26 @@ def _match(path: Path, names: list[str], released: bool, with_system: bool) -> d
     return {name: ours[name] for name in COLUMNS if name in ours}
 
 
+def _check_types(path: Path, schema: Any, columns: Mapping[str, str]) -> None:
+    """Refuse columns of a parquet file that hold neither text nor what they should."""
+    for name, there in columns.items():
+        kind = schema.field(there).type
+        kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+        sound = kind in (pa.string(), pa.large_string(), pa.null())
+        expected = "text"
+        if name in (*_NUMBERS, "success"):
+            sound |= pa.types.is_integer(kind) or kind in (pa.float32(), pa.float64())
+            expected = "numbers"
+        if name == "success":
+            sound |= pa.types.is_boolean(kind)
+            expected = "true and false"
+        if not sound:
+            raise FormatError(
+                f"{path}: the column {there!r} holds {kind}; expected {expected}",
+                "Write the file again with plain values in that column.",
+            )
+
+
 def read_batches(source: Source, columns: Sequence[str] | None = None) -> Iterator[Batch]:
     """Stream a file's rows in batches of bounded size, under the names that scoring uses.
 
@@ -214,7 +238,7 @@ def read_batches(source: Source, columns: Sequence[str] | None = None) -> Iterat
 
 
 def _chosen(source: Source, columns: Sequence[str]) -> dict[str, str]:
-    present = set(_column_names(source.path))
+    present = set(_schema(source.path).names)
     named = {name: source.columns.get(name, name) for name in columns}
     return {name: there for name, there in named.items() if there in present}
 

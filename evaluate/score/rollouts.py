@@ -17,6 +17,7 @@ from robomme_interference_data.evaluate.score.check import (
     field,
     pack,
 )
+from robomme_interference_data.evaluate.score.columns import flags
 from robomme_interference_data.evaluate.score.read import Batch, Source, find_sources, read_batches
 from robomme_interference_data.evaluate.systems import SYSTEMS
 
@@ -108,7 +109,7 @@ class _Reader:
             self.starts.append((self.rows, source.path, replace(batch, columns={})))
             if "video" in batch.columns and source.folder is not None:
                 video = batch.columns["video"]
-                for row in np.flatnonzero(video.is_valid().to_numpy(zero_copy_only=False)).tolist():
+                for row in np.flatnonzero(flags(video.is_valid())).tolist():
                     self.videos.append((self.rows + row, source.folder / video[row].as_py()))
             self.chunks.append(packed)
             self.rows += batch.rows
