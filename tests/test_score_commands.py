@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,9 @@ import score_rows as made
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app
-from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.errors import BadRowsError, MissingExtraError
 from robomme_interference_data.evaluate.score.grid import Grid
+from robomme_interference_data.evaluate.score.outputs import TABLES
 from robomme_interference_data.evaluate.score.scoring import score
 
 Run = Callable[..., Any]
@@ -51,22 +53,18 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     path = made.write_parquet(tmp_path / "a.parquet", made.rows())
     common = ("--grid", "given", "--out", tmp_path / "out")
     assert run("score", path, *common, "--export", tmp_path / "export").exit_code == 0
-    files = sorted((tmp_path / "export").iterdir())
-    assert [f.name for f in files] == [
+    exported = sorted((tmp_path / "export").iterdir())
+    assert [f.name for f in exported] == [
         "my-memory-tabletop_rollouts.csv",
         "perceptual-framesamp-modul-tabletop_rollouts.csv",
         "retrieval-framesamp-modul-tabletop_rollouts.csv",
     ]
-    with files[0].open(newline="") as lines:
+    with exported[0].open(newline="") as lines:
         rows = list(csv.DictReader(lines))
     assert [row["status"] for row in rows].count("error") == 1
-    found = score([files[1]], system=made.BASE, grid=Grid.GIVEN, draws=100)
+    found = score([exported[1]], system=made.BASE, grid=Grid.GIVEN, draws=100)
     assert [cell.counts[0] for cell in found.cells] == [1, 7, 5, 3, 2]
     assert found.cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
-    rows_ = [*made.rows(), *made.repeat(made.rows(), 3)]
-    path = made.write_parquet(tmp_path / "b.parquet", rows_)
-    done = run("score", path, *common, "--export", tmp_path / "export")
-    assert "2 model seeds" in str(done.exception)
 
 
 def test_lenient_on_the_command_line(tmp_path: Path) -> None:
@@ -79,6 +77,51 @@ def test_lenient_on_the_command_line(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert f"left out: {path}, line 3: unknown family 'MoveCub'" in done.stderr
     assert "| my-memory | 100.0% [20.7, 100.0] n=1 |" in done.stdout
+
+
+def files(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(tmp_path: Path) -> None:
+    out, fresh = tmp_path / "out", tmp_path / "fresh"
+    rows = made.rows()
+    both = [*rows, *(replace(r, simulator="robomme") for r in rows)]
+    first = made.write_parquet(tmp_path / "a.parquet", both)
+    second = made.write_parquet(tmp_path / "b.parquet", [r for r in rows if r.system == made.OWN])
+    done = run("score", first, "--grid", "given", "--against", "paper", "--out", out)
+    assert done.exit_code == 0, done.output
+    assert {"tables/paper.csv", "tables/paper.md", "figures/success-robomme.png"} <= files(out)
+    assert {path.stem for path in (out / "tables").iterdir()} == set(TABLES)
+    others = {"tables/notes.csv", "tables/mine.md", "figures/mine.svg", "figures/success-me.png"}
+    for name in (*others, "notes.txt"):
+        (out / name).touch()
+    for folder in (out, fresh):
+        done = run("score", second, "--grid", "given", "--out", folder)
+        assert done.exit_code == 0, done.output
+    assert "tables/paper.csv" not in files(fresh)
+    assert files(out) == files(fresh) | others | {"notes.txt"}
+
+
+@pytest.mark.parametrize("library", ["matplotlib", "jinja2"])
+def test_without_a_library_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    monkeypatch.setitem(sys.modules, library, None)
+    given = ("score", path, "--grid", "given", "--out", tmp_path / "o", "--export", tmp_path / "e")
+    done = run(*given)
+    assert isinstance(done.exception, MissingExtraError) and library in str(done.exception)
+    assert files(tmp_path) == {"a.csv"}
+
+
+def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    rows = [*made.rows(), *made.repeat(made.rows(), 3)]
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    given = ("score", path, "--grid", "given", "--out", tmp_path / "o", "--export", tmp_path / "e")
+    done = run(*given)
+    assert "2 model seeds" in str(done.exception)
+    assert files(tmp_path) == {"a.csv"}
 
 
 def test_compare_on_the_command_line(tmp_path: Path) -> None:

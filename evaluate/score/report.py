@@ -24,7 +24,7 @@ from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import atomic_path, sha256_file
 from robomme_interference_data.tables import Table
 
-__all__ = ["write_report"]
+__all__ = ["load_jinja2", "write_report"]
 
 MOST_EPISODES = 20_000
 """So many rows of single episodes a page holds at most."""
@@ -51,13 +51,7 @@ def write_report(score: Score, figures: Mapping[str, Path], out: Path) -> None:
     Raises:
         MissingExtraError: jinja2 is not installed.
     """
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingExtraError(
-            "the report needs jinja2",
-            'Install it: pip install "robomme-interference-data[score]"',
-        ) from error
+    jinja2 = load_jinja2()
     template = resources.files(__package__).joinpath("templates", "report.html.j2")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -76,6 +70,22 @@ def write_report(score: Score, figures: Mapping[str, Path], out: Path) -> None:
     )
     with atomic_path(out) as partial:
         partial.write_text(html, encoding="utf-8", newline="\n")
+
+
+def load_jinja2() -> Any:
+    """Return the library that fills in the page.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
+    try:
+        import jinja2
+    except ImportError as error:
+        raise MissingExtraError(
+            "the report needs jinja2",
+            'Install it: pip install "robomme-interference-data[score]"',
+        ) from error
+    return jinja2
 
 
 def _grid(grid: MainGrid) -> dict[str, Any]:
