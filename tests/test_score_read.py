@@ -242,6 +242,36 @@ def test_simulators_have_revisions_and_scenes_of_their_own(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("../escaped", "'../escaped' is not the name of a simulator; expected up to 128 letters"),
+        ("a/b", "'a/b' is not the name"),
+        (".hidden", "'.hidden' is not the name"),
+        ("", "'' is not the name"),
+        ("x" * 129, "is not the name"),
+        ("RoboMME", "there is no simulator 'RoboMME'. Did you mean 'robomme'?"),
+        ("Tabletop", "Did you mean 'tabletop'?"),
+    ],
+)
+def test_a_simulator_has_a_name_that_a_file_can_have(
+    tmp_path: Path, name: str, reason: str
+) -> None:
+    rows = made.rows()
+    rows[3] = replace(rows[3], simulator=name)
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    first = raised.value.message.splitlines()[1]
+    assert first.startswith(f"{tmp_path / 'a.csv'}, line 5: ") and reason in first
+
+
+def test_simulators_of_ones_own_are_named_as_runs_name_them(tmp_path: Path) -> None:
+    names = ("my_package.kitchen:make_simulator", "_doubles:make", "sim-2.1", "x" * 128)
+    rows = [replace(r, simulator=name) for name in names for r in made.rows()[:2]]
+    found = read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    assert found.simulators == tuple(sorted(names))
+
+
+@pytest.mark.parametrize(
     ("header", "message"),
     [
         ("family,condition,episode,status", "lacks the columns success"),

@@ -1,5 +1,6 @@
 """Judge rows, and pack each into one 64-bit number."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_
 from robomme_interference_data.evaluate.score.columns import Codes, Rows, distinct
 from robomme_interference_data.evaluate.score.read import Batch, Source
 from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.simulators.registry import SIMULATORS
 
 __all__ = ["BITS", "DIFFICULTIES", "REFUSED", "STATUSES", "Checker", "field", "pack"]
 
@@ -43,6 +45,10 @@ _WORDS: dict[Any, bool | None] = {"": None, "none": None, "nan": None}
 _WORDS |= dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 
 
+_SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
+"""Names of files hold it, so no `/`. A simulator of one's own is `module:function` in rows."""
+
+
 def pack(**codes: Codes | int) -> NDArray[np.uint64]:
     """Pack codes into numbers; fields that are not given are zero."""
     packed: Any = np.uint64(0)
@@ -70,7 +76,7 @@ class Checker:
     """
 
     def __init__(self, system: str | None = None):
-        self._system = system
+        self._default = system
         self.simulators: list[str] = []
         self.systems: list[str] = []
         self.model_seeds: list[int] = []
@@ -82,12 +88,10 @@ class Checker:
     def pack(self, batch: Batch, source: Source) -> tuple[NDArray[np.uint64], dict[int, str]]:
         """Return the packed rows, `REFUSED` for bad ones, and the reason for each bad row."""
         rows = Rows(batch)
-        default = None if "system" in source.columns else self._system
+        default = None if "system" in source.columns else self._default
         codes = {
-            "simulator": rows.code(
-                "simulator", self._named(self.simulators, "simulator"), "robomme"
-            ),
-            "system": rows.code("system", self._named_system, default),
+            "simulator": rows.code("simulator", self._simulator, "robomme"),
+            "system": rows.code("system", self._system, default),
             "condition": rows.code("condition", _condition),
             "family": rows.code("family", _family),
             "episode_split": rows.code("episode_split", _split, "test"),
@@ -121,22 +125,21 @@ class Checker:
         packed[list(rows.reasons)] = REFUSED
         return packed, rows.reasons
 
-    def _named(self, names: list[str], what: str) -> Callable[[Any], int]:
-        def code(value: Any) -> int:
-            if not value:
-                raise ValueError(f"{what} is empty")
-            if value not in names:
-                if len(names) == 2 ** BITS[what]:
-                    raise ValueError(f"more than {2 ** BITS[what]} values of {what}")
-                names.append(value)
-            return names.index(value)
+    def _simulator(self, value: str | None) -> int:
+        name = value or ""
+        if name not in SIMULATORS and name.lower() in SIMULATORS:
+            raise ValueError(f"there is no simulator {name!r}. Did you mean {name.lower()!r}?")
+        if not _SIMULATOR.fullmatch(name):
+            raise ValueError(
+                f"{name!r} is not the name of a simulator; expected up to 128 letters, digits, "
+                "'.', '_', '-' and ':'"
+            )
+        return _code(name, self.simulators, "simulator")
 
-        return code
-
-    def _named_system(self, value: Any) -> int:
+    def _system(self, value: str | None) -> int:
         if value in self.systems:
             return self.systems.index(value)
-        return self._named(self.systems, "system")(name_system(value or "").name)
+        return _code(name_system(value or "").name, self.systems, "system")
 
     def _seeds(self, rows: Rows) -> Codes:
         seeds = rows.number("model_seed", 2**62, absent=0)
@@ -211,6 +214,14 @@ _GROUP = ("simulator", "family", "episode_split")
 def episode_group(simulator: Any, family: Any, split: Any) -> Any:
     """Return the row of `Checker.difficulty` for codes of simulator, family and split."""
     return (simulator * len(FAMILIES) + family) * len(SPLITS) + split
+
+
+def _code(name: str, names: list[str], what: str) -> int:
+    if name not in names:
+        if len(names) == 2 ** BITS[what]:
+            raise ValueError(f"more than {2 ** BITS[what]} values of {what}")
+        names.append(name)
+    return names.index(name)
 
 
 def _beside(rows: Rows, known: str) -> Callable[[int], str]:
