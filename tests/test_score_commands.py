@@ -13,9 +13,12 @@ import score_rows as made
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app
-from robomme_interference_data.errors import BadRowsError, MissingExtraError
+from robomme_interference_data.errors import BadRowsError, InvalidOptionError, MissingExtraError
+from robomme_interference_data.evaluate.score.export import export
 from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.outputs import TABLES
+from robomme_interference_data.evaluate.score.read import RELEASED_COLUMNS
+from robomme_interference_data.evaluate.score.rollouts import read_rollouts
 from robomme_interference_data.evaluate.score.scoring import score
 
 Run = Callable[..., Any]
@@ -65,6 +68,57 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     found = score([exported[1]], system=made.BASE, grid=Grid.GIVEN, draws=100)
     assert [cell.counts[0] for cell in found.cells] == [1, 7, 5, 3, 2]
     assert found.cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
+    # Their simulator comes back, too: they never stand beside the paper's rates.
+    done = run(
+        *("score", exported[1], "--system", made.BASE, "--against", "paper", "--json"),
+        *("--grid", "given", "--out", tmp_path / "paper"),
+    )
+    value = json.loads(done.stdout)
+    assert value["tables"]["paper"] == [] and list(value["headlines"]) == ["tabletop"]
+
+
+RETRIEVED: dict[str, Any] = {
+    "retrieval_model": "thumbnail/max/adaptive",
+    "retrieval_selected_lesson_fraction": 0.5,
+    "retrieval_selected_filler_fraction": 0.46875,
+    "retrieval_selected_query_fraction": 1 / 32,
+}
+
+
+def test_exported_rows_are_the_same_bytes_from_csv_and_parquet(tmp_path: Path) -> None:
+    kept = [made.row(made.OWN, "k0", "InsertPeg", i, letter) for i, letter in enumerate("sfte")]
+    kept[1] = replace(kept[1], seed=None, difficulty=None)
+    rows = [replace(r, simulator=s, **RETRIEVED) for s in ("robomme", "tabletop") for r in kept]
+    # As pandas saves a column with a gap, and an author a number.
+    text = made.write_csv(tmp_path / "a.csv", rows).read_text(encoding="utf-8")
+    text = text.replace(",1000,", ",1000.0,").replace(",0.5,0.46875,", ",0.50,0.468750,")
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    for name, path in (
+        ("csv", tmp_path / "a.csv"),
+        ("parquet", made.write_parquet(tmp_path / "a.parquet", rows)),
+    ):
+        found = read_rollouts([path])
+        assert len(export(found, tmp_path / name)) == 2
+        lines = [
+            *("InsertPeg,k0,0,1000,easy,success,1,100", "InsertPeg,k0,1,,,fail,0,100"),
+            *("InsertPeg,k0,2,1002,medium,ongoing,0,1300", "InsertPeg,k0,3,1003,medium,error,,100"),
+        ]
+        for simulator, head, tail in (("robomme", "", ""), ("tabletop", ",simulator", ",tabletop")):
+            file = tmp_path / name / f"{made.OWN}-{simulator}_rollouts.csv"
+            expected = [
+                ",".join(RELEASED_COLUMNS) + head,
+                *(f"{line},thumbnail/max/adaptive,0.5,0.46875,0.03125{tail}" for line in lines),
+            ]
+            assert file.read_bytes() == "".join(f"{line}\r\n" for line in expected).encode()
+
+
+def test_rows_of_other_episodes_than_test_ones_are_not_exported(tmp_path: Path) -> None:
+    rows = made.rows()
+    rows[7] = replace(rows[7], episode_split="val", seed=7)
+    found = read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    with pytest.raises(InvalidOptionError, match="1 rows are of train or val episodes"):
+        export(found, tmp_path / "export")
+    assert not (tmp_path / "export").exists()
 
 
 def test_lenient_on_the_command_line(tmp_path: Path) -> None:

@@ -279,8 +279,8 @@ def test_simulators_of_ones_own_are_named_as_runs_name_them(tmp_path: Path) -> N
         ("system,simulatr,family,condition,episode,status,success", "has the column 'simulatr'"),
         ("system,family,family,condition,episode,status,success", "two columns of one name"),
         (
-            "system,simulator,family,condition,episode,status,success",
-            "lacks the columns split, rev",
+            "system,simulator,split,family,condition,episode,status,success",
+            "lacks the columns revision, episode_split, model_seed, protocol_version;",
         ),
     ],
 )

@@ -11,7 +11,7 @@ from robomme_interference_data.constants import FAMILIES, MAX_STEPS, SPLITS
 from robomme_interference_data.errors import nearest
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_rank
 from robomme_interference_data.evaluate.score.columns import Codes, Rows, distinct
-from robomme_interference_data.evaluate.score.read import Batch, Source
+from robomme_interference_data.evaluate.score.read import RELEASED_SIMULATOR, Batch, Source
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.simulators.registry import SIMULATORS
 
@@ -90,7 +90,7 @@ class Checker:
         rows = Rows(batch)
         default = None if "system" in source.columns else self._default
         codes = {
-            "simulator": rows.code("simulator", self._simulator, "robomme"),
+            "simulator": rows.code("simulator", self._simulator, RELEASED_SIMULATOR),
             "system": rows.code("system", self._system, default),
             "condition": rows.code("condition", _condition),
             "family": rows.code("family", _family),

@@ -23,7 +23,15 @@ from robomme_interference_data.evaluate.rows import KEY_COLUMNS, ROLLOUT_SCHEMA
 from robomme_interference_data.files import read_json
 from robomme_interference_data.parquet import reading
 
-__all__ = ["COLUMNS", "RELEASED_COLUMNS", "Batch", "Source", "find_sources", "read_batches"]
+__all__ = [
+    "COLUMNS",
+    "RELEASED_COLUMNS",
+    "RELEASED_SIMULATOR",
+    "Batch",
+    "Source",
+    "find_sources",
+    "read_batches",
+]
 
 RELEASED_COLUMNS = (
     "family",
@@ -47,6 +55,13 @@ COLUMNS = (
 )
 """What scoring reads of a file, as far as it is there."""
 
+RELEASED_SIMULATOR = "robomme"
+"""The simulator of rows that name none."""
+
+_UNRELEASED = {"split", "revision", "episode_split", "model_seed", "protocol_version"}
+"""Columns that only rows of a run have. The released layout is without them, and without
+`simulator`, which exported rows of other simulators have as one column more."""
+
 _NEEDED = ("family", "condition", "episode", "status", "success")
 _NUMBERS = ("episode", "model_seed", "protocol_version", "seed", "steps")
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
@@ -64,15 +79,12 @@ class Source:
         folder: The folder of its run; None for a file that was given by itself.
         record: What `run.json` says about the run; empty without.
         columns: Name that scoring uses to name in the file.
-        released: Whether the file has the layout of the released CSVs: no simulator, split,
-            revision or model seed. Such rows are RoboMME's.
     """
 
     path: Path
     folder: Path | None
     record: Mapping[str, Any]
     columns: Mapping[str, str]
-    released: bool
 
 
 @dataclass
@@ -142,11 +154,10 @@ def _source(path: Path, with_system: bool) -> Source:
     if (path.parent / RUN_NAME).is_file() and path.name in (PARQUET_NAME, CSV_NAME):
         folder, record = path.parent, _record(path.parent / RUN_NAME)
     schema = _schema(path)
-    released = "simulator" not in schema.names
-    columns = _match(path, schema.names, released, with_system)
+    columns = _match(path, schema.names, with_system)
     if path.suffix.lower() == ".parquet":  # a CSV's cells are all text
         _check_types(path, schema, columns)
-    return Source(path, folder, record, columns, released)
+    return Source(path, folder, record, columns)
 
 
 def _record(path: Path) -> dict[str, Any]:
@@ -172,7 +183,7 @@ def _schema(path: Path) -> Any:
         return reader.schema
 
 
-def _match(path: Path, names: list[str], released: bool, with_system: bool) -> dict[str, str]:
+def _match(path: Path, names: list[str], with_system: bool) -> dict[str, str]:
     """Return which column of the file is which of ours."""
     ours = {_ALIASES.get(name, name): name for name in names}
     known = [*ROLLOUT_SCHEMA.names, *_ALIASES]
@@ -182,7 +193,8 @@ def _match(path: Path, names: list[str], released: bool, with_system: bool) -> d
             what = f"the column {name!r}" if near else "two columns of one name"
             hint = f"Did you mean {near[0]!r}?" if near else "Rename one of them."
             raise FormatError(f"{path} has {what}", hint)
-    needed = _NEEDED if released else (*KEY_COLUMNS, *_NEEDED)
+    ran = "simulator" in ours and not _UNRELEASED.isdisjoint(ours)
+    needed = (*KEY_COLUMNS, *_NEEDED) if ran else _NEEDED
     missing = [name for name in dict.fromkeys(needed) if name not in ours]
     if missing:
         raise FormatError(
