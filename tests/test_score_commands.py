@@ -1,14 +1,19 @@
 """score and compare as commands: options, exported rows, pairs."""
 
 import csv
+import html
 import json
+import re
+import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import factories
 import pytest
+import rollout_doubles
 import score_rows as made
 from typer.testing import CliRunner
 
@@ -155,6 +160,32 @@ def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(tmp_path: Pa
         assert done.exit_code == 0, done.output
     assert "tables/paper.csv" not in files(fresh)
     assert files(out) == files(fresh) | others | {"notes.txt"}
+
+
+def test_the_report_holds_the_commands_of_the_score_and_of_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trouble").mkdir()
+    monkeypatch.setenv(rollout_doubles.TROUBLE, str(tmp_path / "trouble"))
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+
+    def typed(*arguments: str | Path) -> str:
+        words = ["robomme-interference", *map(str, arguments)]
+        monkeypatch.setattr(sys, "argv", words)
+        done = run(*words[1:])
+        assert done.exit_code == 0, done.output
+        return shlex.join(words)
+
+    rollouts, out = tmp_path / "my run", tmp_path / "out"
+    evaluated = typed(
+        *("evaluate", "--policy", "python:rollout_doubles:make_cheat", "--conditions", "k0"),
+        *("--simulator", "rollout_doubles:World", "--split", factories.split()),
+        *("--episodes", "0", "--system", "mine", "--out", rollouts),
+    )
+    scored = typed("score", rollouts, "--grid", "given", "--lenient", "--out", out)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    codes = [html.unescape(code) for code in re.findall("<code>(.*?)</code>", page)]
+    assert codes == [scored, evaluated]
 
 
 @pytest.mark.parametrize("library", ["matplotlib", "jinja2"])

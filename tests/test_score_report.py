@@ -1,8 +1,10 @@
 """The report, opened and clicked in a browser; and the figures in it."""
 
 import html
+import platform
 import re
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -37,7 +39,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made.write_parquet(folder / "rollouts.parquet", rows)
     record = {
         "format_version": 1,
-        "command": ["robomme-interference", "evaluate", "--out", "my run"],
+        "command": [
+            "robomme-interference evaluate --out 'my run' --shard 1/2",
+            "robomme-interference evaluate --out 'my run' --shard 2/2",
+        ],
         "versions": {"python": "3.12.0", "numpy": "2.2.0"},
         "split": "made-up",
         "revision": made.REVISION,
@@ -140,13 +145,21 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
 def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
     text = report.read_text(encoding="utf-8")
     for shown in (
-        "robomme-interference evaluate --out &#39;my run&#39;",
+        # One line for each shard of a joined run, to be copied as it was typed.
+        "<pre><code>robomme-interference evaluate --out 'my run' --shard 1/2</code></pre>"
+        "<pre><code>robomme-interference evaluate --out 'my run' --shard 2/2</code></pre>",
+        # From Python there is no command: the call stands in its place.
+        f"<pre><code>score([{str(run)!r}], system=None, lenient=False, grid='given', "
+        "against_paper=False, draws=500)</code></pre>",
+        "500 draws, seeded by the simulator",
+        f"Python {platform.python_version()}, robomme-interference-data ",
+        *(f"{name} {metadata.version(name)}" for name in ("numpy", "pyarrow", "matplotlib")),
         "numpy 2.2.0, python 3.12.0",
         sha256_file(run / "rollouts.parquet"),
         made.REVISION,
         "those that any of the given rows is of",
     ):
-        assert shown in text
+        assert shown in html.unescape(text)
     assert "<script>alert" not in text and html.escape("<script>alert(1)") in text
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
 

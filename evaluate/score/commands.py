@@ -1,6 +1,8 @@
 """The commands `score` and `compare`."""
 
 import json
+import shlex
+import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -68,7 +70,8 @@ def score(
     if found.rollouts.refused:
         MESSAGES.print(f"{found.rollouts.refused:,} bad rows left out")
     with MESSAGES.status("Drawing the figures"):
-        exported = write_outputs(found, out, export_to, system)
+        command = shlex.join(["robomme-interference", *sys.argv[1:]])
+        exported = write_outputs(found, out, export_to, system, command)
     for path in exported:
         MESSAGES.print(f"{path} written")
     if as_json:

@@ -21,7 +21,11 @@ TABLES = (
 
 
 def write_outputs(
-    score: Score, out: Path, export_to: Path | None = None, system: str | None = None
+    score: Score,
+    out: Path,
+    export_to: Path | None = None,
+    system: str | None = None,
+    command: str | None = None,
 ) -> list[Path]:
     """Write tables, figures and the report, each atomically and the report last.
 
@@ -33,6 +37,7 @@ def write_outputs(
         out: Folder for `tables/`, `figures/` and `report.html`.
         export_to: Folder for the rows in the released layout (see `export`); None writes none.
         system: Name of the system of rows that name none.
+        command: The command line that made the score, for the report.
 
     Returns:
         The exported files.
@@ -47,7 +52,7 @@ def write_outputs(
     write_tables(list(score.tables.values()), out / "tables", main_markdown(score.cells))
     figures = draw_figures(score, out / "figures")
     _remove_earlier(out, score, figures)
-    write_report(score, figures, out / "report.html")
+    write_report(score, figures, out / "report.html", command)
     return exported
 
 

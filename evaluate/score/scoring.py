@@ -41,7 +41,9 @@ class Score:
         rollouts: The rows.
         grid: Which episodes a complete cell has.
         against_paper: Whether published rates stand beside ours.
-        expected: The same by simulator.
+        draws: Bootstrap samples.
+        call: The call of `score` that made it, as Python has it.
+        expected: The episodes of a complete cell, by simulator.
         outcomes: By system and simulator, in the order of tables.
         effects: Of each of `outcomes`.
         cells: System × condition.
@@ -53,6 +55,8 @@ class Score:
     rollouts: Rollouts
     grid: Grid
     against_paper: bool
+    draws: int
+    call: str
     expected: dict[str, Expected]
     outcomes: tuple[Outcomes, ...]
     effects: tuple[Effects, ...]
@@ -125,6 +129,9 @@ def score(
         rollouts,
         grid,
         against_paper,
+        draws,
+        f"score({[str(path) for path in paths]}, system={system!r}, lenient={lenient}, "
+        f"grid={str(grid)!r}, against_paper={against_paper}, draws={draws})",
         expected,
         outcomes,
         effects,
