@@ -193,18 +193,57 @@ def test_a_duplicate_in_another_file_names_both_places(tmp_path: Path) -> None:
     rows = made.rows()
     paths = [
         made.write_csv(tmp_path / "one.csv", rows[:50]),
-        made.write_csv(
-            tmp_path / "two.csv", [rows[60], replace(rows[8], status="timeout", success=False)]
-        ),
+        made.write_csv(tmp_path / "two.csv", [rows[60], rows[8]]),
     ]
     with pytest.raises(BadRowsError) as raised:
         read_rollouts(paths)
-    assert f"{paths[1]}, line 3: the same rollout as {paths[0]}, line 10" in str(raised.value)
+    assert raised.value.message.splitlines() == [
+        "1 bad row:",
+        f"{paths[1]}, line 3: the same rollout as {paths[0]}, line 10",
+    ]
     found = read_rollouts(paths, lenient=True)
     assert (len(found.packed), found.refused) == (51, 1)
-    # The first one stays.
-    expected = read_rollouts([paths[0]])
-    assert set(expected.packed.tolist()) < set(found.packed.tolist())
+    # Equal rows: one stays, and counts.
+    expected = read_rollouts([made.write_csv(tmp_path / "all.csv", [*rows[:50], rows[60]])])
+    assert np.array_equal(found.packed, expected.packed)
+
+
+def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -> None:
+    rows = made.rows()
+    other = replace(rows[8], status="timeout", success=False)  # rows[8] failed
+    one = made.write_csv(tmp_path / "one.csv", rows[:50])
+    two = made.write_csv(tmp_path / "two.csv", [other, rows[60]])
+    three = made.write_csv(tmp_path / "three.csv", [rows[3], rows[8]])
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([one, two, three])
+    more = "; its rows contradict each other"
+    assert raised.value.message.splitlines() == [
+        "4 bad rows:",
+        f"{one}, line 10: the same rollout as {two}, line 2{more}",
+        f"{two}, line 2: the same rollout as {one}, line 10{more}",
+        f"{three}, line 2: the same rollout as {one}, line 5",
+        f"{three}, line 3: the same rollout as {one}, line 10{more}",
+    ]
+    kept = [*rows[:8], *rows[9:50], rows[60]]
+    expected = read_rollouts([made.write_csv(tmp_path / "kept.csv", kept)])
+    for paths in ([one, two, three], [three, two, one], [two, one, three]):
+        found = read_rollouts(paths, lenient=True)
+        assert np.array_equal(found.packed, expected.packed)
+        assert found.refused == 4
+
+
+def test_videos_are_those_of_rows_that_stay(tmp_path: Path) -> None:
+    rows = [replace(row, video=f"{row.episode}.mp4") for row in made.rows()[:3]]
+    changed = replace(rows[1], status="success", success=True, video="x.mp4")  # it failed
+    folders = [tmp_path / name for name in "ab"]
+    for folder, given_rows in zip(folders, (rows, [changed, rows[2]]), strict=True):
+        folder.mkdir()
+        made.write_parquet(folder / "rollouts.parquet", given_rows)
+        (folder / "run.json").write_text('{"format_version": 1}')
+    for paths in (folders, folders[::-1]):
+        found = read_rollouts(paths, lenient=True)
+        assert len(found.packed) == 2
+        assert sorted(found.videos.values()) == [folders[0] / "0.mp4", folders[0] / "2.mp4"]
 
 
 @pytest.mark.parametrize(

@@ -229,6 +229,28 @@ def test_episode_rows_show_every_outcome(tmp_path: Path) -> None:
     assert own["MoveCube/test/5"] == {"no-history": "fail"}
 
 
+def test_each_rollout_has_its_video_whatever_seeds_others_have(tmp_path: Path) -> None:
+    first = next(r for r in made.rows() if (r.system, r.condition) == (made.BASE, "k0"))
+    given = {  # run to rows of (episode, model seed, video)
+        "a": [(0, 0, "a0.mp4")],
+        "b": [(1, 5, "b1.mp4"), (2, 5, "gone.mp4"), (2, 7, "b2.mp4"), (2, 9, "b9.mp4")],
+    }
+    for name, rollouts in given.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").write_text('{"format_version": 1}')
+        rows = [
+            replace(first, episode=episode, seed=episode, model_seed=model, video=video)
+            for episode, model, video in rollouts
+        ]
+        made.write_parquet(tmp_path / name / "rollouts.parquet", rows)
+        for _, _, video in rollouts:
+            if video != "gone.mp4":
+                (tmp_path / name / video).touch()
+    found = score([tmp_path / "a", tmp_path / "b"], grid=Grid.GIVEN, draws=10)
+    listed = list(episode_rows(found.outcomes, found.rollouts, tmp_path))
+    assert [row.videos for row in listed] == [{"k0": f"{v}.mp4"} for v in ("a/a0", "b/b1", "b/b2")]
+
+
 def test_no_two_systems_of_the_paper_look_alike() -> None:
     looks = looks_of([system.name for system in PAPER_SYSTEMS])
     pictures = {(look.colour, look.marker, str(look.line)) for look in looks.values()}

@@ -146,7 +146,10 @@ class _Reader:
         return path, batch.line(row - start)
 
     def refuse_duplicates(self, packed: NDArray[np.uint64]) -> NDArray[np.uint64]:
-        """Return the rows, sorted, of each rollout only the first that was read."""
+        """Return the rows, sorted: one of each rollout, none where its rows contradict each other.
+
+        So what stays does not depend on the order of files.
+        """
         ordered = np.sort(packed)
         ordered = ordered[: np.searchsorted(ordered, REFUSED)]
         if not any(
@@ -156,17 +159,22 @@ class _Reader:
             return ordered
         keys = packed >> _STATUS_BITS
         order = np.argsort(keys, kind="stable")
-        keys = keys[order]
-        later = 1 + np.flatnonzero((keys[1:] == keys[:-1]) & (packed[order[1:]] != REFUSED))
-        first = np.searchsorted(keys, keys[later], side="left")
-        for one, other in sorted(zip(order[later].tolist(), order[first].tolist(), strict=True)):
-            path, line = self.where(one)
-            self.refuse(path, line, f"the same rollout as {_place(*self.where(other))}")
+        order = order[packed[order] != REFUSED]
+        begins = np.diff(keys[order], prepend=REFUSED) != 0
+        group = np.cumsum(begins) - 1
+        first = order[begins][group]
+        contradicted = np.zeros(int(begins.sum()), bool)
+        contradicted[group[packed[order] != packed[first]]] = True
+        refused = ~begins | contradicted[group]
+        kept = np.sort(packed[order[~refused]])
+        other = np.where(begins, np.roll(order, -1), first)
+        found = np.stack([order, other, contradicted[group]], axis=1)[refused]
+        for row, same, differs in sorted(found.tolist()):
+            more = "; its rows contradict each other" if differs else ""
+            path, line = self.where(row)
+            self.refuse(path, line, f"the same rollout as {_place(*self.where(same))}{more}")
         self.give_up_if_strict()
-        kept = np.ones(len(packed), bool)
-        kept[order[later]] = False
-        kept &= packed != REFUSED
-        return np.sort(packed[kept])
+        return kept
 
 
 def read_rollouts(
@@ -199,7 +207,7 @@ def read_rollouts(
         "model_seed": _ranks(checker.model_seeds, lambda seed: seed),
     }
     _recode(packed, orders)
-    videos = {int(packed[row] >> _STATUS_BITS): path for row, path in reader.videos}
+    videos = [(packed[row], path) for row, path in reader.videos]
     packed = reader.refuse_duplicates(packed)
     by_name = np.argsort(orders["simulator"])
     return Rollouts(
@@ -210,7 +218,7 @@ def read_rollouts(
         _regrouped(checker.difficulty, by_name),
         _regrouped(checker.seeds, by_name),
         dict(sorted(checker.revisions.items())),
-        videos,
+        _kept_videos(videos, packed),
         tuple(sources),
         tuple(reader.refusals),
         reader.refused,
@@ -219,6 +227,16 @@ def read_rollouts(
 
 def _place(path: Path, line: int) -> str:
     return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
+
+
+def _kept_videos(
+    videos: Sequence[tuple[np.uint64, Path]], packed: NDArray[np.uint64]
+) -> dict[int, Path]:
+    """Return the videos of rows that stayed; of a rollout's several the first by path."""
+    rows = np.array([row for row, _ in videos], np.uint64)
+    kept = np.searchsorted(packed, rows, "left") < np.searchsorted(packed, rows, "right")
+    there = [videos[place] for place in np.flatnonzero(kept).tolist()]
+    return {int(row >> _STATUS_BITS): path for row, path in sorted(there, reverse=True)}
 
 
 def _table_order(system: str) -> tuple[int, str]:
