@@ -18,7 +18,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
 )
-from robomme_interference_data.evaluate.score import read, rollouts
+from robomme_interference_data.evaluate.score import batches, rollouts
 from robomme_interference_data.evaluate.score.check import BITS, REFUSED, field, pack
 from robomme_interference_data.evaluate.score.columns import distinct
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
@@ -156,7 +156,7 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
 
 
 def test_lines_are_right_in_every_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(read, "_BLOCK", 150)  # about three rows
+    monkeypatch.setattr(batches, "_BLOCK", 150)  # about three rows
     lines = [f"my-memory,MoveCube,k0,{number},{number},easy,fail,0,9" for number in range(40)]
     for broken in (4, 11, 25):
         lines[broken] = "only,three,fields"
@@ -170,7 +170,7 @@ def test_lines_are_right_in_every_block(tmp_path: Path, monkeypatch: pytest.Monk
 def test_rows_of_parquet_are_counted_from_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(read, "_BATCH", 10)
+    monkeypatch.setattr(batches, "_BATCH", 10)
     table = pa.Table.from_pylist([row.as_dict() for row in made.rows()])
     names = table["family"].to_pylist()
     names[17] = "Unknown"
@@ -334,7 +334,7 @@ def test_files_without_what_is_needed_are_refused(
     assert raised.value.hint
 
 
-def test_missing_and_damaged_files(tmp_path: Path) -> None:
+def test_missing_and_damaged_files(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(MissingFileError, match="there is no file or folder"):
         read_rollouts([tmp_path / "nowhere"])
     with pytest.raises(
@@ -347,6 +347,16 @@ def test_missing_and_damaged_files(tmp_path: Path) -> None:
     (tmp_path / "picture.csv").write_bytes(b"a,b\n1,\xff\n")
     with pytest.raises(FormatError, match=r"picture\.csv cannot be read: byte 6 is not UTF-8 text"):
         read_rollouts([tmp_path / "picture.csv"])
+    # A byte that is no text in a line with too few fields, in a later block.
+    whole = made.write_csv(tmp_path / "late.csv", made.rows()).read_bytes()
+    (tmp_path / "late.csv").write_bytes(whole * 1200 + b"x" * 70_000 + b"\xe9,x\n" + whole)
+    place = 1200 * len(whole) + 70_000
+    with pytest.raises(FormatError, match=rf"late\.csv cannot be read: byte {place} is not UTF-8"):
+        read_rollouts([tmp_path / "late.csv"], lenient=True)
+    assert capfd.readouterr().err == ""
+    (tmp_path / "cut.csv").write_bytes(b"a,b\n1,\xc3")
+    with pytest.raises(FormatError, match=r"cut\.csv cannot be read: byte 6 is not UTF-8 text"):
+        read_rollouts([tmp_path / "cut.csv"])
     (tmp_path / "rows.txt").touch()
     with pytest.raises(FormatError, match=r"neither \.csv nor \.parquet"):
         read_rollouts([tmp_path / "rows.txt"])

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS, SPLITS
 from robomme_interference_data.errors import nearest
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_rank
+from robomme_interference_data.evaluate.score.batches import Batch
 from robomme_interference_data.evaluate.score.columns import Codes, Rows, distinct
-from robomme_interference_data.evaluate.score.read import RELEASED_SIMULATOR, Batch, Source
+from robomme_interference_data.evaluate.score.read import RELEASED_SIMULATOR, Source
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.simulators.registry import SIMULATORS
 

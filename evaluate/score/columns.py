@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.evaluate.score.read import Batch
+from robomme_interference_data.evaluate.score.batches import Batch
 
 __all__ = ["Codes", "Rows", "distinct", "flags", "whole_number"]
 

@@ -10,12 +10,12 @@ from typing import Any
 
 from robomme_interference_data.constants import SPLITS
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.score.batches import Batch
 from robomme_interference_data.evaluate.score.check import field
 from robomme_interference_data.evaluate.score.columns import whole_number
 from robomme_interference_data.evaluate.score.read import (
     RELEASED_COLUMNS,
     RELEASED_SIMULATOR,
-    Batch,
     read_batches,
 )
 from robomme_interference_data.evaluate.score.rollouts import Rollouts

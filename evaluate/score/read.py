@@ -1,6 +1,5 @@
 """Open files of rollout rows and stream them, whatever wrote them; nothing is judged here."""
 
-import codecs
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -8,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
@@ -20,6 +18,12 @@ from robomme_interference_data.evaluate.log import (
     RUN_NAME,
 )
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, ROLLOUT_SCHEMA
+from robomme_interference_data.evaluate.score.batches import (
+    Batch,
+    csv_batches,
+    csv_schema,
+    parquet_batches,
+)
 from robomme_interference_data.files import read_json
 from robomme_interference_data.parquet import reading
 
@@ -27,7 +31,6 @@ __all__ = [
     "COLUMNS",
     "RELEASED_COLUMNS",
     "RELEASED_SIMULATOR",
-    "Batch",
     "Source",
     "find_sources",
     "read_batches",
@@ -65,9 +68,6 @@ _UNRELEASED = {"split", "revision", "episode_split", "model_seed", "protocol_ver
 _NEEDED = ("family", "condition", "episode", "status", "success")
 _NUMBERS = ("episode", "model_seed", "protocol_version", "seed", "steps")
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
-_BLOCK = 16 * 2**20  # bytes of CSV at a time
-_LOOKED_AT = 2**16  # bytes of CSV, to tell whether it is text
-_BATCH = 2**18  # rows of parquet at a time
 
 
 @dataclass(frozen=True)
@@ -85,33 +85,6 @@ class Source:
     folder: Path | None
     record: Mapping[str, Any]
     columns: Mapping[str, str]
-
-
-@dataclass
-class Batch:
-    """Consecutive rows of one file.
-
-    Attributes:
-        columns: Name to values, dictionary-encoded text or plain numbers, all equally long.
-        rows: How many rows.
-        first: Line of the first row if all lines before are rows; 1 is the header of a CSV, or
-            the first row of a parquet file.
-        malformed: Line and reason of the lines found since the last batch that are no rows.
-        skipped: All such lines so far, in order.
-    """
-
-    columns: dict[str, Any]
-    rows: int
-    first: int
-    malformed: Sequence[tuple[int, str]] = ()
-    skipped: Sequence[tuple[int, str]] = ()
-
-    def line(self, row: int) -> int:
-        """Return the line on which a row stands; the row of a parquet file, from 1."""
-        line = self.first + row
-        for skipped, _ in self.skipped:
-            line += skipped <= line
-        return line
 
 
 def find_sources(paths: Sequence[Path], with_system: bool = False) -> list[Source]:
@@ -179,8 +152,8 @@ def _schema(path: Path) -> Any:
         raise FormatError(
             f"{path} is neither .csv nor .parquet", "Rows are read from CSV and parquet files."
         )
-    with reading(path), _open_csv(path, None, []) as reader:
-        return reader.schema
+    with reading(path):
+        return csv_schema(path)
 
 
 def _match(path: Path, names: list[str], with_system: bool) -> dict[str, str]:
@@ -244,74 +217,12 @@ def read_batches(source: Source, columns: Sequence[str] | None = None) -> Iterat
     chosen = source.columns if columns is None else _chosen(source, columns)
     with reading(source.path):
         if source.path.suffix.lower() == ".parquet":
-            yield from _parquet_batches(source.path, chosen)
+            yield from parquet_batches(source.path, chosen)
         else:
-            yield from _csv_batches(source.path, chosen)
+            yield from csv_batches(source.path, chosen)
 
 
 def _chosen(source: Source, columns: Sequence[str]) -> dict[str, str]:
     present = set(_schema(source.path).names)
     named = {name: source.columns.get(name, name) for name in columns}
     return {name: there for name, there in named.items() if there in present}
-
-
-def _parquet_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
-    schema = pq.read_schema(path)
-    texts = [name for name in columns.values() if pa.types.is_string(schema.field(name).type)]
-    first = 1
-    with pq.ParquetFile(path, read_dictionary=texts) as file:
-        for batch in file.iter_batches(_BATCH, columns=list(columns.values())):
-            found = {name: batch.column(there) for name, there in columns.items()}
-            yield Batch(found, len(batch), first)
-            first += len(batch)
-
-
-def _csv_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
-    skipped: list[tuple[int, str]] = []
-    first, seen = 2, 0
-    with _open_csv(path, list(columns.values()), skipped) as reader:
-        for batch in reader:
-            found = {name: batch.column(there) for name, there in columns.items()}
-            # pyarrow reads ahead: some of them may stand after these rows.
-            yield Batch(found, len(batch), first, skipped[seen:], skipped)
-            first += len(batch)
-            seen = len(skipped)
-    if skipped[seen:]:
-        yield Batch({}, 0, first, skipped[seen:], skipped)
-
-
-def _check_text(path: Path) -> None:
-    """Refuse what is no text at all: pyarrow would show a traceback of its own for it."""
-    with path.open("rb") as file:
-        start = file.read(_LOOKED_AT)
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(start)
-    except UnicodeDecodeError as error:
-        raise FormatError(
-            f"{path} cannot be read: byte {error.start} is not UTF-8 text",
-            "Expected a CSV or parquet file of rollout rows (docs/score.md).",
-        ) from None
-
-
-def _open_csv(path: Path, columns: list[str] | None, skipped: list[tuple[int, str]]) -> Any:
-    def note(row: Any) -> str:
-        expected, actual = row.expected_columns, row.actual_columns
-        skipped.append((row.number, f"the line has {actual} fields; expected {expected}"))
-        return "skip"
-
-    # Everything is text at first: what a number should be is judged row by row. Threads would
-    # not say on which line a broken one stands.
-    text = pa.dictionary(pa.int32(), pa.string())
-    _check_text(path)
-    return pa_csv.open_csv(
-        path,
-        read_options=pa_csv.ReadOptions(use_threads=False, block_size=_BLOCK),
-        parse_options=pa_csv.ParseOptions(ignore_empty_lines=False, invalid_row_handler=note),
-        convert_options=pa_csv.ConvertOptions(
-            column_types=dict.fromkeys(columns or [], text),
-            include_columns=columns or [],
-            strings_can_be_null=True,
-            quoted_strings_can_be_null=True,
-            null_values=[""],
-        ),
-    )

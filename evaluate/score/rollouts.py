@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.evaluate.score.batches import Batch
 from robomme_interference_data.evaluate.score.check import (
     BITS,
     REFUSED,
@@ -18,7 +19,7 @@ from robomme_interference_data.evaluate.score.check import (
     pack,
 )
 from robomme_interference_data.evaluate.score.columns import flags
-from robomme_interference_data.evaluate.score.read import Batch, Source, find_sources, read_batches
+from robomme_interference_data.evaluate.score.read import Source, find_sources, read_batches
 from robomme_interference_data.evaluate.systems import SYSTEMS
 
 __all__ = ["Refusal", "Rollouts", "read_rollouts"]
