@@ -18,7 +18,13 @@ import score_rows as made
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app
-from robomme_interference_data.errors import BadRowsError, InvalidOptionError, MissingExtraError
+from robomme_interference_data.errors import (
+    BadRowsError,
+    InvalidIdError,
+    InvalidOptionError,
+    MissingExtraError,
+    UnknownNameError,
+)
 from robomme_interference_data.evaluate.score.export import export
 from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.outputs import TABLES
@@ -206,6 +212,23 @@ def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path:
     given = ("score", path, "--grid", "given", "--out", tmp_path / "o", "--export", tmp_path / "e")
     done = run(*given)
     assert "2 model seeds" in str(done.exception)
+    assert files(tmp_path) == {"a.csv"}
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("ret rieval", InvalidIdError), ("pi05-baseline", UnknownNameError), ("", InvalidIdError)],
+)
+def test_a_name_that_is_none_is_a_bad_option_not_bad_rows(
+    tmp_path: Path, name: str, error: type[Exception]
+) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    for given in (
+        ("score", path, "--system", name, "--out", tmp_path / "out", "--lenient"),
+        ("compare", path, path, "--system-b", name),
+    ):
+        done = run(*given)
+        assert isinstance(done.exception, error) and repr(name) in str(done.exception)
     assert files(tmp_path) == {"a.csv"}
 
 

@@ -29,7 +29,7 @@ VIDEO = "videos/MoveCube/k0 #0.mp4"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run, with one video that is there and one that is not."""
-    folder = tmp_path_factory.mktemp("runs") / "my run"
+    folder = tmp_path_factory.mktemp("runs_with_a_name_that_no_browser_would_break") / "my run"
     (folder / VIDEO).parent.mkdir(parents=True)
     (folder / VIDEO).write_bytes(b"video")
     rows = made.rows()
@@ -140,6 +140,16 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert text == "success"
         assert address == (report.parent.parent / "my run" / VIDEO).resolve().as_uri()
         assert page.complaints() == []
+
+
+def test_the_report_fits_a_narrow_window(report: Path) -> None:
+    with open_page() as page:
+        page.call(
+            "Emulation.setDeviceMetricsOverride",
+            **{"width": 400, "height": 900, "deviceScaleFactor": 1, "mobile": True},
+        )
+        page.open(report)
+        assert page.run("document.documentElement.scrollWidth") == 400
 
 
 def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:

@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.score.check import (
 )
 from robomme_interference_data.evaluate.score.columns import flags
 from robomme_interference_data.evaluate.score.read import Source, find_sources, read_batches
-from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.evaluate.systems import SYSTEMS, name_system
 
 __all__ = ["Refusal", "Rollouts", "read_rollouts"]
 
@@ -194,9 +194,12 @@ def read_rollouts(
         BadRowsError: A row is bad: unknown family, condition, status or system, numbers out of
             range, a success that contradicts the status, the same rollout twice, rows of
             different splits, or an episode with two seeds or difficulties.
+        InvalidIdError, UnknownNameError: `system` is no name of a system; see `name_system`.
         MissingFileError: There is no such file.
-        FormatError: A file cannot be read or lacks columns.
+        FormatError: A file cannot be read, lacks columns, or has some of a type that does not fit.
     """
+    if system is not None:
+        name_system(system)
     sources = find_sources(paths, with_system=system is not None)
     checker, reader = Checker(system), _Reader(lenient)
     for source in sources:
