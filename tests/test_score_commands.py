@@ -132,6 +132,59 @@ def test_rows_of_other_episodes_than_test_ones_are_not_exported(tmp_path: Path) 
     assert not (tmp_path / "export").exists()
 
 
+def test_rows_without_a_revision_stand_beside_others_and_are_not_paired(tmp_path: Path) -> None:
+    """Released rows name no revision: their buffers may be others than those of one's own runs."""
+    rows = [replace(r, simulator="robomme") for r in made.rows()]
+    base = [r for r in rows if r.system == made.BASE]
+    retrieval = [r for r in rows if r.system == made.RETRIEVAL]
+    assert len(export(read_rollouts([made.write_csv(tmp_path / "all.csv", rows)]), tmp_path)) == 3
+    own = made.write_csv(tmp_path / "own.csv", base)
+    other = tmp_path / f"{made.RETRIEVAL}-robomme_rollouts.csv"
+    page = tmp_path / "out" / "report.html"
+
+    def scored(*paths: Path) -> Any:
+        done = run(
+            *("score", *paths, "--system", made.RETRIEVAL, "--grid", "given"),
+            *("--out", tmp_path / "out", "--json"),
+        )
+        assert done.exit_code == 0, done.output
+        value = json.loads(done.stdout)
+        pairs = {(r["system"], r["against_system"]) for r in value["tables"]["effects"]}
+        assert all(note in done.stderr.replace("\n", " ") for note in value["notes"])
+        return pairs, value["notes"]
+
+    inside = {(made.BASE, made.BASE), (made.RETRIEVAL, made.RETRIEVAL)}
+    note = (
+        f"{made.RETRIEVAL} and {made.BASE} in robomme are not paired: the rows of "
+        f"{made.RETRIEVAL} name no revision of a split, so their histories may differ"
+    )
+    for paths in ([own, other], [other, own]):
+        assert scored(*paths) == (inside, [note])
+        assert note in page.read_text(encoding="utf-8")
+    pinned = made.write_csv(tmp_path / "retrieval.csv", retrieval)
+    assert scored(own, pinned) == (inside | {(made.RETRIEVAL, made.BASE)}, [])
+    assert "are not paired" not in page.read_text(encoding="utf-8")
+
+
+def test_rows_of_one_system_with_and_without_a_revision_do_not_mix(tmp_path: Path) -> None:
+    rows = [r for r in made.rows() if r.system == made.RETRIEVAL]
+    half = made.write_csv(tmp_path / "half.csv", rows[:12])
+    (other,) = export(read_rollouts([made.write_csv(tmp_path / "b.csv", rows[12:])]), tmp_path)
+    for paths in ([half, other], [other, half]):
+        with pytest.raises(InvalidOptionError) as raised:
+            score(paths, system=made.RETRIEVAL, lenient=True)
+        assert str(raised.value).startswith(
+            f"some rows of {made.RETRIEVAL} in tabletop are of the split with revision "
+            f"{made.REVISION}, others name no revision"
+        )
+    again = made.write_csv(tmp_path / "again.csv", rows[12:])
+    found = json.loads(run("compare", again, other, "--system-b", made.RETRIEVAL, "--json").stdout)
+    assert found["notes"] == [
+        "Only one of the runs names the revision of its split of tabletop: the histories may "
+        "differ."
+    ]
+
+
 def test_lenient_on_the_command_line(tmp_path: Path) -> None:
     lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,MoveCub,k0,1,8,easy,fail,0,9"]
     path = made.released(tmp_path / "a.csv", lines)

@@ -71,6 +71,8 @@ class Checker:
         simulators: Names by code, in the order in which they were first seen; so are `systems`
             and `model_seeds`.
         revisions: Simulator to the revision of its rows, as far as rows name one.
+        pinned: Codes of simulator and system of the rows that name a revision.
+        unpinned: The same of those that name none.
         difficulty: Code by episode, −1 where no row tells: a row per `episode_group`, a column per
             index.
         seeds: Seed of the scene, likewise.
@@ -82,6 +84,8 @@ class Checker:
         self.systems: list[str] = []
         self.model_seeds: list[int] = []
         self.revisions: dict[str, str] = {}
+        self.pinned: set[tuple[int, int]] = set()
+        self.unpinned: set[tuple[int, int]] = set()
         self._width = 0
         self.difficulty = np.zeros((0, 0), np.int8)
         self.seeds = np.zeros((0, 0), np.int64)
@@ -124,6 +128,10 @@ class Checker:
         packed = pack(**{name: np.maximum(code, 0) for name, code in codes.items()})
         packed = np.broadcast_to(packed, batch.rows).copy()
         packed[list(rows.reasons)] = REFUSED
+        sound = packed[packed != REFUSED]
+        pairs, _ = distinct(field(sound, "simulator") << BITS["system"] | field(sound, "system"))
+        said = self.pinned if "revision" in source.columns else self.unpinned
+        said.update(divmod(pair, 2 ** BITS["system"]) for pair in pairs.tolist())
         return packed, rows.reasons
 
     def _simulator(self, value: str | None) -> int:

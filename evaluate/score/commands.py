@@ -69,6 +69,8 @@ def score(
         MESSAGES.print(f"left out: {refusal}")
     if found.rollouts.refused:
         MESSAGES.print(f"{found.rollouts.refused:,} bad rows left out")
+    for note in found.notes:
+        MESSAGES.print(note)
     with MESSAGES.status("Drawing the figures"):
         command = shlex.join(["robomme-interference", *sys.argv[1:]])
         exported = write_outputs(found, out, export_to, system, command)
@@ -88,6 +90,7 @@ def _as_dict(found: "Score") -> dict[str, Any]:
         "headlines": {simulator: headline(found, simulator) for simulator in found.expected},
         "rows": len(found.rollouts.packed),
         "bad_rows": found.rollouts.refused,
+        "notes": list(found.notes),
         "grid": found.grid,
         "tables": {name: table.records() for name, table in found.tables.items()},
     }

@@ -162,4 +162,11 @@ def _notes(one: Rollouts, other: Rollouts) -> tuple[str, ...]:
         for simulator, revision in one.revisions.items()
         if other.revisions.get(simulator, revision) != revision
     ]
-    return tuple(differing)
+    unknown = [
+        f"Only one of the runs names the revision of its split of {simulator}: the histories may "
+        "differ."
+        for simulator in one.simulators
+        if simulator in other.simulators
+        and (simulator in one.revisions) != (simulator in other.revisions)
+    ]
+    return (*differing, *unknown)

@@ -207,6 +207,8 @@ def _facts(score: Score, command: str | None) -> list[_Fact]:
         told["model seeds"] = ", ".join(map(str, rollouts.model_seeds[:20]))
     for simulator, revision in rollouts.revisions.items():
         told[f"revision of the split, {simulator}"] = revision
+    if score.notes:
+        told["note"] = "; ".join(score.notes)
     if rollouts.refused:
         named = "; ".join(map(str, rollouts.refusals))
         told["bad rows left out"] = f"{rollouts.refused:,}: {named}"

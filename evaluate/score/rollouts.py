@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.errors import BadRowsError, InvalidOptionError
 from robomme_interference_data.evaluate.score.batches import Batch
 from robomme_interference_data.evaluate.score.check import (
     BITS,
@@ -55,6 +55,7 @@ class Rollouts:
         difficulty: Code by episode, −1 unknown; see `Rollouts.difficulty_of`.
         seeds: Seed of the scene by episode, −1 unknown, likewise.
         revisions: Simulator to the revision of its split, where rows name one.
+        unpinned: Simulator and system of rows that name no revision, as released ones.
         videos: Packed row, its status left out, to the video of it.
         sources: The files that were read.
         refusals: The first bad rows that were skipped.
@@ -68,6 +69,7 @@ class Rollouts:
     difficulty: NDArray[np.int8]
     seeds: NDArray[np.int64]
     revisions: dict[str, str]
+    unpinned: frozenset[tuple[str, str]]
     videos: dict[int, Path]
     sources: tuple[Source, ...]
     refusals: tuple[Refusal, ...] = ()
@@ -195,6 +197,7 @@ def read_rollouts(
             range, a success that contradicts the status, the same rollout twice, rows of
             different splits, or an episode with two seeds or difficulties.
         InvalidIdError, UnknownNameError: `system` is no name of a system; see `name_system`.
+        InvalidOptionError: Some rows of a system name the revision of their split, others none.
         MissingFileError: There is no such file.
         FormatError: A file cannot be read, lacks columns, or has some of a type that does not fit.
     """
@@ -204,6 +207,7 @@ def read_rollouts(
     checker, reader = Checker(system), _Reader(lenient)
     for source in sources:
         reader.read(source, checker)
+    _check_revisions(checker)
     packed = reader.joined()
     orders = {
         "simulator": _ranks(checker.simulators, lambda name: name),
@@ -222,6 +226,7 @@ def read_rollouts(
         _regrouped(checker.difficulty, by_name),
         _regrouped(checker.seeds, by_name),
         dict(sorted(checker.revisions.items())),
+        frozenset((checker.simulators[s], checker.systems[n]) for s, n in checker.unpinned),
         _kept_videos(videos, packed),
         tuple(sources),
         tuple(reader.refusals),
@@ -231,6 +236,17 @@ def read_rollouts(
 
 def _place(path: Path, line: int) -> str:
     return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
+
+
+def _check_revisions(checker: Checker) -> None:
+    """Refuse to join, as one system's, rows whose histories may differ (protocol, rule 5)."""
+    for simulator, system in sorted(checker.pinned & checker.unpinned):
+        name = checker.simulators[simulator]
+        raise InvalidOptionError(
+            f"some rows of {checker.systems[system]} in {name} are of the split with revision "
+            f"{checker.revisions[name]}, others name no revision, as released rows do",
+            "Their histories may differ: score the files apart, or compare them.",
+        )
 
 
 def _kept_videos(
