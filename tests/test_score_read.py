@@ -167,6 +167,28 @@ def test_lines_are_right_in_every_block(tmp_path: Path, monkeypatch: pytest.Monk
     assert (found.refused, len(found.packed)) == (4, 36)
 
 
+def test_lines_are_right_after_quoted_line_breaks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "_BLOCK", 600)  # about three rows: some end inside quotes
+    rows = [replace(row, goal="do\nit" if row.episode % 2 else "do") for row in made.rows()[:20]]
+    rows[5] = replace(rows[5], goal='a "long\r\n\nstory"')
+    rows[7] = replace(rows[7], family="X")
+    rows[15] = rows[14]
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    lines = path.read_bytes().decode().splitlines(keepends=True)
+    begins = [n for n, line in enumerate(lines, 1) if line.startswith(made.BASE)]
+    lines[begins[18] - 1] = "too,short\n"
+    path.write_bytes("".join(lines).encode())
+    found = read_rollouts([path], lenient=True)
+    assert len(begins) == 20 and len(found.packed) == 17
+    assert sorted((r.line, r.reason.partition(" ")[0]) for r in found.refusals) == [
+        (begins[7], "unknown"),
+        (begins[15], "the"),
+        (begins[18], "the"),
+    ]
+
+
 def test_rows_of_parquet_are_counted_from_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

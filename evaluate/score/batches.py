@@ -1,9 +1,13 @@
 """Stream the rows of CSV and parquet files in batches of bounded size."""
 
 import codecs
+import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +30,11 @@ class Batch:
     Attributes:
         columns: Name to values, dictionary-encoded text or plain numbers, all equally long.
         rows: How many rows.
-        first: Line of the first row if all lines before are rows; 1 is the header of a CSV, or
+        first: Number of the first row if all before it are rows; 1 is the header of a CSV, or
             the first row of a parquet file.
-        malformed: Line and reason of the lines found since the last batch that are no rows.
-        skipped: All such lines so far, in order.
+        malformed: Line and reason of what was found since the last batch and is no row.
+        skipped: Number and reason of all such so far, in order.
+        line_of: From such a number to the line of the file.
     """
 
     columns: dict[str, Any]
@@ -37,13 +42,44 @@ class Batch:
     first: int
     malformed: Sequence[tuple[int, str]] = ()
     skipped: Sequence[tuple[int, str]] = ()
+    line_of: Callable[[int], int] = int
 
     def line(self, row: int) -> int:
-        """Return the line on which a row stands; the row of a parquet file, from 1."""
-        line = self.first + row
+        """Return the line on which a row begins; the row of a parquet file, from 1."""
+        number = self.first + row
         for skipped, _ in self.skipped:
-            line += skipped <= line
-        return line
+            number += skipped <= number
+        return self.line_of(number)
+
+
+class _Lines:
+    """Where the rows of a CSV begin, read only if somebody asks: quoted text may hold lines."""
+
+    def __init__(self, path: Path):
+        self._path = path
+
+    def __call__(self, number: int) -> int:
+        """Return the line on which a row begins; the header is row 1."""
+        place = bisect_left(self._longer, (number, 0)) - 1
+        return number + (self._longer[place][1] if place >= 0 else 0)
+
+    @cached_property
+    def _longer(self) -> list[tuple[int, int]]:
+        """Rows of several lines, each with the lines that it and those before have too many."""
+        with self._path.open("rb") as file:
+            if not any(b'"' in block for block in iter(partial(file.read, _BLOCK), b"")):
+                return []
+        longer: list[tuple[int, int]] = []
+        with (
+            self._path.open(encoding="utf-8", errors="replace", newline="") as text,
+            suppress(csv.Error),
+        ):
+            # A cell longer than the csv module reads ends it: later lines are then uncertain.
+            reader = csv.reader(text)
+            for number, _ in enumerate(reader, 1):
+                if reader.line_num - number > (longer[-1][1] if longer else 0):
+                    longer.append((number, reader.line_num - number))
+        return longer
 
 
 def parquet_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
@@ -67,16 +103,20 @@ def csv_schema(path: Path) -> Any:
 def csv_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
     """Yield the rows of a CSV, all as text; `columns` has our names, each to the file's."""
     skipped: list[tuple[int, str]] = []
-    first, seen = 2, 0
+    first, seen, line_of = 2, 0, _Lines(path)
+
+    def malformed() -> list[tuple[int, str]]:
+        return [(line_of(number), reason) for number, reason in skipped[seen:]]
+
     with _open_csv(path, list(columns.values()), skipped) as reader:
         for batch in reader:
             found = {name: batch.column(there) for name, there in columns.items()}
             # pyarrow reads ahead: some of them may stand after these rows.
-            yield Batch(found, len(batch), first, skipped[seen:], skipped)
+            yield Batch(found, len(batch), first, malformed(), skipped, line_of)
             first += len(batch)
             seen = len(skipped)
     if skipped[seen:]:
-        yield Batch({}, 0, first, skipped[seen:], skipped)
+        yield Batch({}, 0, first, malformed())
 
 
 class _Text(io.RawIOBase):
@@ -121,7 +161,9 @@ def _open_csv(path: Path, columns: list[str] | None, skipped: list[tuple[int, st
     return pa_csv.open_csv(
         _Text(path),
         read_options=pa_csv.ReadOptions(use_threads=False, block_size=_BLOCK),
-        parse_options=pa_csv.ParseOptions(ignore_empty_lines=False, invalid_row_handler=note),
+        parse_options=pa_csv.ParseOptions(
+            ignore_empty_lines=False, newlines_in_values=True, invalid_row_handler=note
+        ),
         convert_options=pa_csv.ConvertOptions(
             column_types=dict.fromkeys(columns or [], text),
             include_columns=columns or [],
