@@ -27,6 +27,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
+from robomme_interference_data.bootstrap import _drawn
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA
 from robomme_interference_data.evaluate.score.cells import main_markdown
@@ -165,7 +166,8 @@ def write_rows(path: Path, repeats: int) -> Path:
 
 
 def ours(rows: Path, out: Path, draws: int) -> None:
-    """Score with the package."""
+    """Score with the package, the draws made anew: it keeps them from one call to the next."""
+    _drawn.cache_clear()
     found = score([rows], draws=draws)
     write_tables(list(found.tables.values()), out, main_markdown(found.cells))
 

@@ -18,7 +18,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
 )
-from robomme_interference_data.evaluate.score import read, rollouts
+from robomme_interference_data.evaluate.score import batches, rollouts
 from robomme_interference_data.evaluate.score.check import BITS, REFUSED, field, pack
 from robomme_interference_data.evaluate.score.columns import distinct
 from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
@@ -113,6 +113,9 @@ def test_the_released_layout(tmp_path: Path) -> None:
             "episode '-1'; expected a whole number from 0 to",
         ),
         ("my-memory,MoveCube,k0,1.5,7,easy,fail,0,9", "episode '1.5'; expected a whole number"),
+        ("my-memory,MoveCube,k0,1_0,7,easy,fail,0,9", "episode '1_0'; expected a whole number"),
+        ("my-memory,MoveCube,k0,٣,7,easy,fail,0,9", "episode '٣'; expected a whole number"),
+        ("my-memory,MoveCube,k0, 3,7,easy,fail,0,9", "episode ' 3'; expected a whole number"),
         (
             "my-memory,MoveCube,k0,131072,7,easy,fail,0,9",
             "episode '131072'; expected a whole number",
@@ -153,7 +156,7 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
 
 
 def test_lines_are_right_in_every_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(read, "_BLOCK", 150)  # about three rows
+    monkeypatch.setattr(batches, "_BLOCK", 150)  # about three rows
     lines = [f"my-memory,MoveCube,k0,{number},{number},easy,fail,0,9" for number in range(40)]
     for broken in (4, 11, 25):
         lines[broken] = "only,three,fields"
@@ -164,10 +167,32 @@ def test_lines_are_right_in_every_block(tmp_path: Path, monkeypatch: pytest.Monk
     assert (found.refused, len(found.packed)) == (4, 36)
 
 
+def test_lines_are_right_after_quoted_line_breaks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "_BLOCK", 600)  # about three rows: some end inside quotes
+    rows = [replace(row, goal="do\nit" if row.episode % 2 else "do") for row in made.rows()[:20]]
+    rows[5] = replace(rows[5], goal='a "long\r\n\nstory"')
+    rows[7] = replace(rows[7], family="X")
+    rows[15] = rows[14]
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    lines = path.read_bytes().decode().splitlines(keepends=True)
+    begins = [n for n, line in enumerate(lines, 1) if line.startswith(made.BASE)]
+    lines[begins[18] - 1] = "too,short\n"
+    path.write_bytes("".join(lines).encode())
+    found = read_rollouts([path], lenient=True)
+    assert len(begins) == 20 and len(found.packed) == 17
+    assert sorted((r.line, r.reason.partition(" ")[0]) for r in found.refusals) == [
+        (begins[7], "unknown"),
+        (begins[15], "the"),
+        (begins[18], "the"),
+    ]
+
+
 def test_rows_of_parquet_are_counted_from_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(read, "_BATCH", 10)
+    monkeypatch.setattr(batches, "_BATCH", 10)
     table = pa.Table.from_pylist([row.as_dict() for row in made.rows()])
     names = table["family"].to_pylist()
     names[17] = "Unknown"
@@ -190,18 +215,57 @@ def test_a_duplicate_in_another_file_names_both_places(tmp_path: Path) -> None:
     rows = made.rows()
     paths = [
         made.write_csv(tmp_path / "one.csv", rows[:50]),
-        made.write_csv(
-            tmp_path / "two.csv", [rows[60], replace(rows[8], status="timeout", success=False)]
-        ),
+        made.write_csv(tmp_path / "two.csv", [rows[60], rows[8]]),
     ]
     with pytest.raises(BadRowsError) as raised:
         read_rollouts(paths)
-    assert f"{paths[1]}, line 3: the same rollout as {paths[0]}, line 10" in str(raised.value)
+    assert raised.value.message.splitlines() == [
+        "1 bad row:",
+        f"{paths[1]}, line 3: the same rollout as {paths[0]}, line 10",
+    ]
     found = read_rollouts(paths, lenient=True)
     assert (len(found.packed), found.refused) == (51, 1)
-    # The first one stays.
-    expected = read_rollouts([paths[0]])
-    assert set(expected.packed.tolist()) < set(found.packed.tolist())
+    # Equal rows: one stays, and counts.
+    expected = read_rollouts([made.write_csv(tmp_path / "all.csv", [*rows[:50], rows[60]])])
+    assert np.array_equal(found.packed, expected.packed)
+
+
+def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -> None:
+    rows = made.rows()
+    other = replace(rows[8], status="timeout", success=False)  # rows[8] failed
+    one = made.write_csv(tmp_path / "one.csv", rows[:50])
+    two = made.write_csv(tmp_path / "two.csv", [other, rows[60]])
+    three = made.write_csv(tmp_path / "three.csv", [rows[3], rows[8]])
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([one, two, three])
+    more = "; its rows contradict each other"
+    assert raised.value.message.splitlines() == [
+        "4 bad rows:",
+        f"{one}, line 10: the same rollout as {two}, line 2{more}",
+        f"{two}, line 2: the same rollout as {one}, line 10{more}",
+        f"{three}, line 2: the same rollout as {one}, line 5",
+        f"{three}, line 3: the same rollout as {one}, line 10{more}",
+    ]
+    kept = [*rows[:8], *rows[9:50], rows[60]]
+    expected = read_rollouts([made.write_csv(tmp_path / "kept.csv", kept)])
+    for paths in ([one, two, three], [three, two, one], [two, one, three]):
+        found = read_rollouts(paths, lenient=True)
+        assert np.array_equal(found.packed, expected.packed)
+        assert found.refused == 4
+
+
+def test_videos_are_those_of_rows_that_stay(tmp_path: Path) -> None:
+    rows = [replace(row, video=f"{row.episode}.mp4") for row in made.rows()[:3]]
+    changed = replace(rows[1], status="success", success=True, video="x.mp4")  # it failed
+    folders = [tmp_path / name for name in "ab"]
+    for folder, given_rows in zip(folders, (rows, [changed, rows[2]]), strict=True):
+        folder.mkdir()
+        made.write_parquet(folder / "rollouts.parquet", given_rows)
+        (folder / "run.json").write_text('{"format_version": 1}')
+    for paths in (folders, folders[::-1]):
+        found = read_rollouts(paths, lenient=True)
+        assert len(found.packed) == 2
+        assert sorted(found.videos.values()) == [folders[0] / "0.mp4", folders[0] / "2.mp4"]
 
 
 @pytest.mark.parametrize(
@@ -239,6 +303,36 @@ def test_simulators_have_revisions_and_scenes_of_their_own(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("../escaped", "'../escaped' is not the name of a simulator; expected up to 128 letters"),
+        ("a/b", "'a/b' is not the name"),
+        (".hidden", "'.hidden' is not the name"),
+        ("", "'' is not the name"),
+        ("x" * 129, "is not the name"),
+        ("RoboMME", "there is no simulator 'RoboMME'. Did you mean 'robomme'?"),
+        ("Tabletop", "Did you mean 'tabletop'?"),
+    ],
+)
+def test_a_simulator_has_a_name_that_a_file_can_have(
+    tmp_path: Path, name: str, reason: str
+) -> None:
+    rows = made.rows()
+    rows[3] = replace(rows[3], simulator=name)
+    with pytest.raises(BadRowsError) as raised:
+        read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    first = raised.value.message.splitlines()[1]
+    assert first.startswith(f"{tmp_path / 'a.csv'}, line 5: ") and reason in first
+
+
+def test_simulators_of_ones_own_are_named_as_runs_name_them(tmp_path: Path) -> None:
+    names = ("my_package.kitchen:make_simulator", "_doubles:make", "sim-2.1", "x" * 128)
+    rows = [replace(r, simulator=name) for name in names for r in made.rows()[:2]]
+    found = read_rollouts([made.write_csv(tmp_path / "a.csv", rows)])
+    assert found.simulators == tuple(sorted(names))
+
+
+@pytest.mark.parametrize(
     ("header", "message"),
     [
         ("family,condition,episode,status", "lacks the columns success"),
@@ -246,8 +340,8 @@ def test_simulators_have_revisions_and_scenes_of_their_own(tmp_path: Path) -> No
         ("system,simulatr,family,condition,episode,status,success", "has the column 'simulatr'"),
         ("system,family,family,condition,episode,status,success", "two columns of one name"),
         (
-            "system,simulator,family,condition,episode,status,success",
-            "lacks the columns split, rev",
+            "system,simulator,split,family,condition,episode,status,success",
+            "lacks the columns revision, episode_split, model_seed, protocol_version;",
         ),
     ],
 )
@@ -262,7 +356,7 @@ def test_files_without_what_is_needed_are_refused(
     assert raised.value.hint
 
 
-def test_missing_and_damaged_files(tmp_path: Path) -> None:
+def test_missing_and_damaged_files(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(MissingFileError, match="there is no file or folder"):
         read_rollouts([tmp_path / "nowhere"])
     with pytest.raises(
@@ -275,6 +369,16 @@ def test_missing_and_damaged_files(tmp_path: Path) -> None:
     (tmp_path / "picture.csv").write_bytes(b"a,b\n1,\xff\n")
     with pytest.raises(FormatError, match=r"picture\.csv cannot be read: byte 6 is not UTF-8 text"):
         read_rollouts([tmp_path / "picture.csv"])
+    # A byte that is no text in a line with too few fields, in a later block.
+    whole = made.write_csv(tmp_path / "late.csv", made.rows()).read_bytes()
+    (tmp_path / "late.csv").write_bytes(whole * 1200 + b"x" * 70_000 + b"\xe9,x\n" + whole)
+    place = 1200 * len(whole) + 70_000
+    with pytest.raises(FormatError, match=rf"late\.csv cannot be read: byte {place} is not UTF-8"):
+        read_rollouts([tmp_path / "late.csv"], lenient=True)
+    assert capfd.readouterr().err == ""
+    (tmp_path / "cut.csv").write_bytes(b"a,b\n1,\xc3")
+    with pytest.raises(FormatError, match=r"cut\.csv cannot be read: byte 6 is not UTF-8 text"):
+        read_rollouts([tmp_path / "cut.csv"])
     (tmp_path / "rows.txt").touch()
     with pytest.raises(FormatError, match=r"neither \.csv nor \.parquet"):
         read_rollouts([tmp_path / "rows.txt"])

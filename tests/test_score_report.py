@@ -1,8 +1,10 @@
 """The report, opened and clicked in a browser; and the figures in it."""
 
 import html
+import platform
 import re
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -27,7 +29,7 @@ VIDEO = "videos/MoveCube/k0 #0.mp4"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run, with one video that is there and one that is not."""
-    folder = tmp_path_factory.mktemp("runs") / "my run"
+    folder = tmp_path_factory.mktemp("runs_with_a_name_that_no_browser_would_break") / "my run"
     (folder / VIDEO).parent.mkdir(parents=True)
     (folder / VIDEO).write_bytes(b"video")
     rows = made.rows()
@@ -37,7 +39,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made.write_parquet(folder / "rollouts.parquet", rows)
     record = {
         "format_version": 1,
-        "command": ["robomme-interference", "evaluate", "--out", "my run"],
+        "command": [
+            "robomme-interference evaluate --out 'my run' --shard 1/2",
+            "robomme-interference evaluate --out 'my run' --shard 2/2",
+        ],
         "versions": {"python": "3.12.0", "numpy": "2.2.0"},
         "split": "made-up",
         "revision": made.REVISION,
@@ -138,16 +143,34 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert page.complaints() == []
 
 
+def test_the_report_fits_a_narrow_window(report: Path) -> None:
+    with open_page() as page:
+        page.call(
+            "Emulation.setDeviceMetricsOverride",
+            **{"width": 400, "height": 900, "deviceScaleFactor": 1, "mobile": True},
+        )
+        page.open(report)
+        assert page.run("document.documentElement.scrollWidth") == 400
+
+
 def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
     text = report.read_text(encoding="utf-8")
     for shown in (
-        "robomme-interference evaluate --out &#39;my run&#39;",
+        # One line for each shard of a joined run, to be copied as it was typed.
+        "<pre><code>robomme-interference evaluate --out 'my run' --shard 1/2</code></pre>"
+        "<pre><code>robomme-interference evaluate --out 'my run' --shard 2/2</code></pre>",
+        # From Python there is no command: the call stands in its place.
+        f"<pre><code>score([{str(run)!r}], system=None, lenient=False, grid='given', "
+        "against_paper=False, draws=500)</code></pre>",
+        "500 draws, seeded by the simulator",
+        f"Python {platform.python_version()}, robomme-interference-data ",
+        *(f"{name} {metadata.version(name)}" for name in ("numpy", "pyarrow", "matplotlib")),
         "numpy 2.2.0, python 3.12.0",
         sha256_file(run / "rollouts.parquet"),
         made.REVISION,
         "those that any of the given rows is of",
     ):
-        assert shown in text
+        assert shown in html.unescape(text)
     assert "<script>alert" not in text and html.escape("<script>alert(1)") in text
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
 
@@ -215,6 +238,28 @@ def test_episode_rows_show_every_outcome(tmp_path: Path) -> None:
     own = {row.episode: row.outcomes for row in listed if row.system == made.OWN}
     assert own["MoveCube/test/2"] == {"no-history": "fail", "k0": "0/1"}  # the other one broke
     assert own["MoveCube/test/5"] == {"no-history": "fail"}
+
+
+def test_each_rollout_has_its_video_whatever_seeds_others_have(tmp_path: Path) -> None:
+    first = next(r for r in made.rows() if (r.system, r.condition) == (made.BASE, "k0"))
+    given = {  # run to rows of (episode, model seed, video)
+        "a": [(0, 0, "a0.mp4")],
+        "b": [(1, 5, "b1.mp4"), (2, 5, "gone.mp4"), (2, 7, "b2.mp4"), (2, 9, "b9.mp4")],
+    }
+    for name, rollouts in given.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").write_text('{"format_version": 1}')
+        rows = [
+            replace(first, episode=episode, seed=episode, model_seed=model, video=video)
+            for episode, model, video in rollouts
+        ]
+        made.write_parquet(tmp_path / name / "rollouts.parquet", rows)
+        for _, _, video in rollouts:
+            if video != "gone.mp4":
+                (tmp_path / name / video).touch()
+    found = score([tmp_path / "a", tmp_path / "b"], grid=Grid.GIVEN, draws=10)
+    listed = list(episode_rows(found.outcomes, found.rollouts, tmp_path))
+    assert [row.videos for row in listed] == [{"k0": f"{v}.mp4"} for v in ("a/a0", "b/b1", "b/b2")]
 
 
 def test_no_two_systems_of_the_paper_look_alike() -> None:

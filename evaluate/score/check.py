@@ -1,5 +1,6 @@
 """Judge rows, and pack each into one 64-bit number."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -9,9 +10,11 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS, SPLITS
 from robomme_interference_data.errors import nearest
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, condition_rank
+from robomme_interference_data.evaluate.score.batches import Batch
 from robomme_interference_data.evaluate.score.columns import Codes, Rows, distinct
-from robomme_interference_data.evaluate.score.read import Batch, Source
+from robomme_interference_data.evaluate.score.read import RELEASED_SIMULATOR, Source
 from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.simulators.registry import SIMULATORS
 
 __all__ = ["BITS", "DIFFICULTIES", "REFUSED", "STATUSES", "Checker", "field", "pack"]
 
@@ -43,6 +46,10 @@ _WORDS: dict[Any, bool | None] = {"": None, "none": None, "nan": None}
 _WORDS |= dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 
 
+_SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
+"""Names of files hold it, so no `/`. A simulator of one's own is `module:function` in rows."""
+
+
 def pack(**codes: Codes | int) -> NDArray[np.uint64]:
     """Pack codes into numbers; fields that are not given are zero."""
     packed: Any = np.uint64(0)
@@ -64,17 +71,21 @@ class Checker:
         simulators: Names by code, in the order in which they were first seen; so are `systems`
             and `model_seeds`.
         revisions: Simulator to the revision of its rows, as far as rows name one.
+        pinned: Codes of simulator and system of the rows that name a revision.
+        unpinned: The same of those that name none.
         difficulty: Code by episode, −1 where no row tells: a row per `episode_group`, a column per
             index.
         seeds: Seed of the scene, likewise.
     """
 
     def __init__(self, system: str | None = None):
-        self._system = system
+        self._default = system
         self.simulators: list[str] = []
         self.systems: list[str] = []
         self.model_seeds: list[int] = []
         self.revisions: dict[str, str] = {}
+        self.pinned: set[tuple[int, int]] = set()
+        self.unpinned: set[tuple[int, int]] = set()
         self._width = 0
         self.difficulty = np.zeros((0, 0), np.int8)
         self.seeds = np.zeros((0, 0), np.int64)
@@ -82,20 +93,18 @@ class Checker:
     def pack(self, batch: Batch, source: Source) -> tuple[NDArray[np.uint64], dict[int, str]]:
         """Return the packed rows, `REFUSED` for bad ones, and the reason for each bad row."""
         rows = Rows(batch)
-        default = None if "system" in source.columns else self._system
+        default = None if "system" in source.columns else self._default
         codes = {
-            "simulator": rows.text(
-                "simulator", self._named(self.simulators, "simulator"), "robomme"
-            ),
-            "system": rows.text("system", self._named_system, default),
-            "condition": rows.text("condition", _condition),
-            "family": rows.text("family", _family),
-            "episode_split": rows.text("episode_split", _split, "test"),
+            "simulator": rows.code("simulator", self._simulator, RELEASED_SIMULATOR),
+            "system": rows.code("system", self._system, default),
+            "condition": rows.code("condition", _condition),
+            "family": rows.code("family", _family),
+            "episode_split": rows.code("episode_split", _split, "test"),
             "episode": rows.number("episode", 2 ** BITS["episode"] - 1),
             "model_seed": self._seeds(rows),
-            "status": rows.text("status", _status),
+            "status": rows.code("status", _status),
         }
-        success = rows.text("success", _success)
+        success = rows.code("success", _success)
         rows.refuse(
             (success >= 0) & (codes["status"] >= 0) & (success != _EXPECTED[codes["status"]]),
             lambda row: (
@@ -103,7 +112,7 @@ class Checker:
                 f"{rows.shown('status', row)}"
             ),
         )
-        rows.number("steps", MAX_STEPS, default=0)
+        rows.number("steps", MAX_STEPS, absent=0, empty=0)
         if "protocol_version" in batch.columns:
             version = rows.number("protocol_version", 2**31)
             rows.refuse(
@@ -119,30 +128,35 @@ class Checker:
         packed = pack(**{name: np.maximum(code, 0) for name, code in codes.items()})
         packed = np.broadcast_to(packed, batch.rows).copy()
         packed[list(rows.reasons)] = REFUSED
+        sound = packed[packed != REFUSED]
+        pairs, _ = distinct(field(sound, "simulator") << BITS["system"] | field(sound, "system"))
+        said = self.pinned if "revision" in source.columns else self.unpinned
+        said.update(divmod(pair, 2 ** BITS["system"]) for pair in pairs.tolist())
         return packed, rows.reasons
 
-    def _named(self, names: list[str], what: str) -> Callable[[Any], int]:
-        def code(value: Any) -> int:
-            if not value:
-                raise ValueError(f"{what} is empty")
-            if value not in names:
-                if len(names) == 2 ** BITS[what]:
-                    raise ValueError(f"more than {2 ** BITS[what]} values of {what}")
-                names.append(value)
-            return names.index(value)
+    def _simulator(self, value: str | None) -> int:
+        name = value or ""
+        if name not in SIMULATORS and name.lower() in SIMULATORS:
+            raise ValueError(f"there is no simulator {name!r}. Did you mean {name.lower()!r}?")
+        if not _SIMULATOR.fullmatch(name):
+            raise ValueError(
+                f"{name!r} is not the name of a simulator; expected up to 128 letters, digits, "
+                "'.', '_', '-' and ':'"
+            )
+        return _code(name, self.simulators, "simulator")
 
-        return code
-
-    def _named_system(self, value: Any) -> int:
+    def _system(self, value: str | None) -> int:
         if value in self.systems:
             return self.systems.index(value)
-        return self._named(self.systems, "system")(name_system(value or "").name)
+        return _code(name_system(value or "").name, self.systems, "system")
 
     def _seeds(self, rows: Rows) -> Codes:
-        seeds = rows.number("model_seed", 2**62, default=0)
+        seeds = rows.number("model_seed", 2**62, absent=0)
         values, place = distinct(seeds)
         codes = np.zeros(len(values), np.int64)
         for index, value in enumerate(values.tolist()):
+            if value < 0:  # refused
+                continue
             if value not in self.model_seeds:
                 self.model_seeds.append(value)
             codes[index] = self.model_seeds.index(value)
@@ -152,7 +166,7 @@ class Checker:
 
     def _check_revisions(self, rows: Rows, simulator: Codes) -> None:
         revisions: list[str] = []
-        code = rows.text("revision", lambda v: _revision(revisions, v))
+        code = rows.code("revision", lambda v: _revision(revisions, v))
         sound = (simulator >= 0) & (code >= 0)
         for pair in np.unique((simulator * max(len(revisions), 1) + code)[sound]).tolist():
             number, place = divmod(pair, len(revisions))
@@ -166,9 +180,9 @@ class Checker:
 
     def _check_episodes(self, rows: Rows, codes: dict[str, Codes]) -> None:
         """Hold seed and difficulty against what other rows of the same episode say."""
-        difficulty = rows.text("difficulty", _difficulty, default="")
+        difficulty = rows.code("difficulty", _difficulty, default="")
         difficulty = np.where(difficulty == _UNSAID, -1, difficulty)
-        seed = rows.number("seed", 2**62, default=-1)
+        seed = rows.number("seed", 2**62, absent=-1, empty=-1)
         episode = np.maximum(codes["episode"], 0)
         self._grow(int(episode.max(initial=0)))
         group = episode_group(*(np.maximum(codes[n], 0) for n in _GROUP))
@@ -209,6 +223,14 @@ _GROUP = ("simulator", "family", "episode_split")
 def episode_group(simulator: Any, family: Any, split: Any) -> Any:
     """Return the row of `Checker.difficulty` for codes of simulator, family and split."""
     return (simulator * len(FAMILIES) + family) * len(SPLITS) + split
+
+
+def _code(name: str, names: list[str], what: str) -> int:
+    if name not in names:
+        if len(names) == 2 ** BITS[what]:
+            raise ValueError(f"more than {2 ** BITS[what]} values of {what}")
+        names.append(name)
+    return names.index(name)
 
 
 def _beside(rows: Rows, known: str) -> Callable[[int], str]:

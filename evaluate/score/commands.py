@@ -1,6 +1,8 @@
 """The commands `score` and `compare`."""
 
 import json
+import shlex
+import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -59,24 +61,21 @@ def score(
     --out my-score
     """
     from robomme_interference_data.evaluate.score.cells import main_markdown
-    from robomme_interference_data.evaluate.score.export import export
-    from robomme_interference_data.evaluate.score.figures import draw_figures
-    from robomme_interference_data.evaluate.score.report import write_report
+    from robomme_interference_data.evaluate.score.outputs import write_outputs
     from robomme_interference_data.evaluate.score.scoring import score as compute
-    from robomme_interference_data.tables import write_tables
 
     found = compute(rows, system, lenient, grid, against is Against.PAPER)
     for refusal in found.rollouts.refusals:
         MESSAGES.print(f"left out: {refusal}")
     if found.rollouts.refused:
         MESSAGES.print(f"{found.rollouts.refused:,} bad rows left out")
-    write_tables(list(found.tables.values()), out / "tables", main_markdown(found.cells))
+    for note in found.notes:
+        MESSAGES.print(note)
     with MESSAGES.status("Drawing the figures"):
-        figures = draw_figures(found, out / "figures")
-        write_report(found, figures, out / "report.html")
-    if export_to is not None:
-        for path in export(found.rollouts, export_to, system):
-            MESSAGES.print(f"{path} written")
+        command = shlex.join(["robomme-interference", *sys.argv[1:]])
+        exported = write_outputs(found, out, export_to, system, command)
+    for path in exported:
+        MESSAGES.print(f"{path} written")
     if as_json:
         typer.echo(json.dumps(_as_dict(found), indent=2, ensure_ascii=False, allow_nan=False))
     else:
@@ -91,6 +90,7 @@ def _as_dict(found: "Score") -> dict[str, Any]:
         "headlines": {simulator: headline(found, simulator) for simulator in found.expected},
         "rows": len(found.rollouts.packed),
         "bad_rows": found.rollouts.refused,
+        "notes": list(found.notes),
         "grid": found.grid,
         "tables": {name: table.records() for name, table in found.tables.items()},
     }

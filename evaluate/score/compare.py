@@ -78,7 +78,7 @@ def compare(
                 if numbers := here.row(part):
                     names = (a.simulator, a.system, b.system, part or "all", here.condition)
                     rows.append((*names, *numbers))
-        if a.system == b.system and a.simulator not in _revised(one, other):
+        if a.system == b.system and _same_histories(a.simulator, one, other):
             notes += _noise(a, found, one, other)
     if not rows:
         raise InvalidOptionError(
@@ -202,16 +202,26 @@ def _of(part: str, episodes: NDArray[np.int64]) -> NDArray[np.bool_]:
     return families_of(episodes) == FAMILIES.index(part)
 
 
-def _revised(one: Rollouts, other: Rollouts) -> list[str]:
-    return [s for s, r in one.revisions.items() if other.revisions.get(s, r) != r]
+def _same_histories(simulator: str, one: Rollouts, other: Rollouts) -> bool:
+    """Whether the runs name one revision of a split, or neither names any."""
+    return one.revisions.get(simulator) == other.revisions.get(simulator)
 
 
 def _differing(one: Rollouts, other: Rollouts) -> Iterator[str]:
-    for simulator in _revised(one, other):
-        yield (
-            f"The rows of {simulator} are of different splits (revisions "
-            f"{one.revisions[simulator]} and {other.revisions[simulator]}): the histories differ."
-        )
+    for simulator in one.simulators:
+        if simulator not in other.simulators or _same_histories(simulator, one, other):
+            continue
+        revisions = [r.revisions.get(simulator) for r in (one, other)]
+        if None in revisions:
+            yield (
+                f"Only one of the runs names the revision of its split of {simulator}: the "
+                "histories may differ."
+            )
+        else:
+            yield (
+                f"The rows of {simulator} are of different splits (revisions {revisions[0]} and "
+                f"{revisions[1]}): the histories differ."
+            )
 
 
 def _noise(

@@ -63,6 +63,7 @@ def episode_rows(
     outcomes: Sequence[Outcomes], rollouts: Rollouts, page_folder: Path
 ) -> Iterator[EpisodeRow]:
     """Yield a row for each system and episode, in the order of tables."""
+    there = _videos(rollouts)
     for one in outcomes:
         histories = [i for i, c in enumerate(one.conditions) if c != NO_HISTORY]
         names = [one.conditions[i] for i in histories]
@@ -72,8 +73,7 @@ def episode_rows(
             for row, condition in enumerate(one.conditions):
                 if text := _outcome(one.counts[row, place].tolist()):
                     found[condition] = text
-                video = rollouts.videos.get(_key(rollouts, one, condition, packed))
-                if video is not None and video.is_file():
+                if video := there.get(_key(rollouts, one, condition, packed)):
                     videos[condition] = _link(video, page_folder)
             yield EpisodeRow(
                 one.simulator,
@@ -99,12 +99,22 @@ def _outcome(counts: list[int]) -> str:
     return f"{counts[SUCCESS]}/{scored}"
 
 
+def _videos(rollouts: Rollouts) -> dict[int, Path]:
+    """Return the videos that are there, by packed row without seed and status.
+
+    Of repeats it is the one with the lowest model seed among those that have one.
+    """
+    found: dict[int, Path] = {}
+    for key, video in sorted(rollouts.videos.items()):
+        if key >> BITS["model_seed"] not in found and video.is_file():
+            found[key >> BITS["model_seed"]] = video
+    return found
+
+
 def _key(rollouts: Rollouts, one: Outcomes, condition: str, packed: int) -> int:
-    """Return the key of the rollout with the lowest model seed, as `Rollouts.videos` has it."""
     codes = pack(
         simulator=rollouts.simulators.index(one.simulator),
         system=rollouts.systems.index(one.system),
         condition=condition_rank(condition) + 1,
     )
-    episode = packed << BITS["model_seed"]
-    return (int(codes) >> BITS["status"]) | episode
+    return int(codes) >> BITS["status"] + BITS["model_seed"] | packed

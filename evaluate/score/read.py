@@ -1,6 +1,5 @@
 """Open files of rollout rows and stream them, whatever wrote them; nothing is judged here."""
 
-import codecs
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -8,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
@@ -20,10 +18,23 @@ from robomme_interference_data.evaluate.log import (
     RUN_NAME,
 )
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, ROLLOUT_SCHEMA
+from robomme_interference_data.evaluate.score.batches import (
+    Batch,
+    csv_batches,
+    csv_schema,
+    parquet_batches,
+)
 from robomme_interference_data.files import read_json
 from robomme_interference_data.parquet import reading
 
-__all__ = ["COLUMNS", "RELEASED_COLUMNS", "Batch", "Source", "find_sources", "read_batches"]
+__all__ = [
+    "COLUMNS",
+    "RELEASED_COLUMNS",
+    "RELEASED_SIMULATOR",
+    "Source",
+    "find_sources",
+    "read_batches",
+]
 
 RELEASED_COLUMNS = (
     "family",
@@ -47,11 +58,16 @@ COLUMNS = (
 )
 """What scoring reads of a file, as far as it is there."""
 
+RELEASED_SIMULATOR = "robomme"
+"""The simulator of rows that name none."""
+
+_UNRELEASED = {"split", "revision", "episode_split", "model_seed", "protocol_version"}
+"""Columns that only rows of a run have. The released layout is without them, and without
+`simulator`, which exported rows of other simulators have as one column more."""
+
 _NEEDED = ("family", "condition", "episode", "status", "success")
+_NUMBERS = ("episode", "model_seed", "protocol_version", "seed", "steps")
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
-_BLOCK = 16 * 2**20  # bytes of CSV at a time
-_LOOKED_AT = 2**16  # bytes of CSV, to tell whether it is text
-_BATCH = 2**18  # rows of parquet at a time
 
 
 @dataclass(frozen=True)
@@ -63,42 +79,12 @@ class Source:
         folder: The folder of its run; None for a file that was given by itself.
         record: What `run.json` says about the run; empty without.
         columns: Name that scoring uses to name in the file.
-        released: Whether the file has the layout of the released CSVs: no simulator, split,
-            revision or model seed. Such rows are RoboMME's.
     """
 
     path: Path
     folder: Path | None
     record: Mapping[str, Any]
     columns: Mapping[str, str]
-    released: bool
-
-
-@dataclass
-class Batch:
-    """Consecutive rows of one file.
-
-    Attributes:
-        columns: Name to values, dictionary-encoded text or plain numbers, all equally long.
-        rows: How many rows.
-        first: Line of the first row if all lines before are rows; 1 is the header of a CSV, or
-            the first row of a parquet file.
-        malformed: Line and reason of the lines found since the last batch that are no rows.
-        skipped: All such lines so far, in order.
-    """
-
-    columns: dict[str, Any]
-    rows: int
-    first: int
-    malformed: Sequence[tuple[int, str]] = ()
-    skipped: Sequence[tuple[int, str]] = ()
-
-    def line(self, row: int) -> int:
-        """Return the line on which a row stands; the row of a parquet file, from 1."""
-        line = self.first + row
-        for skipped, _ in self.skipped:
-            line += skipped <= line
-        return line
 
 
 def find_sources(paths: Sequence[Path], with_system: bool = False) -> list[Source]:
@@ -140,9 +126,11 @@ def _source(path: Path, with_system: bool) -> Source:
         raise MissingFileError(f"there is no file or folder {path}", "Check the path.")
     if (path.parent / RUN_NAME).is_file() and path.name in (PARQUET_NAME, CSV_NAME):
         folder, record = path.parent, _record(path.parent / RUN_NAME)
-    names = _column_names(path)
-    released = "simulator" not in names
-    return Source(path, folder, record, _match(path, names, released, with_system), released)
+    schema = _schema(path)
+    columns = _match(path, schema.names, with_system)
+    if path.suffix.lower() == ".parquet":  # a CSV's cells are all text
+        _check_types(path, schema, columns)
+    return Source(path, folder, record, columns)
 
 
 def _record(path: Path) -> dict[str, Any]:
@@ -156,19 +144,19 @@ def _record(path: Path) -> dict[str, Any]:
     return record
 
 
-def _column_names(path: Path) -> list[str]:
+def _schema(path: Path) -> Any:
     if path.suffix.lower() == ".parquet":
         with reading(path):
-            return list(pq.read_schema(path).names)
+            return pq.read_schema(path)
     if path.suffix.lower() != ".csv":
         raise FormatError(
             f"{path} is neither .csv nor .parquet", "Rows are read from CSV and parquet files."
         )
-    with reading(path), _open_csv(path, None, []) as reader:
-        return list(reader.schema.names)
+    with reading(path):
+        return csv_schema(path)
 
 
-def _match(path: Path, names: list[str], released: bool, with_system: bool) -> dict[str, str]:
+def _match(path: Path, names: list[str], with_system: bool) -> dict[str, str]:
     """Return which column of the file is which of ours."""
     ours = {_ALIASES.get(name, name): name for name in names}
     known = [*ROLLOUT_SCHEMA.names, *_ALIASES]
@@ -178,7 +166,8 @@ def _match(path: Path, names: list[str], released: bool, with_system: bool) -> d
             what = f"the column {name!r}" if near else "two columns of one name"
             hint = f"Did you mean {near[0]!r}?" if near else "Rename one of them."
             raise FormatError(f"{path} has {what}", hint)
-    needed = _NEEDED if released else (*KEY_COLUMNS, *_NEEDED)
+    ran = "simulator" in ours and not _UNRELEASED.isdisjoint(ours)
+    needed = (*KEY_COLUMNS, *_NEEDED) if ran else _NEEDED
     missing = [name for name in dict.fromkeys(needed) if name not in ours]
     if missing:
         raise FormatError(
@@ -192,6 +181,26 @@ def _match(path: Path, names: list[str], released: bool, with_system: bool) -> d
             "--system-b).",
         )
     return {name: ours[name] for name in COLUMNS if name in ours}
+
+
+def _check_types(path: Path, schema: Any, columns: Mapping[str, str]) -> None:
+    """Refuse columns of a parquet file that hold neither text nor what they should."""
+    for name, there in columns.items():
+        kind = schema.field(there).type
+        kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+        sound = kind in (pa.string(), pa.large_string(), pa.null())
+        expected = "text"
+        if name in (*_NUMBERS, "success"):
+            sound |= pa.types.is_integer(kind) or kind in (pa.float32(), pa.float64())
+            expected = "numbers"
+        if name == "success":
+            sound |= pa.types.is_boolean(kind)
+            expected = "true and false"
+        if not sound:
+            raise FormatError(
+                f"{path}: the column {there!r} holds {kind}; expected {expected}",
+                "Write the file again with plain values in that column.",
+            )
 
 
 def read_batches(source: Source, columns: Sequence[str] | None = None) -> Iterator[Batch]:
@@ -208,74 +217,12 @@ def read_batches(source: Source, columns: Sequence[str] | None = None) -> Iterat
     chosen = source.columns if columns is None else _chosen(source, columns)
     with reading(source.path):
         if source.path.suffix.lower() == ".parquet":
-            yield from _parquet_batches(source.path, chosen)
+            yield from parquet_batches(source.path, chosen)
         else:
-            yield from _csv_batches(source.path, chosen)
+            yield from csv_batches(source.path, chosen)
 
 
 def _chosen(source: Source, columns: Sequence[str]) -> dict[str, str]:
-    present = set(_column_names(source.path))
+    present = set(_schema(source.path).names)
     named = {name: source.columns.get(name, name) for name in columns}
     return {name: there for name, there in named.items() if there in present}
-
-
-def _parquet_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
-    schema = pq.read_schema(path)
-    texts = [name for name in columns.values() if pa.types.is_string(schema.field(name).type)]
-    first = 1
-    with pq.ParquetFile(path, read_dictionary=texts) as file:
-        for batch in file.iter_batches(_BATCH, columns=list(columns.values())):
-            found = {name: batch.column(there) for name, there in columns.items()}
-            yield Batch(found, len(batch), first)
-            first += len(batch)
-
-
-def _csv_batches(path: Path, columns: Mapping[str, str]) -> Iterator[Batch]:
-    skipped: list[tuple[int, str]] = []
-    first, seen = 2, 0
-    with _open_csv(path, list(columns.values()), skipped) as reader:
-        for batch in reader:
-            found = {name: batch.column(there) for name, there in columns.items()}
-            # pyarrow reads ahead: some of them may stand after these rows.
-            yield Batch(found, len(batch), first, skipped[seen:], skipped)
-            first += len(batch)
-            seen = len(skipped)
-    if skipped[seen:]:
-        yield Batch({}, 0, first, skipped[seen:], skipped)
-
-
-def _check_text(path: Path) -> None:
-    """Refuse what is no text at all: pyarrow would show a traceback of its own for it."""
-    with path.open("rb") as file:
-        start = file.read(_LOOKED_AT)
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(start)
-    except UnicodeDecodeError as error:
-        raise FormatError(
-            f"{path} cannot be read: byte {error.start} is not UTF-8 text",
-            "Expected a CSV or parquet file of rollout rows (docs/score.md).",
-        ) from None
-
-
-def _open_csv(path: Path, columns: list[str] | None, skipped: list[tuple[int, str]]) -> Any:
-    def note(row: Any) -> str:
-        expected, actual = row.expected_columns, row.actual_columns
-        skipped.append((row.number, f"the line has {actual} fields; expected {expected}"))
-        return "skip"
-
-    # Everything is text at first: what a number should be is judged row by row. Threads would
-    # not say on which line a broken one stands.
-    text = pa.dictionary(pa.int32(), pa.string())
-    _check_text(path)
-    return pa_csv.open_csv(
-        path,
-        read_options=pa_csv.ReadOptions(use_threads=False, block_size=_BLOCK),
-        parse_options=pa_csv.ParseOptions(ignore_empty_lines=False, invalid_row_handler=note),
-        convert_options=pa_csv.ConvertOptions(
-            column_types=dict.fromkeys(columns or [], text),
-            include_columns=columns or [],
-            strings_can_be_null=True,
-            quoted_strings_can_be_null=True,
-            null_values=[""],
-        ),
-    )

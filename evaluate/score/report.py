@@ -3,14 +3,14 @@
 import base64
 import json
 import math
-import shlex
-from collections.abc import Mapping
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import metadata, resources
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.rows import condition_rank
 from robomme_interference_data.evaluate.score.cells import MainGrid, main_grids, main_note
@@ -24,10 +24,13 @@ from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import atomic_path, sha256_file
 from robomme_interference_data.tables import Table
 
-__all__ = ["write_report"]
+__all__ = ["load_jinja2", "write_report"]
 
 MOST_EPISODES = 20_000
 """So many rows of single episodes a page holds at most."""
+
+_LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
+"""What the numbers and pictures depend on."""
 
 _RUN_FIELDS = (
     *("status", "command", "identity", "split", "revision", "simulator", "system", "policy"),
@@ -40,24 +43,21 @@ _GRIDS = {
 }
 
 
-def write_report(score: Score, figures: Mapping[str, Path], out: Path) -> None:
-    """Write the page.
+def write_report(
+    score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
+) -> None:
+    """Write the page: the same bytes for the same rows, options and command.
 
     Args:
         score: What it shows.
         figures: Names and SVG files, as `draw_figures` returns them.
         out: The HTML file.
+        command: The command line that made the score; None shows the call of `score`.
 
     Raises:
         MissingExtraError: jinja2 is not installed.
     """
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingExtraError(
-            "the report needs jinja2",
-            'Install it: pip install "robomme-interference-data[score]"',
-        ) from error
+    jinja2 = load_jinja2()
     template = resources.files(__package__).joinpath("templates", "report.html.j2")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -72,10 +72,26 @@ def write_report(score: Score, figures: Mapping[str, Path], out: Path) -> None:
         episodes=_episodes(score, out.parent),
         most=MOST_EPISODES,
         sources=[_source(source) for source in score.rollouts.sources],
-        facts=_facts(score),
+        facts=_facts(score, command),
     )
     with atomic_path(out) as partial:
         partial.write_text(html, encoding="utf-8", newline="\n")
+
+
+def load_jinja2() -> Any:
+    """Return the library that fills in the page.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
+    try:
+        import jinja2
+    except ImportError as error:
+        raise MissingExtraError(
+            "the report needs jinja2",
+            'Install it: pip install "robomme-interference-data[score]"',
+        ) from error
+    return jinja2
 
 
 def _grid(grid: MainGrid) -> dict[str, Any]:
@@ -150,40 +166,49 @@ def _episodes(score: Score, folder: Path) -> dict[str, Any]:
     return {"json": text, "total": sum(len(one.episodes) for one in score.outcomes)}
 
 
+@dataclass(frozen=True)
+class _Fact:
+    """Something about how a score or a run was made; code may be copied, a line each."""
+
+    name: str
+    lines: Sequence[str]
+    code: bool = False
+
+
 def _source(source: Source) -> dict[str, Any]:
-    record = source.record
-    shown = {
-        name: _told(value)
-        for name in _RUN_FIELDS
-        if (value := record.get(name)) not in (None, "", {})
-    }
-    return {"path": str(source.path), "sha256": sha256_file(source.path), "run": shown}
+    facts = [_Fact("SHA-256", [sha256_file(source.path)])]
+    for name in _RUN_FIELDS:
+        value = source.record.get(name)
+        if name == "command" and value:  # a list of command lines: a joined run has several
+            facts.append(_Fact(name, value, code=True))
+        elif value not in (None, "", {}, []):
+            facts.append(_Fact(name, [_told(value)]))
+    return {"path": str(source.path), "facts": facts}
 
 
 def _told(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_told(part)}" for name, part in sorted(value.items()))
-    if isinstance(value, list):
-        return shlex.join(map(str, value))
-    return str(value)
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _facts(score: Score) -> list[tuple[str, str]]:
+def _facts(score: Score, command: str | None) -> list[_Fact]:
     rollouts = score.rollouts
-    facts = [
-        (
-            "scored with",
-            f"robomme-interference-data {metadata.version('robomme-interference-data')}",
-        ),
-        ("rows", f"{len(rollouts.packed):,}"),
-        ("episodes of a complete cell", _GRIDS[score.grid]),
-        ("bootstrap", f"{DRAWS:,} draws, seeded by the simulator, clustered by episode"),
-    ]
+    versions = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
+    told = {
+        "scored with": ", ".join([f"Python {platform.python_version()}", *versions]),
+        "rows": f"{len(rollouts.packed):,}",
+        "episodes of a complete cell": _GRIDS[score.grid],
+        "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
+    }
     if len(rollouts.model_seeds) > 1:
-        facts.append(("model seeds", ", ".join(map(str, rollouts.model_seeds[:20]))))
+        told["model seeds"] = ", ".join(map(str, rollouts.model_seeds[:20]))
     for simulator, revision in rollouts.revisions.items():
-        facts.append((f"revision of the split, {simulator}", revision))
+        told[f"revision of the split, {simulator}"] = revision
+    if score.notes:
+        told["note"] = "; ".join(score.notes)
     if rollouts.refused:
         named = "; ".join(map(str, rollouts.refusals))
-        facts.append(("bad rows left out", f"{rollouts.refused:,}: {named}"))
-    return facts
+        told["bad rows left out"] = f"{rollouts.refused:,}: {named}"
+    made = _Fact("command" if command else "call", [command or score.call], code=True)
+    return [made, *(_Fact(name, [text]) for name, text in told.items())]

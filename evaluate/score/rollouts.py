@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.errors import BadRowsError, InvalidOptionError
+from robomme_interference_data.evaluate.score.batches import Batch
 from robomme_interference_data.evaluate.score.check import (
     BITS,
     REFUSED,
@@ -17,8 +18,9 @@ from robomme_interference_data.evaluate.score.check import (
     field,
     pack,
 )
-from robomme_interference_data.evaluate.score.read import Batch, Source, find_sources, read_batches
-from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.evaluate.score.columns import flags
+from robomme_interference_data.evaluate.score.read import Source, find_sources, read_batches
+from robomme_interference_data.evaluate.systems import SYSTEMS, name_system
 
 __all__ = ["Refusal", "Rollouts", "read_rollouts"]
 
@@ -53,6 +55,7 @@ class Rollouts:
         difficulty: Code by episode, −1 unknown; see `Rollouts.difficulty_of`.
         seeds: Seed of the scene by episode, −1 unknown, likewise.
         revisions: Simulator to the revision of its split, where rows name one.
+        unpinned: Simulator and system of rows that name no revision, as released ones.
         videos: Packed row, its status left out, to the video of it.
         sources: The files that were read.
         refusals: The first bad rows that were skipped.
@@ -66,6 +69,7 @@ class Rollouts:
     difficulty: NDArray[np.int8]
     seeds: NDArray[np.int64]
     revisions: dict[str, str]
+    unpinned: frozenset[tuple[str, str]]
     videos: dict[int, Path]
     sources: tuple[Source, ...]
     refusals: tuple[Refusal, ...] = ()
@@ -108,7 +112,7 @@ class _Reader:
             self.starts.append((self.rows, source.path, replace(batch, columns={})))
             if "video" in batch.columns and source.folder is not None:
                 video = batch.columns["video"]
-                for row in np.flatnonzero(video.is_valid().to_numpy(zero_copy_only=False)).tolist():
+                for row in np.flatnonzero(flags(video.is_valid())).tolist():
                     self.videos.append((self.rows + row, source.folder / video[row].as_py()))
             self.chunks.append(packed)
             self.rows += batch.rows
@@ -145,7 +149,10 @@ class _Reader:
         return path, batch.line(row - start)
 
     def refuse_duplicates(self, packed: NDArray[np.uint64]) -> NDArray[np.uint64]:
-        """Return the rows, sorted, of each rollout only the first that was read."""
+        """Return the rows, sorted: one of each rollout, none where its rows contradict each other.
+
+        So what stays does not depend on the order of files.
+        """
         ordered = np.sort(packed)
         ordered = ordered[: np.searchsorted(ordered, REFUSED)]
         if not any(
@@ -155,17 +162,22 @@ class _Reader:
             return ordered
         keys = packed >> _STATUS_BITS
         order = np.argsort(keys, kind="stable")
-        keys = keys[order]
-        later = 1 + np.flatnonzero((keys[1:] == keys[:-1]) & (packed[order[1:]] != REFUSED))
-        first = np.searchsorted(keys, keys[later], side="left")
-        for one, other in sorted(zip(order[later].tolist(), order[first].tolist(), strict=True)):
-            path, line = self.where(one)
-            self.refuse(path, line, f"the same rollout as {_place(*self.where(other))}")
+        order = order[packed[order] != REFUSED]
+        begins = np.diff(keys[order], prepend=REFUSED) != 0
+        group = np.cumsum(begins) - 1
+        first = order[begins][group]
+        contradicted = np.zeros(int(begins.sum()), bool)
+        contradicted[group[packed[order] != packed[first]]] = True
+        refused = ~begins | contradicted[group]
+        kept = np.sort(packed[order[~refused]])
+        other = np.where(begins, np.roll(order, -1), first)
+        found = np.stack([order, other, contradicted[group]], axis=1)[refused]
+        for row, same, differs in sorted(found.tolist()):
+            more = "; its rows contradict each other" if differs else ""
+            path, line = self.where(row)
+            self.refuse(path, line, f"the same rollout as {_place(*self.where(same))}{more}")
         self.give_up_if_strict()
-        kept = np.ones(len(packed), bool)
-        kept[order[later]] = False
-        kept &= packed != REFUSED
-        return np.sort(packed[kept])
+        return kept
 
 
 def read_rollouts(
@@ -184,13 +196,18 @@ def read_rollouts(
         BadRowsError: A row is bad: unknown family, condition, status or system, numbers out of
             range, a success that contradicts the status, the same rollout twice, rows of
             different splits, or an episode with two seeds or difficulties.
+        InvalidIdError, UnknownNameError: `system` is no name of a system; see `name_system`.
+        InvalidOptionError: Some rows of a system name the revision of their split, others none.
         MissingFileError: There is no such file.
-        FormatError: A file cannot be read or lacks columns.
+        FormatError: A file cannot be read, lacks columns, or has some of a type that does not fit.
     """
+    if system is not None:
+        name_system(system)
     sources = find_sources(paths, with_system=system is not None)
     checker, reader = Checker(system), _Reader(lenient)
     for source in sources:
         reader.read(source, checker)
+    _check_revisions(checker)
     packed = reader.joined()
     orders = {
         "simulator": _ranks(checker.simulators, lambda name: name),
@@ -198,7 +215,7 @@ def read_rollouts(
         "model_seed": _ranks(checker.model_seeds, lambda seed: seed),
     }
     _recode(packed, orders)
-    videos = {int(packed[row] >> _STATUS_BITS): path for row, path in reader.videos}
+    videos = [(packed[row], path) for row, path in reader.videos]
     packed = reader.refuse_duplicates(packed)
     by_name = np.argsort(orders["simulator"])
     return Rollouts(
@@ -209,7 +226,8 @@ def read_rollouts(
         _regrouped(checker.difficulty, by_name),
         _regrouped(checker.seeds, by_name),
         dict(sorted(checker.revisions.items())),
-        videos,
+        frozenset((checker.simulators[s], checker.systems[n]) for s, n in checker.unpinned),
+        _kept_videos(videos, packed),
         tuple(sources),
         tuple(reader.refusals),
         reader.refused,
@@ -218,6 +236,27 @@ def read_rollouts(
 
 def _place(path: Path, line: int) -> str:
     return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
+
+
+def _check_revisions(checker: Checker) -> None:
+    """Refuse to join, as one system's, rows whose histories may differ (protocol, rule 5)."""
+    for simulator, system in sorted(checker.pinned & checker.unpinned):
+        name = checker.simulators[simulator]
+        raise InvalidOptionError(
+            f"some rows of {checker.systems[system]} in {name} are of the split with revision "
+            f"{checker.revisions[name]}, others name no revision, as released rows do",
+            "Their histories may differ: score the files apart, or compare them.",
+        )
+
+
+def _kept_videos(
+    videos: Sequence[tuple[np.uint64, Path]], packed: NDArray[np.uint64]
+) -> dict[int, Path]:
+    """Return the videos of rows that stayed; of a rollout's several the first by path."""
+    rows = np.array([row for row, _ in videos], np.uint64)
+    kept = np.searchsorted(packed, rows, "left") < np.searchsorted(packed, rows, "right")
+    there = [videos[place] for place in np.flatnonzero(kept).tolist()]
+    return {int(row >> _STATUS_BITS): path for row, path in sorted(there, reverse=True)}
 
 
 def _table_order(system: str) -> tuple[int, str]:

@@ -41,7 +41,10 @@ class Score:
         rollouts: The rows.
         grid: Which episodes a complete cell has.
         against_paper: Whether published rates stand beside ours.
-        expected: The same by simulator.
+        draws: Bootstrap samples.
+        call: The call of `score` that made it, as Python has it.
+        notes: What a reader must know, such as that two systems are not paired.
+        expected: The episodes of a complete cell, by simulator.
         outcomes: By system and simulator, in the order of tables.
         effects: Of each of `outcomes`.
         cells: System × condition.
@@ -53,6 +56,9 @@ class Score:
     rollouts: Rollouts
     grid: Grid
     against_paper: bool
+    draws: int
+    call: str
+    notes: tuple[str, ...]
     expected: dict[str, Expected]
     outcomes: tuple[Outcomes, ...]
     effects: tuple[Effects, ...]
@@ -96,15 +102,10 @@ def score(
         )
     outcomes = tuple(outcomes_of(rollouts))
     expected = expected_episodes(rollouts, outcomes, grid)
-    named = {(one.simulator, one.system): one for one in outcomes}
+    bases, notes = _bases(rollouts, outcomes)
     effects = tuple(
-        effects_of(
-            one,
-            named.get((one.simulator, base_of(one.system) or "")),
-            expected[one.simulator],
-            draws,
-        )
-        for one in outcomes
+        effects_of(one, base, expected[one.simulator], draws)
+        for one, base in zip(outcomes, bases, strict=True)
     )
     cells = cells_by(outcomes, expected)
     family_cells = cells_by(outcomes, expected, "family")
@@ -127,6 +128,10 @@ def score(
         rollouts,
         grid,
         against_paper,
+        draws,
+        f"score({[str(path) for path in paths]}, system={system!r}, lenient={lenient}, "
+        f"grid={str(grid)!r}, against_paper={against_paper}, draws={draws})",
+        notes,
         expected,
         outcomes,
         effects,
@@ -135,3 +140,27 @@ def score(
         difficulty_cells,
         {table.name: table for table in tables},
     )
+
+
+def _bases(
+    rollouts: Rollouts, outcomes: Sequence[Outcomes]
+) -> tuple[list[Outcomes | None], tuple[str, ...]]:
+    """Return the system without retrieval that each is paired with, and which are not paired.
+
+    Of a split that one names and the other does not, nobody knows that it is the same: released
+    rows stand beside one's own, and are not paired with them.
+    """
+    named = {(one.simulator, one.system): one for one in outcomes}
+    bases, notes = [], []
+    for one in outcomes:
+        base = named.get((one.simulator, base_of(one.system) or ""))
+        both = [one] if base is None else [one, base]
+        unpinned = [o.system for o in both if (o.simulator, o.system) in rollouts.unpinned]
+        if base is not None and len(unpinned) == 1:
+            notes.append(
+                f"{one.system} and {base.system} in {one.simulator} are not paired: the rows of "
+                f"{unpinned[0]} name no revision of a split, so their histories may differ"
+            )
+            base = None
+        bases.append(base)
+    return bases, tuple(notes)
