@@ -51,7 +51,15 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
         InterferenceError: It cannot be made, its server cannot be reached, or it does not say
             what it is.
     """
-    check_workers(parse_policy(config.policy), config.workers)
+    spec = parse_policy(config.policy)
+    if spec.kind == "python" and spec.target.startswith("__main__:"):
+        raise InvalidOptionError(
+            f"policy {config.policy!r}: worker processes run another program, and find no such "
+            "function in it",
+            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
+            "write python:MODULE:FUNCTION.",
+        )
+    check_workers(spec, config.workers)
     options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
     policy = make_policy(config.policy, **options)
     try:

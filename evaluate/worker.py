@@ -44,6 +44,9 @@ class RolloutWorker:
 
     def __call__(self, item: WorkItem) -> tuple[Rollout, str | None]:
         """Run a rollout; return its row, and the traceback of its error if there is one."""
+        if self._watchdog is None:
+            self._watchdog = Watchdog(self.config.simulator_s, self._out, worker_number())
+        self._watchdog.clear()
         try:
             self._prepare()
             assert self._simulator is not None and self._policy is not None
@@ -73,8 +76,6 @@ class RolloutWorker:
 
     def _prepare(self) -> None:
         config = self.config
-        if self._watchdog is None:
-            self._watchdog = Watchdog(config.simulator_s, self._out)
         if self._split is None:
             self._split = load_split(config.split, cache=config.cache, threads=1)
         if self._policy is None:
@@ -88,6 +89,12 @@ class RolloutWorker:
             self._simulator = make_simulator(
                 config.simulator, **simulator_options(config, self._policy, self._selector)
             )
+
+    def close(self) -> None:
+        """Release everything; no rollout follows."""
+        self._discard()
+        if self._watchdog is not None:
+            self._watchdog.close()
 
     def _discard(self) -> None:
         for thing in (self._policy, self._simulator):
