@@ -13,6 +13,7 @@ from robomme_interference_data.evaluate.checks import (
     applicable,
     check_plan,
     check_settings,
+    check_simulator,
     describe_policy,
 )
 from robomme_interference_data.evaluate.config import (
@@ -21,7 +22,7 @@ from robomme_interference_data.evaluate.config import (
     identity,
     provenance,
 )
-from robomme_interference_data.evaluate.log import RunLog, open_log, summary
+from robomme_interference_data.evaluate.log import RunLog, open_log, read_log, summary
 from robomme_interference_data.evaluate.plan import (
     WorkItem,
     parse_episodes,
@@ -189,6 +190,10 @@ def run_evaluation(
     )
     check_plan(config, opened, about, plan)
     mine = take_shard(plan, parse_shard(shard))
+    rows = read_log(Path(out))
+    done = {key for key, row in rows.items() if row.status != Status.ERROR}
+    if any(_key(config, item) not in done for item in mine):
+        check_simulator(config, about)
     with open_log(Path(out), identity(config), resume) as log:
         log.write_header(policy=about.metadata, status="running", **provenance(list(command)))
         log.header["plans"] = [*log.header["plans"], {**_plan_of(plan), "shard": shard}]

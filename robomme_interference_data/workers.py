@@ -199,12 +199,11 @@ def run_tasks(
                     worker.retired = result.error
                     continue
                 yield result
-            retired = [worker for worker in running if worker.retired is not None]
-            running = [worker for worker in running if worker.retired is None]
-            for worker in retired:
+            for worker in [worker for worker in running if worker.retired is not None]:
                 worker.stop()
-            if retired and not running:
-                raise retired[-1].retired
+                running.remove(worker)
+                if not running:
+                    raise worker.retired from None
     finally:
         _end(running)
 
