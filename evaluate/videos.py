@@ -167,7 +167,7 @@ class ClipWatcher:
             if text:
                 lines += ["", head, *_wrap(text, _LETTERS)]
         # The last two lines always have their place, however long the words before them are.
-        lines = [*lines[: _LINES - 2], f"step {self._steps} of {MAX_STEPS}", str(status)]
+        lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
         heads = (self._given, "front", "wrist", "")
         return _lettered(canvas, heads, lines, _COLOURS[status])
 

@@ -357,7 +357,7 @@ def test_a_history_beyond_the_systems_positions_is_refused(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("raise", "SimulatorCrashError: the world fell apart"),
+        ("raise", "SimulatorCrashError: the world fell apart (Pick it up.)"),
         ("error", "RolloutError: the rollout_doubles:World simulator reported an error at step 7"),
         ("die", "RuntimeError: the worker process died (exit code -9)"),
         ("hang", "TimeoutError: still running after 8 s"),
