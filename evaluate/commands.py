@@ -34,9 +34,9 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    families: Annotated[list[str], typer.Option(metavar="NAME…", help="Families, or all.")] = [
+    families: Annotated[list[str], typer.Option(metavar="NAME…", help="Families, or all.")] = [  # noqa: B006
         "all"
-    ],  # noqa: B006
+    ],
     episodes: Annotated[str, typer.Option(help="Indices, such as 0-49 or 0,3,10-12.")] = "0-49",
     episode_split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     shard: Annotated[

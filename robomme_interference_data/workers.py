@@ -199,13 +199,19 @@ def run_tasks(
                     worker.retired = result.error
                     continue
                 yield result
-            for worker in [worker for worker in running if worker.retired is not None]:
-                worker.stop()
-                running.remove(worker)
-                if not running:
-                    raise worker.retired from None
+            _drop_retired(running)
     finally:
         _end(running)
+
+
+def _drop_retired(running: list[_Worker]) -> None:
+    """End workers that have retired, and raise why the last one did if none is left."""
+    for worker in list(running):
+        if worker.retired is not None:
+            worker.stop()
+            running.remove(worker)
+            if not running:
+                raise worker.retired
 
 
 def _end(running: list[_Worker]) -> None:
