@@ -3,7 +3,8 @@
 ```python
 from robomme_interference_data.evaluate import run_evaluation
 
-result = run_evaluation("replay", "demo/tabletop", "runs/replay-full", episodes="0")
+if __name__ == "__main__":  # worker processes import the script
+    result = run_evaluation("replay", "demo/tabletop", "runs/replay-full", episodes="0")
 ```
 """
 

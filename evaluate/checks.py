@@ -1,43 +1,65 @@
 """All that can be known to be wrong with a run before its first rollout."""
 
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     PolicyError,
+    PolicyServerError,
+    SimulatorCrashError,
     UnknownNameError,
-    nearest,
 )
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.config import RunConfig, default_system
 from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.checks import plain
 from robomme_interference_data.evaluate.policies.registry import (
+    BUILTINS,
     check_workers,
     make_policy,
     parse_policy,
 )
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.systems import (
+    SYSTEMS,
     System,
     check_condition,
     check_history,
     name_system,
 )
-from robomme_interference_data.evaluate.worker import make_selector
+from robomme_interference_data.evaluate.videos import check_videos
+from robomme_interference_data.evaluate.worker import make_selector, simulator_options
 from robomme_interference_data.ids import condition_name
 from robomme_interference_data.loader import Split
-from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
+from robomme_interference_data.progress import MESSAGES
+from robomme_interference_data.simulators.registry import (
+    SIMULATORS,
+    find_simulator,
+    make_simulator,
+)
+from robomme_interference_data.workers import run_tasks
 
-__all__ = ["PolicyTraits", "applicable", "check_plan", "check_settings", "describe_policy"]
+__all__ = [
+    "PolicyTraits",
+    "applicable",
+    "check_plan",
+    "check_settings",
+    "check_simulator",
+    "describe_policy",
+]
 
 
 @dataclass(frozen=True)
 class PolicyTraits:
     """What a policy says of itself; see `Policy`."""
 
+    cameras: tuple[str, ...]
     history_cameras: tuple[str, ...]
     wants_history: bool
     privileged: bool
@@ -45,15 +67,50 @@ class PolicyTraits:
 
 
 def describe_policy(config: RunConfig) -> PolicyTraits:
-    """Make the policy once, ask what it is, and release it.
+    """Make the policy once, ask what it is, and release it; of several servers ask each.
 
     Raises:
-        InterferenceError: It cannot be made, its server cannot be reached, or it does not say
-            what it is.
+        InterferenceError: It cannot be made, a server cannot be reached, servers say different
+            things of themselves, or it does not say what it is.
     """
-    check_workers(parse_policy(config.policy), config.workers)
+    spec = parse_policy(config.policy)
+    if spec.kind == "python" and spec.target.startswith("__main__:"):
+        raise InvalidOptionError(
+            f"policy {config.policy!r}: worker processes run another program, and find no such "
+            "function in it",
+            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
+            "write python:MODULE:FUNCTION.",
+        )
+    check_workers(spec, config.workers)
     options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
-    policy = make_policy(config.policy, **options)
+    with redirect_stdout(sys.stderr):  # stdout is for the rows
+        traits = [
+            _traits(config, make_policy(config.policy, worker=worker, **options))
+            for worker in range(max(1, len(spec.servers)))
+        ]
+    first = traits[0]
+    metadata = dict(first.metadata)
+    if spec.kind == "websocket":
+        names = [str(one.metadata["server"]) for one in traits]
+        for name, other in zip(names, traits, strict=True):
+            if other.metadata["server_metadata"] != metadata["server_metadata"]:
+                raise PolicyServerError(
+                    f"the policy servers {names[0]} and {name} serve different models: one says "
+                    f"{metadata['server_metadata']}, the other {other.metadata['server_metadata']}",
+                    "Start all of them with the same checkpoint and seed.",
+                )
+        metadata["server"] = ", ".join(names)
+    if first.privileged:
+        metadata["privileged"] = True
+        if spec.kind not in BUILTINS:
+            MESSAGES.print(
+                f"The policy {config.policy} is privileged: it gets the simulator itself, under "
+                f"every condition, {NO_HISTORY} too; run.json says so."
+            )
+    return replace(first, metadata=metadata)
+
+
+def _traits(config: RunConfig, policy: Policy) -> PolicyTraits:
     try:
         said = policy.metadata()
         if not isinstance(said, Mapping):
@@ -62,7 +119,11 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
                 'Expected a dict that says which policy this is, such as {"policy": "mine"}.',
             )
         return PolicyTraits(
-            tuple(policy.history_cameras), policy.wants_history, policy.privileged, plain(said)
+            tuple(policy.cameras),
+            tuple(policy.history_cameras),
+            policy.wants_history,
+            policy.privileged,
+            plain(said),
         )
     finally:
         policy.close()
@@ -74,10 +135,10 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
     Raises:
         UnknownNameError: There is no such simulator, or a name passes for a system.
         InvalidOptionError: A setting is out of range or does not go with another.
+        MissingExtraError: A library for videos or retrieval is not installed.
     """
     name = config.simulator
-    if name not in SIMULATORS and ":" not in name:
-        raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
+    find_simulator(name)
     for setting in ("workers", "history_chunk", "max_errors", "rollout_s", "simulator_s"):
         if getattr(config, setting) <= 0:
             raise InvalidOptionError(
@@ -90,6 +151,7 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
             "Run it on --simulator tabletop, or take another policy.",
         )
     system = name_system(config.system)
+    _check_label(config, system)
     if config.retrieval is not None and system.paper and not system.retrieval:
         raise InvalidOptionError(
             f"system {system.name} has no retrieval step, and --retrieval puts one in front",
@@ -100,8 +162,8 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
             f"system {system.name} has a retrieval step, and none is given",
             "Add --retrieval ENCODER, such as --retrieval siglip.",
         )
-    if config.retrieval is not None:
-        make_selector(config)
+    if config.videos:
+        check_videos()
     cameras = split.load(split.episode_ids[0], split.k_values[0]).cameras
     for camera in policy.history_cameras:
         if camera not in cameras:
@@ -109,6 +171,31 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
                 f"the policy wants the camera {camera!r} of the history; the split has "
                 f"{', '.join(cameras)}",
                 "Build the split with that camera (build … --cameras), or take another policy.",
+            )
+
+
+def _check_label(config: RunConfig, system: System) -> None:
+    """Refuse a name of the table for a policy that is not that system."""
+    kind = parse_policy(config.policy).kind
+    own = "Leave out --system, or give a name of your own."
+    if system.paper and kind not in ("websocket", "python"):
+        raise InvalidOptionError(
+            f"the policy {config.policy} is not the paper's system {system.name}",
+            f"Such a name stands for a websocket: or python: policy. {own}",
+        )
+    if system.subgoals is not None and kind == "websocket":
+        raise InvalidOptionError(
+            f"{system.name} acts on subgoals that a vision-language model writes, and this package "
+            f"sends the server none: what runs would not be {system.name}",
+            "Give --system a name of your own, or a python: policy that has such a model.",
+        )
+    if system.name in SYSTEMS and not system.paper:
+        retrieval = config.retrieval is not None
+        names = default_system(config.policy, config.memory, retrieval) if kind in BUILTINS else ""
+        if names.removeprefix("retrieval-") != system.name.removeprefix("retrieval-"):
+            memory = f" with the memory {config.memory}" if config.memory is not None else ""
+            raise InvalidOptionError(
+                f"the policy {config.policy}{memory} is not the control {system.name}", own
             )
 
 
@@ -125,12 +212,18 @@ def check_plan(
     """Check every planned rollout.
 
     Raises:
-        InvalidOptionError: A condition does not apply, or the split is of another simulator.
+        InvalidOptionError: There is none, a condition does not apply, or the split is of another
+            simulator.
         UnknownNameError: The split has no buffers for a condition.
         HistoryTooLongError: A buffer exceeds the system's position limit.
-        MissingExtraError: RoboMME's interpreter does not have it.
+        MissingIndexError, StaleIndexError: The split has no fitting index for the retrieval step.
     """
     system = name_system(config.system)
+    if not plan:
+        raise InvalidOptionError(
+            "there is nothing to run: no family, or no condition that applies",
+            "Give --families and --conditions, or leave them out for all.",
+        )
     known = [NO_HISTORY, *(condition_name(k) for k in split.k_values)]
     for condition in dict.fromkeys(item.condition for item in plan):
         if (refusal := _refusal(system, policy, condition)) is not None:
@@ -151,8 +244,40 @@ def check_plan(
             )
         if item.k is not None and config.retrieval is None:
             check_history(system, manifest.history_frames)
-    if config.simulator == "robomme":  # its interpreter may be missing, or lack RoboMME
-        make_simulator("robomme", python=config.robomme_python).close()
+    longest = max(plan, key=lambda item: -1 if item.k is None else item.k)
+    if config.retrieval is not None and longest.k is not None:
+        selector = make_selector(config)
+        buffer = split.load(longest.episode, longest.k)
+        selector.select(buffer, buffer.query_frame(selector.camera))
+
+
+def check_simulator(config: RunConfig, policy: PolicyTraits) -> None:
+    """Make the simulator once, in a process of its own, as a broken driver may end its process.
+
+    One of the user's own is made by the workers only.
+
+    Raises:
+        NoRendererError: This machine cannot draw its pictures.
+        MissingExtraError: Its libraries are not installed, or RoboMME's interpreter lacks it.
+        SimulatorCrashError: It cannot be made for another reason.
+    """
+    if config.simulator not in SIMULATORS:
+        return
+    selector = None if config.retrieval is None else make_selector(config)
+    options = simulator_options(config, policy.cameras, selector)
+    make = partial(_make_once, config.simulator)
+    for outcome in run_tasks(make, [options], workers=1, time_limit=config.simulator_s, attempts=1):
+        if isinstance(outcome.error, InterferenceError):
+            raise outcome.error
+        if outcome.error is not None:
+            raise SimulatorCrashError(
+                f"the {config.simulator} simulator cannot be made: {outcome.error}",
+                "robomme-interference doctor tells what works on this machine.",
+            )
+
+
+def _make_once(name: str, options: Mapping[str, Any]) -> None:
+    make_simulator(name, **options).close()
 
 
 def _refusal(system: System, policy: PolicyTraits, condition: str) -> InterferenceError | None:

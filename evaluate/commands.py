@@ -28,9 +28,15 @@ def evaluate(
     simulator: Annotated[str, typer.Option(help="tabletop or robomme.")] = "tabletop",
     conditions: Annotated[
         list[str] | None,
-        typer.Option(help="no-history, k0, k1, …; by default all that apply.", show_default=False),
+        typer.Option(
+            metavar="NAME…",
+            help="no-history, k0, k1, …; by default all that apply.",
+            show_default=False,
+        ),
     ] = None,
-    families: Annotated[list[str], typer.Option(help="Task families, or all.")] = ["all"],  # noqa: B006
+    families: Annotated[list[str], typer.Option(metavar="NAME…", help="Families, or all.")] = [  # noqa: B006
+        "all"
+    ],
     episodes: Annotated[str, typer.Option(help="Indices, such as 0-49 or 0,3,10-12.")] = "0-49",
     episode_split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     shard: Annotated[
@@ -54,11 +60,15 @@ def evaluate(
         str | None,
         typer.Option(help="Interpreter that has RoboMME.", envvar="ROBOMME_PYTHON"),
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Worker processes.")] = 1,
-    videos: Annotated[bool, typer.Option(help="Write a video of each rollout.")] = False,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Worker processes.")] = 1,
+    videos: Annotated[
+        bool, typer.Option("--videos", help="Write a video of each rollout.")
+    ] = False,
     check_lesson: Annotated[
         bool,
-        typer.Option(help="Compare each lesson with what the simulator plays, bit for bit."),
+        typer.Option(
+            "--check-lesson", help="Compare each lesson with what the simulator plays, bit for bit."
+        ),
     ] = False,
     rollout_timeout: Annotated[float, typer.Option(help="Seconds a rollout may take.")] = 3600.0,
     simulator_timeout: Annotated[
@@ -66,18 +76,23 @@ def evaluate(
         typer.Option(help="Seconds a reset, or 16 steps, may take before the simulator hung."),
     ] = 1800.0,
     cache: Annotated[
-        bool, typer.Option(help="Keep decoded history frames on disk: a second run is faster.")
+        bool,
+        typer.Option(
+            "--cache", help="Keep decoded history frames on disk: a second run is faster."
+        ),
     ] = False,
     history_chunk: Annotated[
-        int, typer.Option(min=1, help="Frames of history handed over at a time.")
+        int,
+        typer.Option(min=1, metavar="N", help="Frames of history handed over at a time."),
     ] = 64,
     max_errors: Annotated[
-        int, typer.Option(min=1, help="Errors in a row after which the run stops.")
+        int,
+        typer.Option(min=1, metavar="N", help="Errors in a row after which the run stops."),
     ] = 10,
     resume: Annotated[bool, typer.Option(help="Go on with a run that is there.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Write the rows as JSON.")] = False,
 ) -> None:
-    """Roll out a policy under the benchmark's conditions, one row per rollout.
+    r"""Roll out a policy under the benchmark's conditions, one row per rollout.
 
     Before each episode the policy gets the history that the condition prescribes: nothing
     (no-history), the lesson (k0), or the lesson and k sessions of other tasks. RUN/rollouts.csv,
@@ -85,15 +100,20 @@ def evaluate(
     command goes on, skips what is finished and repeats what broke.
 
     Examples:
-      robomme-interference evaluate --policy replay --memory window --split S --out runs/window
+    ```
+    robomme-interference evaluate --policy replay --memory window \
+      --split S --out runs/window
 
-      robomme-interference evaluate --policy websocket://localhost:8000 --split S --out runs/mine
-      --system perceptual-framesamp-modul --conditions k0 k7 --families MoveCube RouteStick
+    robomme-interference evaluate --policy websocket://localhost:8000 \
+      --system perceptual-framesamp-modul --split S --out runs/mine \
+      --conditions k0 k7 --families MoveCube RouteStick
 
-      robomme-interference evaluate --policy oracle --split S --out runs/oracle --episodes 0-4
-      --videos
+    robomme-interference evaluate --policy oracle --episodes 0-4 --videos \
+      --split S --out runs/oracle
 
-      robomme-interference evaluate --policy replay --split S --out runs/shard-2 --shard 2/8
+    robomme-interference evaluate --policy replay --shard 2/8 \
+      --split S --out runs/shard-2
+    ```
     """
     from robomme_interference_data.evaluate.progress import RunProgress, rate_table
     from robomme_interference_data.evaluate.runner import run_evaluation

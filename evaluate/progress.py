@@ -1,12 +1,15 @@
 """Show how a run goes: success rates by family and condition, and the time left."""
 
+import time
 from collections.abc import Sequence
 from typing import Self
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress_bar import ProgressBar
+from rich.table import Column, Table
+from rich.text import Text
 
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.rows import Rollout
@@ -14,11 +17,15 @@ from robomme_interference_data.simulators.base import Status
 
 __all__ = ["RunProgress", "rate_table"]
 
+_BAR = 10
+"""Characters of a bar: nine families by five conditions fit into 80 columns."""
+
 
 class RunProgress:
-    """A table and a bar on stderr; use as a context manager.
+    """Bars by family and condition with success rates, and the time left, on stderr.
 
-    Where stderr is no terminal, a line is written whenever a family's condition is done.
+    Use as a context manager. Where stderr is no terminal, a line is written whenever a family's
+    condition is done.
 
     Args:
         quiet: Show nothing.
@@ -30,13 +37,14 @@ class RunProgress:
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("rollouts, left:"),
-            TimeRemainingColumn(),
+            TextColumn("rollouts, {task.fields[left]}"),
             console=self._console,
         )
-        self._task = self._progress.add_task("evaluate", total=None)
+        self._task = self._progress.add_task("evaluate", total=None, left="")
         self._planned: dict[tuple[str, str], int] = {}
         self._rows: dict[tuple[object, ...], Rollout] = {}
+        self._began = self._last = time.monotonic()
+        self._ended = 0
         self._live = Live(console=self._console, get_renderable=self._draw, refresh_per_second=2)
 
     def __enter__(self) -> Self:
@@ -56,12 +64,15 @@ class RunProgress:
         self._rows = {row.key: row for row in done}
         self._progress.update(self._task, total=len(plan))
         self._progress.reset(self._task, completed=len(done))
+        self._began = time.monotonic()
         if done and not self._console.is_terminal:
             self._console.print(f"{len(done)} of {len(plan)} rollouts are done already")
 
     def row(self, row: Rollout) -> None:
         """Count a row."""
         self._rows[row.key] = row
+        self._ended += 1
+        self._last = time.monotonic()
         self._progress.advance(self._task)
         if row.status == Status.ERROR:
             name = f"{row.family}/{row.episode_split}/{row.episode} {row.condition}"
@@ -72,24 +83,49 @@ class RunProgress:
             total = f"{len(self._rows)} of {sum(self._planned.values())}"
             self._console.print(f"{row.family} {row.condition}: {_rate(ended)}  ({total})")
 
+    def left(self) -> float | None:
+        """Return the seconds left, by the mean time that a rollout of this run took so far.
+
+        Whatever the workers do side by side is in that mean. None until one rollout has ended.
+        """
+        if not self._ended:
+            return None
+        mean = (self._last - self._began) / self._ended
+        rest = mean * (sum(self._planned.values()) - len(self._rows))
+        return max(0.0, rest - (time.monotonic() - self._last))
+
     def _draw(self) -> Group:
-        return Group(rate_table(list(self._rows.values()), self._planned), self._progress)
+        left = self.left()
+        told = "" if left is None else f"{_clock(left)} left"
+        self._progress.update(self._task, left=told)
+        return Group(_bars(list(self._rows.values()), self._planned), self._progress)
 
 
-def rate_table(rows: Sequence[Rollout], planned: dict[tuple[str, str], int] | None = None) -> Table:
-    """Return success rates by family and condition, errors apart, as a rich table.
+def _bars(rows: Sequence[Rollout], planned: dict[tuple[str, str], int]) -> Table:
+    """Return a bar by family and condition: how many ended, and how many of those succeeded."""
+    families = list(dict.fromkeys(family for family, _ in planned))
+    conditions = list(dict.fromkeys(condition for _, condition in planned))
+    table = Table(Column("family", no_wrap=True), *conditions, box=None, pad_edge=False)
+    for family in families:
+        cells: list[Group | str] = []
+        for condition in conditions:
+            total = planned.get((family, condition), 0)
+            found = [r for r in rows if (r.family, r.condition) == (family, condition)]
+            told = Text(f"{len(found)}/{total} {_share(found)}", no_wrap=True)
+            bar = ProgressBar(total=total, completed=len(found), width=_BAR)
+            cells.append(Group(told, bar) if total else "")
+        table.add_row(family, *cells)
+    return table
 
-    Args:
-        rows: The rows.
-        planned: Rollouts to come by family and condition, in the order of the table; None: those
-            of the rows.
-    """
-    cells: dict[tuple[str, str], list[Rollout]] = {cell: [] for cell in planned or {}}
+
+def rate_table(rows: Sequence[Rollout]) -> Table:
+    """Return success rates by family and condition, errors apart, as a rich table."""
+    cells: dict[tuple[str, str], list[Rollout]] = {}
     for row in rows:
         cells.setdefault((row.family, row.condition), []).append(row)
     families = list(dict.fromkeys(family for family, _ in cells))
     conditions = list(dict.fromkeys(condition for _, condition in cells))
-    table = Table("family", *conditions, box=None, pad_edge=False)
+    table = Table(Column("family", no_wrap=True), *conditions, box=None, pad_edge=False)
     for family in families:
         found = [cells.get((family, condition), []) for condition in conditions]
         table.add_row(family, *(_rate(group) for group in found))
@@ -103,7 +139,19 @@ def _rate(rows: Sequence[Rollout]) -> str:
     scored = [row for row in rows if row.status != Status.ERROR]
     broken = len(rows) - len(scored)
     errors = f", {broken} broke" if broken else ""
-    if not scored:
-        return f"–{errors}"
     won = sum(row.status == Status.SUCCESS for row in scored)
-    return f"{won}/{len(scored)} {won / len(scored):.0%}{errors}"
+    return f"{won}/{len(scored)} {_share(rows)}{errors}" if scored else f"–{errors}"
+
+
+def _share(rows: Sequence[Rollout]) -> str:
+    """Return the success rate, errors apart; nothing if there is none."""
+    scored = [row for row in rows if row.status != Status.ERROR]
+    if not scored:
+        return ""
+    return f"{sum(row.status == Status.SUCCESS for row in scored) / len(scored):.0%}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"

@@ -38,8 +38,18 @@ ACTION_CHUNK = 16
 class Watcher(Protocol):
     """Sees a rollout as it goes, for a video. It wants the front camera at every step."""
 
-    def begin(self, buffer: Buffer | None, first: Observation, info: EpisodeInfo) -> None:
-        """Take what is known before the first step."""
+    def begin(
+        self, buffer: Buffer | None, start: int, stop: int, first: Observation, info: EpisodeInfo
+    ) -> None:
+        """Take what is known before the first step.
+
+        Args:
+            buffer: The buffer that the condition prescribes, or None.
+            start: First of its frames that the policy is given.
+            stop: Frame after the last one.
+            first: The first live observation.
+            info: The episode.
+        """
         ...
 
     def step(self, observation: Observation, status: Status, subgoal: str | None) -> None:
@@ -110,14 +120,15 @@ def run_rollout(
     _check_episode(item.episode, split, info)
     if config.check_lesson:
         check_lesson(split.load(item.episode, split.k_values[0]), demonstration, first)
-    if watcher is not None:
-        watcher.begin(buffer, first, info)
     chosen = None
     start, stop = 0, 0 if buffer is None else len(buffer)
     with clock.part("history_s"):
         if selector is not None and buffer is not None and len(buffer):
             chosen = selector.select(buffer, first.images[selector.camera])
             start, stop = chosen.start, chosen.stop
+    if watcher is not None:
+        watcher.begin(buffer, start, stop, first, info)
+    with clock.part("history_s"):
         policy.reset(
             RolloutInfo(
                 info.goal,

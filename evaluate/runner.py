@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.checks import (
     applicable,
     check_plan,
     check_settings,
+    check_simulator,
     describe_policy,
 )
 from robomme_interference_data.evaluate.config import (
@@ -20,7 +22,7 @@ from robomme_interference_data.evaluate.config import (
     identity,
     provenance,
 )
-from robomme_interference_data.evaluate.log import RunLog, open_log, summary
+from robomme_interference_data.evaluate.log import RunLog, open_log, read_log, summary
 from robomme_interference_data.evaluate.plan import (
     WorkItem,
     parse_episodes,
@@ -36,7 +38,7 @@ from robomme_interference_data.evaluate.watchdog import last_words
 from robomme_interference_data.evaluate.worker import RolloutWorker, error_row
 from robomme_interference_data.loader import load_split
 from robomme_interference_data.simulators.base import Status
-from robomme_interference_data.workers import Outcome, run_tasks
+from robomme_interference_data.workers import Outcome, end_if_starting, run_tasks
 
 __all__ = ["Listener", "RunResult", "run_evaluation"]
 
@@ -109,6 +111,8 @@ def run_evaluation(
     Rows are on the disk as rollouts end. Run again with the same `out`, it skips finished
     rollouts, repeats errors, and adds what is newly asked for.
 
+    Worker processes import the script that runs: call it under `if __name__ == "__main__":`.
+
     Args:
         policy: `replay`, `oracle`, `guess`, `hold`, `websocket://host:port[,…]`,
             `lerobot:REPO_OR_PATH` or `python:module:factory`.
@@ -146,8 +150,11 @@ def run_evaluation(
         HistoryTooLongError: A buffer exceeds the system's position limit.
         MissingFileError: The split is not there.
         RunFolderError: `out` holds another run, or something else.
-        PolicyError: The policy cannot be made, or its server not reached.
+        PolicyError: The policy cannot be made.
+        PolicyServerError: A policy server cannot be reached, or no longer any of them.
+        WorkerError: The worker processes cannot start.
     """
+    end_if_starting()
     opened = load_split(split)
     label = system or default_system(policy, memory, retrieval is not None)
     config = RunConfig(
@@ -183,6 +190,10 @@ def run_evaluation(
     )
     check_plan(config, opened, about, plan)
     mine = take_shard(plan, parse_shard(shard))
+    rows = read_log(Path(out))
+    done = {key for key, row in rows.items() if row.status != Status.ERROR}
+    if any(_key(config, item) not in done for item in mine):
+        check_simulator(config, about)
     with open_log(Path(out), identity(config), resume) as log:
         log.write_header(policy=about.metadata, status="running", **provenance(list(command)))
         log.header["plans"] = [*log.header["plans"], {**_plan_of(plan), "shard": shard}]
@@ -222,6 +233,9 @@ def _run(
                 written = time.monotonic()
         else:
             stopped = None
+    except InterferenceError as error:  # no worker is left
+        stopped = error.message
+        raise
     finally:
         outcomes.close()
         log.reread()  # Ctrl-C may have come between a row's writing and its counting
@@ -240,7 +254,8 @@ def _row(config: RunConfig, outcome: Outcome, log: RunLog) -> tuple[Rollout, str
         row, traceback = outcome.value
     else:
         # The process died or hung: its last words are all there is.
-        traceback = last_words(log.folder)
+        late = isinstance(outcome.error, TimeoutError)
+        traceback = None if late else last_words(log.folder, outcome.worker)
         text = f"{type(outcome.error).__name__}: {outcome.error}"
         if traceback is not None:
             text = f"the simulator hung: no answer for {config.simulator_s:g} s"

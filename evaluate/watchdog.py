@@ -7,8 +7,6 @@ from pathlib import Path
 
 __all__ = ["Watchdog", "last_words"]
 
-_NAME = ".hung.log"
-
 
 class Watchdog:
     """Guards calls of the simulator in a worker process.
@@ -18,12 +16,17 @@ class Watchdog:
 
     Args:
         seconds: How long guarded work may take.
-        folder: The run's folder, where the tracebacks of a process that hung are kept.
+        folder: The run's folder, where the traceback of a process that hung is kept.
+        worker: Number of the worker.
     """
 
-    def __init__(self, seconds: float, folder: Path):
+    def __init__(self, seconds: float, folder: Path, worker: int):
         self._seconds = seconds
-        self._file = (folder / _NAME).open("a")
+        self._file = _path(folder, worker).open("a")
+
+    def clear(self) -> None:
+        """Forget what was left before: to be called as each rollout begins."""
+        self._file.truncate(0)
 
     @contextmanager
     def guard(self) -> Iterator[None]:
@@ -34,12 +37,18 @@ class Watchdog:
         finally:
             faulthandler.cancel_dump_traceback_later()
 
+    def close(self) -> None:
+        """Remove the file; the watchdog guards nothing any more."""
+        self._file.close()
+        Path(self._file.name).unlink(missing_ok=True)
 
-def last_words(folder: Path) -> str | None:
-    """Return, once, what processes that hung have left in the run's folder; None if none did."""
-    path = folder / _NAME
+
+def last_words(folder: Path, worker: int) -> str | None:
+    """Return where a worker hung that the watchdog has just ended; None if it ended otherwise."""
+    path = _path(folder, worker)
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
-    if text:
-        with path.open("r+") as file:
-            file.truncate(0)
     return text or None
+
+
+def _path(folder: Path, worker: int) -> Path:
+    return folder / f".hung-{worker}.log"

@@ -2,16 +2,23 @@
 
 import dataclasses
 import traceback
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    PolicyServerError,
+    WorkerRetiredError,
+)
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout import base_row, run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
+from robomme_interference_data.evaluate.videos import ClipWatcher, video_name
 from robomme_interference_data.evaluate.watchdog import Watchdog
 from robomme_interference_data.loader import Split, load_split
 from robomme_interference_data.retrieval.selector import Selector
@@ -43,51 +50,70 @@ class RolloutWorker:
         self._selector: Selector | None = None
 
     def __call__(self, item: WorkItem) -> tuple[Rollout, str | None]:
-        """Run a rollout; return its row, and the traceback of its error if there is one."""
+        """Run a rollout; return its row, and the traceback of what broke: it, its clip, or None."""
+        if self._watchdog is None:
+            self._watchdog = Watchdog(self.config.simulator_s, self._out, worker_number())
+        self._watchdog.clear()
+        with self._recorder(item) as clip:
+            row, trace = self._run(item, clip)
+            if clip is None:
+                return row, trace
+            if clip.close(Status(row.status), row.error):
+                row = dataclasses.replace(row, video=video_name(item))
+            # Whatever became of the clip, the rollout ended as it did.
+            return row, "\n".join(filter(None, (trace, clip.problem))) or None
+
+    def _recorder(self, item: WorkItem) -> AbstractContextManager[ClipWatcher | None]:
+        if not self.config.videos:
+            return nullcontext()
+        return ClipWatcher(self._out / video_name(item), item, self.config.system)
+
+    def _run(self, item: WorkItem, clip: ClipWatcher | None) -> tuple[Rollout, str | None]:
         try:
             self._prepare()
             assert self._simulator is not None and self._policy is not None
             assert self._split is not None
-            row = self._run(item)
+            row = run_rollout(
+                self.config,
+                item,
+                simulator=self._simulator,
+                policy=self._policy,
+                split=self._split,
+                selector=self._selector,
+                watcher=clip,
+                watchdog=self._watchdog,
+            )
         except Exception as error:
+            trace = traceback.format_exc()
             self._discard()
-            return self._broken(item, error), traceback.format_exc()
+            if isinstance(error, PolicyServerError):
+                self._check_server()
+            return self._broken(item, error), trace
         return row, None
-
-    def _run(self, item: WorkItem) -> Rollout:
-        assert self._simulator is not None and self._policy is not None
-        assert self._split is not None
-        parts: dict[str, Any] = {
-            "simulator": self._simulator,
-            "policy": self._policy,
-            "split": self._split,
-            "selector": self._selector,
-            "watchdog": self._watchdog,
-        }
-        if not self.config.videos:
-            return run_rollout(self.config, item, **parts)
-        from robomme_interference_data.evaluate.videos import record_rollout, video_name
-
-        row = record_rollout(self.config, item, self._out, **parts)
-        return dataclasses.replace(row, video=video_name(item))
 
     def _prepare(self) -> None:
         config = self.config
-        if self._watchdog is None:
-            self._watchdog = Watchdog(config.simulator_s, self._out)
         if self._split is None:
             self._split = load_split(config.split, cache=config.cache, threads=1)
         if self._policy is None:
-            options: dict[str, Any] = {}
-            if config.memory is not None:
-                options["memory"] = config.memory
-            self._policy = make_policy(config.policy, worker=worker_number(), **options)
+            self._policy = self._make_policy()
         if self._selector is None and config.retrieval is not None:
             self._selector = make_selector(config)
         if self._simulator is None:
             self._simulator = make_simulator(
-                config.simulator, **simulator_options(config, self._policy, self._selector)
+                config.simulator, **simulator_options(config, self._policy.cameras, self._selector)
             )
+
+    def _make_policy(self) -> Policy:
+        memory = self.config.memory
+        options: dict[str, Any] = {} if memory is None else {"memory": memory}
+        return make_policy(self.config.policy, worker=worker_number(), **options)
+
+    def close(self) -> None:
+        """Release everything; no rollout follows."""
+        self._discard()
+        if self._watchdog is not None:
+            self._watchdog.close()
 
     def _discard(self) -> None:
         for thing in (self._policy, self._simulator):
@@ -98,12 +124,28 @@ class RolloutWorker:
                 continue
         self._policy = self._simulator = None
 
+    def _check_server(self) -> None:
+        """See whether the policy's server is still there: without it nothing can be done here.
+
+        Raises:
+            WorkerRetiredError: It is not.
+        """
+        try:
+            self._policy = self._make_policy()
+            self._policy.metadata()  # connects
+        except PolicyServerError as error:
+            raise WorkerRetiredError(error.message, error.hint) from error
+        finally:
+            self._discard()
+
     def _broken(self, item: WorkItem, error: Exception) -> Rollout:
         seed = difficulty = None
         if self._split is not None:
             manifest = self._split.manifest(item.episode, self._split.k_values[0])
             seed, difficulty = manifest.seed, manifest.difficulty
-        text = error.message if isinstance(error, InterferenceError) else str(error)
+        text = str(error)
+        if isinstance(error, InterferenceError):
+            text = error.message if error.hint is None else f"{error.message} ({error.hint})"
         return error_row(
             self.config, item, f"{type(error).__name__}: {text}", seed=seed, difficulty=difficulty
         )
@@ -140,10 +182,16 @@ def make_selector(config: RunConfig) -> Selector:
 
 
 def simulator_options(
-    config: RunConfig, policy: Policy, selector: Selector | None
+    config: RunConfig, watched: Iterable[str], selector: Selector | None
 ) -> dict[str, Any]:
-    """Return the options of a run's simulator: it draws only what somebody looks at."""
-    wanted = {*policy.cameras, *([selector.camera] if selector else [])}
+    """Return the options of a run's simulator: it draws only what somebody looks at.
+
+    Args:
+        config: The run.
+        watched: Cameras that the policy wants.
+        selector: The retrieval step, or None.
+    """
+    wanted = {*watched, *([selector.camera] if selector else [])}
     if config.videos:
         wanted |= {"front", "wrist"}
     if config.check_lesson:

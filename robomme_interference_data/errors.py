@@ -40,6 +40,9 @@ __all__ = [
     "WireError",
     "RolloutError",
     "RunFolderError",
+    # processes
+    "WorkerError",
+    "WorkerRetiredError",
     # helpers
     "nearest",
 ]
@@ -160,6 +163,14 @@ class RolloutError(InterferenceError, RuntimeError):
 
 class RunFolderError(InterferenceError, FileExistsError):
     """A run's folder that holds another run, or that another process is writing."""
+
+
+class WorkerError(InterferenceError, RuntimeError):
+    """Worker processes that cannot be started."""
+
+
+class WorkerRetiredError(InterferenceError, RuntimeError):
+    """A worker that can do no further task: what it had to do is left to the others."""
 
 
 def nearest(given: str, known: Iterable[str]) -> str:

@@ -1,8 +1,13 @@
 """Policies as users write them, for `python:own_policies:…`."""
 
+import os
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
 
 class Still:
@@ -75,3 +80,30 @@ def with_array() -> Still:
 
 def with_text() -> Still:
     return changed("metadata", lambda: "still")
+
+
+class Talker(Still):
+    """Writes to stdout wherever it can, and a line to the file of CLOSED when it is closed."""
+
+    def reset(self, info: Any) -> None:
+        sys.stdout.write("reset\n")
+
+    def close(self) -> None:
+        sys.stdout.write("closed\n")
+        with Path(os.environ["CLOSED"]).open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+
+def talker() -> Talker:
+    sys.stdout.write("made\n")
+    return Talker()
+
+
+def insider() -> Still:
+    return changed("privileged", True)
+
+
+def served(worker: int = 0) -> WebsocketPolicy:
+    """One of the servers of SERVERS, host:port with commas between; asked once, not six times."""
+    host, port = os.environ["SERVERS"].split(",")[worker].split(":")
+    return WebsocketPolicy(host, int(port), attempts=1)

@@ -1,8 +1,11 @@
 """A simulator without physics over the sample split, and a policy that would cheat."""
 
 import os
+import re
 import signal
 import time
+from collections.abc import Iterator, Mapping, Sequence, Set
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -102,10 +105,11 @@ class World:
 
 
 class Cheat:
-    """Does what the lesson shows if it can get hold of it, by whatever way; else it holds.
+    """Does what the lesson shows if it can get hold of any of it, by whatever way; else it holds.
 
-    It looks through all that it is given: history, live frames, and everything that can be
-    reached from the info, simulator included.
+    It knows the split's demonstrations by heart, so that one frame or state of them tells it the
+    answer. It looks for one in all that it is given: everything that can be reached from the info
+    and the goal, the history, and the live observations.
     """
 
     cameras: tuple[str, ...] = ("front",)
@@ -116,30 +120,84 @@ class Cheat:
 
     def reset(self, info: RolloutInfo) -> None:
         self.info = info
+        self.answer: NDArray[np.float32] | None = None
         self.states: list[NDArray[np.float32]] = []
         self.live: list[int] = []
         self.chunks: list[tuple[int, int]] = []
+        self.search(info)
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         assert sorted(frames) == ["front", "wrist"]
         assert all(len(part) == len(states) for part in frames.values())
+        self.search((frames, states))
         self.states += list(states)
         self.chunks.append((len(states), exec_start_idx))
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
         assert list(frames) == ["front"] and len(frames["front"]) == len(states)
+        self.search((frames, states))
         self.live.append(len(states))
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        assert self.info.simulator is None, "only privileged policies get the simulator"
-        state = self.states[ANSWER_FRAME] if len(self.states) > ANSWER_FRAME else observation.state
+        self.search((observation, goal))
+        state = observation.state if self.answer is None else self.answer
         return np.tile(np.append(state[:7], np.float32(1.0)), (16, 1))
+
+    def search(self, given: object) -> None:
+        """Take the answer from the first demonstration frame or state in what was given."""
+        if self.answer is None:
+            known = demonstrations(os.environ[SPLIT])
+            found = (known[piece] for piece in pieces(given, set()) if piece in known)
+            self.answer = next(found, None)
 
     def metadata(self) -> dict[str, Any]:
         return {"policy": "cheat"}
 
     def close(self) -> None:
         pass
+
+
+@cache
+def demonstrations(split: str) -> dict[bytes, NDArray[np.float32]]:
+    """Every frame and joint state of the split's lessons, as bytes, and the answer that it tells.
+
+    What `World` shows of an episode anyway is left out: its only view and state.
+    """
+    loaded = load_split(split, threads=1)
+    known: dict[bytes, NDArray[np.float32]] = {}
+    shown: set[bytes] = set()
+    for episode in loaded.episode_ids:
+        buffer = loaded.load(episode, 0)
+        answer = buffer.states[ANSWER_FRAME]
+        images = [buffer.frames(camera) for camera in buffer.cameras]
+        known |= dict.fromkeys(pieces([buffer.states, images], set()), answer)
+        views = [buffer.query_frame(camera) for camera in buffer.cameras]
+        shown |= set(pieces([buffer.states[-1], views], set()))
+    return {piece: answer for piece, answer in known.items() if piece not in shown}
+
+
+def pieces(given: object, seen: set[int]) -> Iterator[bytes]:
+    """Yield every image, and every seven numbers that could be joints, in what was given."""
+    if id(given) in seen:
+        return
+    seen.add(id(given))
+    if isinstance(given, np.ndarray):
+        if given.dtype == np.uint8 and given.ndim >= 3:
+            yield from (image.tobytes() for image in given.reshape(-1, *given.shape[-3:]))
+        elif given.dtype.kind == "f" and given.ndim and given.shape[-1] >= 7:
+            rows = given.reshape(-1, given.shape[-1]).astype(np.float32)
+            yield from (row[:7].tobytes() for row in rows)
+        return
+    if isinstance(given, str):
+        numbers = np.array(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", given), np.float32)
+        yield from (numbers[at : at + 7].tobytes() for at in range(len(numbers) - 6))
+    elif isinstance(given, Mapping):
+        yield from pieces([*given.keys(), *given.values()], seen)
+    elif isinstance(given, Sequence | Set):
+        for one in given:
+            yield from pieces(one, seen)
+    if hasattr(given, "__dict__") and not isinstance(given, type):
+        yield from pieces(list(vars(given).values()), seen)
 
 
 def make_cheat() -> Cheat:

@@ -134,7 +134,7 @@ def test_the_time_limit_of_a_run_is_the_simulators() -> None:
         robomme_python="python",
         simulator_s=1000.0,
     )
-    assert simulator_options(config, make_policy("hold"), None) == {
+    assert simulator_options(config, make_policy("hold").cameras, None) == {
         "python": "python",
         "cameras": (),
         "reset_s": 900.0,

@@ -3,6 +3,9 @@
 import csv
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ import rollout_doubles
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data import load_split
+from robomme_interference_data import evaluate, load_split
 from robomme_interference_data.errors import (
     FormatError,
     HistoryTooLongError,
@@ -354,7 +357,7 @@ def test_a_history_beyond_the_systems_positions_is_refused(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("raise", "SimulatorCrashError: the world fell apart"),
+        ("raise", "SimulatorCrashError: the world fell apart (Pick it up.)"),
         ("error", "RolloutError: the rollout_doubles:World simulator reported an error at step 7"),
         ("die", "RuntimeError: the worker process died (exit code -9)"),
         ("hang", "TimeoutError: still running after 8 s"),
@@ -396,8 +399,21 @@ def test_a_simulator_that_hangs_is_an_error_with_its_traceback(tmp_path: Path) -
     assert (broken.condition, broken.episode, broken.attempt) == ("no-history", 0, 2)
     assert broken.error == "the simulator hung: no answer for 8 s"
     log = (tmp_path / "run" / "errors.log").read_text()
-    assert log.count("Timeout (0:00:08)!") == 2  # it was tried twice
+    assert log.count("Timeout (0:00:08)!") == 1  # that of the second time
     assert "rollout_doubles.py" in log and "in step" in log
+
+
+def test_what_a_hung_worker_said_is_told_of_no_other_rollout(tmp_path: Path) -> None:
+    trouble(tmp_path, "MoveCube-0", "hang once")
+    options = {"conditions": ["no-history"], "episodes": "0", "simulator_s": 8.0}
+    hung = run(tmp_path / "run", families=["MoveCube"], **options)
+    assert [(row.status, row.attempt) for row in hung.rows] == [("fail", 2)]
+    trouble(tmp_path, "PatternLock-0", "die")
+    died = run(tmp_path / "run", families=["PatternLock"], **options)
+    assert [row.error for row in died.rows] == [
+        "RuntimeError: the worker process died (exit code -9)"
+    ]
+    assert not (tmp_path / "run" / "errors.log").exists()
 
 
 def test_a_worker_that_dies_once_is_replaced(tmp_path: Path) -> None:
@@ -434,3 +450,63 @@ def test_the_split_may_be_given_by_any_path(tmp_path: Path) -> None:
     )
     assert len(again.rows) == 2
     assert load_split(link).revision == load_split(factories.split()).revision
+
+
+# --- scripts -----------------------------------------------------------------------------------
+
+
+def script(tmp_path: Path, call: str) -> subprocess.CompletedProcess[str]:
+    """Run a script that ends with a call of `run_evaluation`."""
+    options = f"{str(factories.split())!r}, 'run', simulator={WORLD!r}, system='mine', "
+    options += "conditions=['k0'], families=['MoveCube'], episodes='0'"
+    path = tmp_path / "script.py"
+    path.write_text(
+        "from rollout_doubles import make_cheat\n"
+        "from robomme_interference_data.evaluate import run_evaluation\n"
+        + call.format(options=options)
+    )
+    return subprocess.run(
+        [sys.executable, str(path)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+GUARD = 'if __name__ == "__main__":'
+
+
+def test_a_script_with_the_guard_runs(tmp_path: Path) -> None:
+    call = f"{GUARD}\n    print(run_evaluation({CHEAT!r}, {{options}}).counts)\n"
+    done = script(tmp_path, call)
+    assert done.stderr == ""
+    assert done.stdout == "{'success': 1, 'fail': 0, 'timeout': 0, 'error': 0}\n"
+
+
+def test_a_script_without_the_guard_gets_one_error_and_no_rows(tmp_path: Path) -> None:
+    done = script(tmp_path, f"run_evaluation({CHEAT!r}, {{options}}, workers=2)\n")
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    assert done.stderr.splitlines()[-1] == f"Put the call into the script under  {GUARD}"
+    assert read_log(tmp_path / "run") == {}
+    header = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert header["status"] == "incomplete"
+    assert header["stopped"].startswith("the worker processes came upon the call that starts them")
+
+
+def test_a_factory_in_the_script_itself_is_refused(tmp_path: Path) -> None:
+    done = script(
+        tmp_path, f"{GUARD}\n    run_evaluation('python:__main__:make_cheat', {{options}})\n"
+    )
+    assert done.stderr.splitlines()[-1].endswith("and write python:MODULE:FUNCTION.")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_example_has_the_guard() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "evaluate.md").read_text(encoding="utf-8")
+    for text in (page, evaluate.__doc__ or ""):
+        snippet = text.split("```python\n")[1].split("```")[0]
+        assert snippet.index(GUARD) < snippet.index("run_evaluation(")

@@ -1,5 +1,6 @@
 """The files of a run, held against golden ones, and the command that writes them."""
 
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -141,3 +142,18 @@ def test_memory_belongs_to_replay(tmp_path: Path) -> None:
     words = ["evaluate", "--policy", "hold", "--memory", "full", "--split", ".", "--out", "x"]
     with pytest.raises(InvalidOptionError, match="only replay has memory rules"):
         CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_help_is_whole_at_80_columns(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from robomme_interference_data.evaluate import commands
+
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = run("evaluate", "--help")
+    names = [name for name in inspect.signature(commands.evaluate).parameters if name != "as_json"]
+    assert len(names) > 20
+    for name in names:
+        assert f"--{name.replace('_', '-')} " in out
+    # The examples are as they can be typed: a command begins a line, and goes on in the next.
+    lines = [line.strip() for line in out.splitlines()]
+    place = lines.index("robomme-interference evaluate --policy replay --shard 2/8 \\")
+    assert lines[place + 1] == "--split S --out runs/shard-2"

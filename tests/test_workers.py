@@ -20,7 +20,11 @@ from typing import Any
 
 import pytest
 
-from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
+from robomme_interference_data.errors import (
+    InvalidIdError,
+    InvalidOptionError,
+    WorkerRetiredError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.workers import Outcome, run_tasks
 
@@ -270,3 +274,147 @@ def test_idle_workers_end_with_their_parent(pid_folder: Path) -> None:
         finally:
             parent.kill()
     wait_until_gone(pids, seconds=20)
+
+
+# --- what workers leave behind -----------------------------------------------------------------
+
+STARTS = (
+    "import multiprocessing, os, pathlib, time\n"
+    "process = multiprocessing.get_context('{method}').Process(target=time.sleep, args=(1e5,))\n"
+    "process.start()\n"
+    "pathlib.Path('{folder}', str(process.pid)).touch()\n"
+    "pathlib.Path('{folder}', str(os.getpid())).touch()\n"
+)
+
+
+def script(folder: Path, text: str) -> list[str]:
+    path = folder / "script.py"
+    path.write_text(text)
+    return [sys.executable, str(path)]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_may_start_processes_which_end_with_them(pid_folder: Path, method: str) -> None:
+    started = STARTS.format(method=method, folder=pid_folder)
+    (outcome,) = run([partial(exec, started)])
+    assert outcome.error is None
+    wait_until_gone(pids_in(pid_folder, 2), seconds=5)
+
+
+def test_processes_of_a_worker_end_though_everything_above_is_killed(
+    pid_folder: Path, tmp_path: Path
+) -> None:
+    started = STARTS.format(method="fork", folder=pid_folder) + "time.sleep(1e5)\n"
+    command = script(
+        tmp_path,
+        "import operator\nfrom functools import partial\n"
+        "from robomme_interference_data.workers import run_tasks\n"
+        "if __name__ == '__main__':\n"
+        f"    list(run_tasks(operator.call, [partial(exec, {started!r})], workers=1))\n",
+    )
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as parent:
+        try:
+            pids = pids_in(pid_folder, 2)
+            assert all(map(is_alive, pids))
+        finally:
+            parent.kill()
+    wait_until_gone(pids, seconds=20)
+
+
+def test_a_dead_worker_is_noticed_though_its_process_holds_the_pipe(pid_folder: Path) -> None:
+    dies = STARTS.format(method="fork", folder=pid_folder) + "os._exit(3)\n"
+    (outcome,) = run([partial(exec, dies)], attempts=1)
+    assert str(outcome.error) == "the worker process died (exit code 3)"
+    wait_until_gone(pids_in(pid_folder, 2), seconds=5)
+
+
+def test_workers_without_work_close_what_they_hold_and_print_to_stderr(tmp_path: Path) -> None:
+    (tmp_path / "held.py").write_text(
+        "import os, subprocess, time\n"
+        "class Held:\n"
+        "    def __call__(self, task):\n"
+        "        print('printed', task, flush=True)\n"
+        "        subprocess.run(['echo', 'echoed'], check=True)\n"
+        "        return task\n"
+        "    def close(self):\n"
+        "        print('closed', flush=True)\n"
+    )
+    command = script(
+        tmp_path,
+        "import held\nfrom robomme_interference_data.workers import run_tasks\n"
+        "if __name__ == '__main__':\n"
+        "    print([outcome.value for outcome in run_tasks(held.Held(), [1], workers=1)])\n",
+    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[1]\n"
+    assert done.stderr.split() == ["printed", "1", "echoed", "closed"]
+
+
+def test_what_does_not_close_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from robomme_interference_data import workers
+
+    monkeypatch.setattr(workers, "_CLOSE_S", 1.0)
+    stays = (
+        f"import threading, time\nthreading.Thread(target=time.sleep, args=({FOREVER},)).start()"
+    )
+    began = time.monotonic()
+    (outcome,) = run([partial(exec, stays)])
+    assert outcome.error is None
+    assert time.monotonic() - began < 30
+
+
+def test_a_worker_that_retires_leaves_its_task_to_the_others(tmp_path: Path) -> None:
+    """Worker 0 retires at its first task, worker 1 never, then after three of them."""
+    retires = (
+        "import os, pathlib\n"
+        "from robomme_interference_data.errors import WorkerRetiredError\n"
+        "from robomme_interference_data.workers import worker_number\n"
+        f"log = pathlib.Path({str(tmp_path)!r}, 'log')\n"
+        "done = log.read_text() if log.exists() else ''\n"
+        "if worker_number() == 0 or len(done) == {last}:\n"
+        "    raise WorkerRetiredError(f'worker {{worker_number()}} is gone', 'Start it.')\n"
+        "log.write_text(done + 'x')\n"
+    )
+    outcomes = run([partial(exec, retires.format(last=9))] * 5, workers=2)
+    assert [(o.error, o.attempts, o.worker) for o in outcomes] == [(None, 1, 1)] * 5
+    (tmp_path / "log").unlink()
+    ended = []
+    with pytest.raises(WorkerRetiredError, match=r"worker [01] is gone") as raised:
+        for outcome in run_tasks(
+            operator.call, [partial(exec, retires.format(last=3))] * 5, workers=2
+        ):
+            ended.append(outcome.error)
+    assert ended == [None] * 3
+    assert raised.value.hint == "Start it."
+
+
+AGAIN = "the worker processes came upon the call that starts them"
+
+
+def test_a_script_without_the_guard_gets_one_error(tmp_path: Path) -> None:
+    command = script(
+        tmp_path,
+        "import math\nfrom robomme_interference_data.workers import run_tasks\n"
+        "list(run_tasks(math.sqrt, [4, 9], workers=2))\n",
+    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    assert done.stderr.count(AGAIN) == 1
+    assert 'if __name__ == "__main__":' in done.stderr.splitlines()[-1]
+
+
+def test_a_worker_that_cannot_start_stops_the_work(tmp_path: Path) -> None:
+    """A script from stdin is no file that workers could import."""
+    done = subprocess.run(
+        [sys.executable, "-"],
+        input="import math\nfrom robomme_interference_data.workers import run_tasks\n"
+        "list(run_tasks(math.sqrt, [4, 9, 16], workers=1))\n",
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("No such file or directory") == 1  # its last words
+    assert "ended before its first task (exit code 1); what it said is above" in done.stderr

@@ -8,7 +8,7 @@ from typing import Any
 from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Simulator
 
-__all__ = ["SIMULATORS", "make_simulator", "own_simulator"]
+__all__ = ["SIMULATORS", "find_simulator", "make_simulator", "own_simulator"]
 
 
 def _tabletop(**options: Any) -> Simulator:
@@ -45,19 +45,28 @@ def make_simulator(name: str, **options: Any) -> Simulator:
         InvalidOptionError: An option is not what it may be.
         NoRendererError: This machine cannot draw its cameras' pictures.
     """
+    return find_simulator(name)(**options)
+
+
+def find_simulator(name: str) -> Callable[..., Simulator]:
+    """Return the function that makes a simulator, without calling it.
+
+    Raises:
+        UnknownNameError: There is no such simulator.
+    """
     if name in SIMULATORS:
-        return SIMULATORS[name](**options)
+        return SIMULATORS[name]
     module, _, function = name.partition(":")
     if not function:
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
     try:
-        simulator: Simulator = getattr(import_module(module), function)(**options)
+        found: Callable[..., Simulator] = getattr(import_module(module), function)
     except (ModuleNotFoundError, AttributeError) as error:
         raise UnknownNameError(
             f"there is no simulator {name!r}: {error}",
             "Expected <module>:<function>, which can be imported and returns a simulator.",
         ) from error
-    return simulator
+    return found
 
 
 @cache
