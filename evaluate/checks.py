@@ -52,8 +52,7 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
             what it is.
     """
     check_workers(parse_policy(config.policy), config.workers)
-    options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
-    policy = make_policy(config.policy, **options)
+    policy = make_policy(config.policy, **config.policy_arguments)
     try:
         said = policy.metadata()
         if not isinstance(said, Mapping):

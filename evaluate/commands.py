@@ -2,7 +2,10 @@
 
 import json
 import shlex
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +23,7 @@ def evaluate(
         str,
         typer.Option(
             help="replay, oracle, guess, hold, websocket://host:port[,host:port…], "
-            "lerobot:REPO_OR_PATH or python:module:factory."
+            "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
         ),
     ],
     split: Annotated[Path, typer.Option(help="Folder of the split of buffers.")],
@@ -41,6 +44,14 @@ def evaluate(
     ] = None,
     memory: Annotated[
         str | None, typer.Option(help="Memory of replay: full, framesamp or window.")
+    ] = None,
+    policy_option: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="Option of the policy, such as device=cpu or response_s=60; may be repeated.",
+            show_default=False,
+        ),
     ] = None,
     model_seed: Annotated[int, typer.Option(help="Seed for the policy.")] = 0,
     retrieval: Annotated[
@@ -95,6 +106,8 @@ def evaluate(
 
       robomme-interference evaluate --policy replay --split S --out runs/shard-2 --shard 2/8
     """
+    from robomme_interference_data.evaluate.policies.options import read_options, split_options
+    from robomme_interference_data.evaluate.policies.registry import policy_factory
     from robomme_interference_data.evaluate.progress import RunProgress, rate_table
     from robomme_interference_data.evaluate.runner import run_evaluation
     from robomme_interference_data.simulators.base import Status
@@ -104,9 +117,11 @@ def evaluate(
             f"--memory {memory} says nothing to the policy {policy}: only replay has memory rules",
             "Leave it out.",
         )
+    factory, _ = policy_factory(policy)
+    options = read_options(factory, split_options(policy_option or []))
     command = shlex.join(["robomme-interference", *sys.argv[1:]])
     try:
-        with RunProgress(quiet=as_json) as progress:
+        with _terminable(), RunProgress(quiet=as_json) as progress:
             result = run_evaluation(
                 policy,
                 split,
@@ -119,6 +134,7 @@ def evaluate(
                 shard=shard,
                 system=system,
                 memory=memory,
+                policy_options=options,
                 model_seed=model_seed,
                 retrieval=retrieval,
                 retrieval_threshold=retrieval_threshold,
@@ -135,10 +151,10 @@ def evaluate(
                 command=[command],
                 listener=progress,
             )
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         MESSAGES.print(f"\nStopped. Finished rollouts are in {out}; go on with:")
         MESSAGES.print(command)
-        raise typer.Exit(130) from None
+        raise typer.Exit(143 if isinstance(stop, _Terminated) else 130) from None
     if as_json:
         typer.echo(json.dumps([row.as_dict() for row in result.rows], ensure_ascii=False))
     else:
@@ -153,6 +169,25 @@ def evaluate(
         )
         MESSAGES.print(command)
         raise typer.Exit(1)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM, with which schedulers and containers stop a job, stop a run as Ctrl-C does."""
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short
+        raise _Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def merge(

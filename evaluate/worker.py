@@ -78,10 +78,9 @@ class RolloutWorker:
         if self._split is None:
             self._split = load_split(config.split, cache=config.cache, threads=1)
         if self._policy is None:
-            options: dict[str, Any] = {}
-            if config.memory is not None:
-                options["memory"] = config.memory
-            self._policy = make_policy(config.policy, worker=worker_number(), **options)
+            self._policy = make_policy(
+                config.policy, worker=worker_number(), **config.policy_arguments
+            )
         if self._selector is None and config.retrieval is not None:
             self._selector = make_selector(config)
         if self._simulator is None:

@@ -141,3 +141,20 @@ def test_memory_belongs_to_replay(tmp_path: Path) -> None:
     words = ["evaluate", "--policy", "hold", "--memory", "full", "--split", ".", "--out", "x"]
     with pytest.raises(InvalidOptionError, match="only replay has memory rules"):
         CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_options_of_the_policy_are_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+    line = "evaluate --policy python:own_policies:Still --simulator rollout_doubles:World "
+    line += "--families MoveCube --conditions no-history --episodes 0 --json "
+    line += "--policy-option gripper=-1"
+    words = [*line.split(), "--split", str(factories.split()), "--out", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, spread(words))
+    assert done.exit_code == 0, done.output
+    header = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert header["identity"]["policy_options"] == {"gripper": -1}
+    with pytest.raises(InvalidOptionError, match="speed") as raised:
+        CliRunner().invoke(
+            app, spread([*words, "--policy-option", "speed=1"]), catch_exceptions=False
+        )
+    assert raised.value.hint == "Its options: gripper."
