@@ -66,10 +66,15 @@ def evaluate(
         typer.Option(help="Interpreter that has RoboMME.", envvar="ROBOMME_PYTHON"),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Worker processes.")] = 1,
-    videos: Annotated[bool, typer.Option(help="Write a video of each rollout.")] = False,
+    videos: Annotated[
+        bool, typer.Option("--videos", help="Write a video of each rollout.")
+    ] = False,
     check_lesson: Annotated[
         bool,
-        typer.Option(help="Compare each lesson with what the simulator plays, bit for bit."),
+        typer.Option(
+            "--check-lesson",
+            help="Compare each lesson with what the simulator plays, bit for bit.",
+        ),
     ] = False,
     rollout_timeout: Annotated[float, typer.Option(help="Seconds a rollout may take.")] = 3600.0,
     simulator_timeout: Annotated[
@@ -77,7 +82,10 @@ def evaluate(
         typer.Option(help="Seconds a reset, or 16 steps, may take before the simulator hung."),
     ] = 1800.0,
     cache: Annotated[
-        bool, typer.Option(help="Keep decoded history frames on disk: a second run is faster.")
+        bool,
+        typer.Option(
+            "--cache", help="Keep decoded history frames on disk: a second run is faster."
+        ),
     ] = False,
     history_chunk: Annotated[
         int, typer.Option(min=1, help="Frames of history handed over at a time.")
@@ -85,26 +93,33 @@ def evaluate(
     max_errors: Annotated[
         int, typer.Option(min=1, help="Errors in a row after which the run stops.")
     ] = 10,
-    resume: Annotated[bool, typer.Option(help="Go on with a run that is there.")] = True,
+    no_resume: Annotated[
+        bool, typer.Option("--no-resume", help="Refuse a folder that holds a run already.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write the rows as JSON.")] = False,
 ) -> None:
-    """Roll out a policy under the benchmark's conditions, one row per rollout.
+    r"""Roll out a policy under the benchmark's conditions, one row per rollout.
 
     Before each episode the policy gets the history that the condition prescribes: nothing
     (no-history), the lesson (k0), or the lesson and k sessions of other tasks. RUN/rollouts.csv,
     RUN/rollouts.parquet and RUN/run.json hold what came out. Stop it at any time: the same
     command goes on, skips what is finished and repeats what broke.
 
-    Examples:
-      robomme-interference evaluate --policy replay --memory window --split S --out runs/window
+    For example:
 
-      robomme-interference evaluate --policy websocket://localhost:8000 --split S --out runs/mine
-      --system perceptual-framesamp-modul --conditions k0 k7 --families MoveCube RouteStick
-
-      robomme-interference evaluate --policy oracle --split S --out runs/oracle --episodes 0-4
-      --videos
-
-      robomme-interference evaluate --policy replay --split S --out runs/shard-2 --shard 2/8
+    ```
+    robomme-interference evaluate --policy replay --memory window \
+        --split S --out runs/window
+    robomme-interference evaluate --policy websocket://localhost:8000 \
+        --system perceptual-framesamp-modul --split S --out runs/mine \
+        --conditions k0 k7 --families MoveCube RouteStick
+    robomme-interference evaluate --policy lerobot:me/act@v1 \
+        --system act-v1 --policy-option device=cpu --split S --out runs/act
+    robomme-interference evaluate --policy oracle --split S \
+        --out runs/oracle --episodes 0-4 --videos
+    robomme-interference evaluate --policy replay --split S \
+        --out runs/shard-2 --shard 2/8
+    ```
     """
     from robomme_interference_data.evaluate.policies.options import read_options, split_options
     from robomme_interference_data.evaluate.policies.registry import policy_factory
@@ -147,7 +162,7 @@ def evaluate(
                 cache=cache,
                 history_chunk=history_chunk,
                 max_errors=max_errors,
-                resume=resume,
+                resume=not no_resume,
                 command=[command],
                 listener=progress,
             )
@@ -155,6 +170,11 @@ def evaluate(
         MESSAGES.print(f"\nStopped. Finished rollouts are in {out}; go on with:")
         MESSAGES.print(command)
         raise typer.Exit(143 if isinstance(stop, _Terminated) else 130) from None
+    except OSError as error:
+        if error.errno is not None:  # the system's word on a file, such as that the disk is full
+            MESSAGES.print(f"Stopped. Finished rollouts are in {out}; once mended, go on with:")
+            MESSAGES.print(command)
+        raise
     if as_json:
         typer.echo(json.dumps([row.as_dict() for row in result.rows], ensure_ascii=False))
     else:
@@ -200,8 +220,11 @@ def merge(
     The shards must agree in all settings that can change a result. The joined run scores like
     any other, and evaluate with its folder as --out runs what is missing.
 
-    Example:
-      robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
+    For example:
+
+    ```
+    robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
+    ```
     """
     from robomme_interference_data.evaluate.merge import Cell, merge_runs
     from robomme_interference_data.evaluate.progress import rate_table

@@ -1,5 +1,6 @@
 """What a run is: its settings, and which of them make it that run."""
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -82,6 +83,15 @@ class RunConfig:
     history_chunk: int = 64
     max_errors: int = 10
     policy_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        try:
+            json.dumps(self.policy_options)
+        except (TypeError, ValueError):
+            raise InvalidOptionError(
+                f"policy options {dict(self.policy_options)!r} cannot be written down",
+                "Expected text, numbers, True, False, None, or lists of them.",
+            ) from None
 
     @property
     def policy_arguments(self) -> dict[str, Any]:

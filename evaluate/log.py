@@ -76,14 +76,19 @@ class RunLog:
 
         Raises:
             FormatError: There is a finished row of this key already.
+            OSError: The file cannot be written; it is named.
         """
         if row.key in self.finished:
             raise FormatError(f"{self.folder} has a row of {row.key} already")
         line = (canonical_json(row.as_dict()) + "\n").encode()
-        with (self.folder / LOG_NAME).open("ab") as file:
-            file.write(line)
-            file.flush()
-            os.fsync(file.fileno())
+        path = self.folder / LOG_NAME
+        try:
+            with path.open("ab") as file:
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:  # from writing, it names no file
+            raise OSError(error.errno, error.strerror, str(path)) from error
         self.rows[row.key] = row
         if traceback:
             with (self.folder / ERRORS_NAME).open("a", encoding="utf-8") as file:

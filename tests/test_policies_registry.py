@@ -207,6 +207,9 @@ def test_what_of_a_policy_can_change_a_result() -> None:
         "policy_options": {},
         "policy_metadata": {"sha256": "ab"},
     }
+    changed = "python:own_policies:changed"
+    assert identity_of(changed, {}, name="x", value=[1])["policy_options"]["value"] == [1]
+    assert "value" not in identity_of(changed, {}, name="x", value=object())["policy_options"]
     whole = identity_of("python:own_policies:Still", {}, gripper=1)
     assert repr(whole) == repr(identity_of("python:own_policies:Still", {}))
     own = identity_of("python:own_policies:Still", {"device": "cuda"}, gripper=0.5)

@@ -1,7 +1,9 @@
 """The files of a run, held against golden ones, and the command that writes them."""
 
 import json
+import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import factories
@@ -12,6 +14,7 @@ from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app, spread
 from robomme_interference_data.errors import FormatError, InvalidIdError, InvalidOptionError
+from robomme_interference_data.evaluate import log as log_module
 from robomme_interference_data.evaluate.log import open_log, read_log
 from robomme_interference_data.evaluate.rows import Rollout, condition_rank
 
@@ -158,3 +161,30 @@ def test_options_of_the_policy_are_typed(tmp_path: Path, monkeypatch: pytest.Mon
             app, spread([*words, "--policy-option", "speed=1"]), catch_exceptions=False
         )
     assert raised.value.hint == "Its options: gripper."
+
+
+def test_a_full_disk_names_the_file_and_the_command_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+    monkeypatch.setattr(log_module, "os", SimpleNamespace(fsync=full))
+    out = tmp_path / "run"
+    line = "evaluate --policy hold --simulator rollout_doubles:World --families MoveCube "
+    line += "--conditions no-history --episodes 0"
+    words = [*line.split(), "--split", str(factories.split()), "--out", str(out)]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, OSError)
+    assert done.exception.filename == str(out / "rollouts.jsonl")
+    assert f"Finished rollouts are in {out}; once mended, go on with:\nrobomme-inter" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["evaluate", "merge"])
+def test_the_help_is_whole_in_80_columns(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = CliRunner().invoke(app, [name, "--help"]).stdout
+    options = text[text.index("Options") :]
+    assert "--out " in options and not re.search(r"--[a-z-]+…", options)
+    assert re.search(rf"^ *robomme-interference {name} [^\n]*(\\| --out runs/whole) *$", text, re.MULTILINE)

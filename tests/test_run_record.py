@@ -15,7 +15,8 @@ from test_run import CHEAT, WORLD, run, untimed
 
 from robomme_interference_data.errors import FormatError, RunFolderError
 from robomme_interference_data.evaluate import merge_runs, run_evaluation, runner
-from robomme_interference_data.evaluate.log import read_log
+from robomme_interference_data.evaluate.log import check_tables, read_log
+from robomme_interference_data.evaluate.score.read import find_sources
 
 ONE: dict[str, Any] = {"families": ["MoveCube"], "episodes": "0", "conditions": ["no-history"]}
 
@@ -261,3 +262,25 @@ def test_a_header_without_plans_is_one_clear_error(
     for attempt in (lambda: run(out, **ONE), lambda: merge_runs([out], tmp_path / "merged")):
         with pytest.raises(FormatError, match=r"run\.json lacks the plans of the run"):
             attempt()
+
+
+def test_tables_behind_the_record_are_not_scored(finished: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(finished, tmp_path / "run")
+    check_tables(out)
+    assert find_sources([out])[0].path == out / PARQUET
+    table = pq.read_table(out / PARQUET)
+    pq.write_table(table.slice(0, 0), out / PARQUET)  # as a killed run leaves it
+    with pytest.raises(
+        FormatError, match=r"^1 of 1 rollouts in .* are not in the tables"
+    ) as raised:
+        find_sources([out])
+    hint = str(raised.value.hint)
+    assert f"robomme-interference merge {out} --out {out}-merged" in hint
+    merged = merge_runs([out], f"{out}-merged")
+    assert pq.read_table(merged.folder / PARQUET).equals(table)
+    # Once an error, now mended: as many rows, and not the same.
+    old = table.to_pylist()
+    old[0] |= {"status": "error", "success": None}
+    pq.write_table(table.from_pylist(old, schema=table.schema), out / PARQUET)
+    with pytest.raises(FormatError, match="1 of 1 rollouts"):
+        find_sources([out])

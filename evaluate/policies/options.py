@@ -59,6 +59,14 @@ def _json(text: str) -> Any:
         return text
 
 
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 _WORDS = {
     str: "text",
     int: "a whole number",
@@ -144,7 +152,8 @@ def policy_identity(
     Args:
         kind: `PolicySpec.kind`.
         text: The policy as it is written.
-        options: All options that it is made with, defaults included; only plain ones count.
+        options: All options that it is made with, defaults included; those that are objects of
+            the policy's own are left out.
         said: What it says of itself.
     """
     places = _PLACES.get(kind, ())
@@ -153,7 +162,7 @@ def policy_identity(
         "policy_options": {
             name: value
             for name, value in sorted(options.items())
-            if type(value) in _WORDS and name not in _WITHOUT_EFFECT.get(kind, ())
+            if name not in _WITHOUT_EFFECT.get(kind, ()) and _is_json(value)
         },
         "policy_metadata": {name: value for name, value in said.items() if name not in places},
     }
