@@ -85,6 +85,11 @@ class RunConfig:
     policy_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if "memory" in self.policy_options and (self.policy == "replay" or self.memory is not None):
+            raise InvalidOptionError(
+                "the memory rule is no --policy-option, as it also names the system",
+                f"Give --memory {self.policy_options['memory']}.",
+            )
         try:
             json.dumps(self.policy_options)
         except (TypeError, ValueError):

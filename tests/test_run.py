@@ -305,6 +305,11 @@ def test_a_finished_rollout_with_two_rows_is_refused(tmp_path: Path) -> None:
             "the rows of lerobot:out/last/pretrained_model need a name",
         ),
         ({"policy": "hold", "memory": "full"}, InvalidOptionError, "memory"),
+        (
+            {"policy": "replay", "policy_options": {"memory": "window"}},
+            InvalidOptionError,
+            "the memory rule is no --policy-option",
+        ),
         ({"policy_options": {"a": object()}}, InvalidOptionError, "cannot be written down"),
         ({"policy_options": {"speed": 2}}, InvalidOptionError, "unexpected keyword argument"),
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),

@@ -187,4 +187,6 @@ def test_the_help_is_whole_in_80_columns(name: str, monkeypatch: pytest.MonkeyPa
     text = CliRunner().invoke(app, [name, "--help"]).stdout
     options = text[text.index("Options") :]
     assert "--out " in options and not re.search(r"--[a-z-]+…", options)
-    assert re.search(rf"^ *robomme-interference {name} [^\n]*(\\| --out runs/whole) *$", text, re.MULTILINE)
+    assert re.search(
+        rf"^ *robomme-interference {name} [^\n]*(\\| --out runs/whole) *$", text, re.MULTILINE
+    )
