@@ -82,10 +82,9 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
             "write python:MODULE:FUNCTION.",
         )
     check_workers(spec, config.workers)
-    options: dict[str, Any] = {} if config.memory is None else {"memory": config.memory}
     with redirect_stdout(sys.stderr):  # stdout is for the rows
         traits = [
-            _traits(config, make_policy(config.policy, worker=worker, **options))
+            _traits(config, make_policy(config.policy, worker=worker, **config.policy_arguments))
             for worker in range(max(1, len(spec.servers)))
         ]
     first = traits[0]

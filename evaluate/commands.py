@@ -2,7 +2,10 @@
 
 import json
 import shlex
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +23,7 @@ def evaluate(
         str,
         typer.Option(
             help="replay, oracle, guess, hold, websocket://host:port[,host:port…], "
-            "lerobot:REPO_OR_PATH or python:module:factory."
+            "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
         ),
     ],
     split: Annotated[Path, typer.Option(help="Folder of the split of buffers.")],
@@ -47,6 +50,14 @@ def evaluate(
     ] = None,
     memory: Annotated[
         str | None, typer.Option(help="Memory of replay: full, framesamp or window.")
+    ] = None,
+    policy_option: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="Option of the policy, such as device=cpu or response_s=60; may be repeated.",
+            show_default=False,
+        ),
     ] = None,
     model_seed: Annotated[int, typer.Option(help="Seed for the policy.")] = 0,
     retrieval: Annotated[
@@ -89,7 +100,9 @@ def evaluate(
         int,
         typer.Option(min=1, metavar="N", help="Errors in a row after which the run stops."),
     ] = 10,
-    resume: Annotated[bool, typer.Option(help="Go on with a run that is there.")] = True,
+    no_resume: Annotated[
+        bool, typer.Option("--no-resume", help="Refuse a folder that holds a run already.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write the rows as JSON.")] = False,
 ) -> None:
     r"""Roll out a policy under the benchmark's conditions, one row per rollout.
@@ -108,6 +121,9 @@ def evaluate(
       --system perceptual-framesamp-modul --split S --out runs/mine \
       --conditions k0 k7 --families MoveCube RouteStick
 
+    robomme-interference evaluate --policy lerobot:me/act@v1 \
+      --system act-v1 --policy-option device=cpu --split S --out runs/act
+
     robomme-interference evaluate --policy oracle --episodes 0-4 --videos \
       --split S --out runs/oracle
 
@@ -115,6 +131,8 @@ def evaluate(
       --split S --out runs/shard-2
     ```
     """
+    from robomme_interference_data.evaluate.policies.options import read_options, split_options
+    from robomme_interference_data.evaluate.policies.registry import policy_factory
     from robomme_interference_data.evaluate.progress import RunProgress, rate_table
     from robomme_interference_data.evaluate.runner import run_evaluation
     from robomme_interference_data.simulators.base import Status
@@ -124,9 +142,11 @@ def evaluate(
             f"--memory {memory} says nothing to the policy {policy}: only replay has memory rules",
             "Leave it out.",
         )
+    factory, _ = policy_factory(policy)
+    options = read_options(factory, split_options(policy_option or []))
     command = shlex.join(["robomme-interference", *sys.argv[1:]])
     try:
-        with RunProgress(quiet=as_json) as progress:
+        with _terminable(), RunProgress(quiet=as_json) as progress:
             result = run_evaluation(
                 policy,
                 split,
@@ -139,6 +159,7 @@ def evaluate(
                 shard=shard,
                 system=system,
                 memory=memory,
+                policy_options=options,
                 model_seed=model_seed,
                 retrieval=retrieval,
                 retrieval_threshold=retrieval_threshold,
@@ -151,14 +172,19 @@ def evaluate(
                 cache=cache,
                 history_chunk=history_chunk,
                 max_errors=max_errors,
-                resume=resume,
+                resume=not no_resume,
                 command=[command],
                 listener=progress,
             )
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         MESSAGES.print(f"\nStopped. Finished rollouts are in {out}; go on with:")
         MESSAGES.print(command)
-        raise typer.Exit(130) from None
+        raise typer.Exit(143 if isinstance(stop, _Terminated) else 130) from None
+    except OSError as error:
+        if error.errno is not None:  # the system's word on a file, such as that the disk is full
+            MESSAGES.print(f"Stopped. Finished rollouts are in {out}; once mended, go on with:")
+            MESSAGES.print(command)
+        raise
     if as_json:
         typer.echo(json.dumps([row.as_dict() for row in result.rows], ensure_ascii=False))
     else:
@@ -175,6 +201,25 @@ def evaluate(
         raise typer.Exit(1)
 
 
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM, with which schedulers and containers stop a job, stop a run as Ctrl-C does."""
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short
+        raise _Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of the shards of a run.")],
     out: Annotated[Path, typer.Option(help="Folder of the joined run, new.")],
@@ -185,8 +230,11 @@ def merge(
     The shards must agree in all settings that can change a result. The joined run scores like
     any other, and evaluate with its folder as --out runs what is missing.
 
-    Example:
-      robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
+    For example:
+
+    ```
+    robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
+    ```
     """
     from robomme_interference_data.evaluate.merge import Cell, merge_runs
     from robomme_interference_data.evaluate.progress import rate_table

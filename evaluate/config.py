@@ -1,11 +1,9 @@
-"""What a run is: its settings, which of them make it that run, and the header that says so."""
+"""What a run is: its settings, and which of them make it that run."""
 
-import platform
+import json
 import re
-import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from importlib import metadata
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +12,16 @@ from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION
 
 __all__ = [
     "IDENTITY",
+    "POLICY",
     "RunConfig",
     "check_same_run",
     "default_system",
     "identity",
-    "provenance",
 ]
 
 IDENTITY = (
     "system",
-    "policy",
-    "memory",
     "simulator",
-    "split_name",
     "revision",
     "episode_split",
     "model_seed",
@@ -35,6 +30,9 @@ IDENTITY = (
 )
 """Settings that can change a result: two runs that differ in one of them never share a folder."""
 
+POLICY = ("policy", "memory", "policy_options")
+"""Settings of which only a part can change a result: `policies.options.policy_identity` says."""
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -42,11 +40,11 @@ class RunConfig:
 
     Attributes:
         system: Name under which the rows stand.
-        policy: Which policy, as `make_policy` reads it.
+        policy: Which policy, as `make_policy` reads it; a model on the Hub with its commit.
         memory: Memory rule of `replay`; None for other policies.
         simulator: Name of the simulator.
         split: Folder of the split of buffers.
-        split_name: `Split.name`.
+        split_name: Label of the split in rows: `Split.name` when the run's folder was made.
         revision: `Split.revision`.
         episode_split: `train`, `val` or `test`.
         model_seed: Seed for the policy.
@@ -61,6 +59,7 @@ class RunConfig:
         cache: Whether to keep decoded history frames on disk, for later conditions and runs.
         history_chunk: Frames of history handed over at a time.
         max_errors: Errors in a row after which the run stops.
+        policy_options: The policy's options by name, without `memory`.
     """
 
     system: str
@@ -83,9 +82,30 @@ class RunConfig:
     cache: bool = False
     history_chunk: int = 64
     max_errors: int = 10
+    policy_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if "memory" in self.policy_options and (self.policy == "replay" or self.memory is not None):
+            raise InvalidOptionError(
+                "the memory rule is no --policy-option, as it also names the system",
+                f"Give --memory {self.policy_options['memory']}.",
+            )
+        try:
+            json.dumps(self.policy_options)
+        except (TypeError, ValueError):
+            raise InvalidOptionError(
+                f"policy options {dict(self.policy_options)!r} cannot be written down",
+                "Expected text, numbers, True, False, None, or lists of them.",
+            ) from None
+
+    @property
+    def policy_arguments(self) -> dict[str, Any]:
+        """The options that the policy is made with."""
+        memory = {} if self.memory is None else {"memory": self.memory}
+        return memory | dict(self.policy_options)
 
 
-EXECUTION = tuple(f.name for f in fields(RunConfig) if f.name not in IDENTITY)
+EXECUTION = tuple(f.name for f in fields(RunConfig) if f.name not in (*IDENTITY, *POLICY))
 """Settings of how a run is carried out: a run may be resumed with others."""
 
 
@@ -102,6 +122,12 @@ def default_system(policy: str, memory: str | None, retrieval: bool) -> str:
             "Give --system, such as perceptual-framesamp-modul, or a name of your own: see "
             "docs/systems.md.",
         )
+    if kind == "lerobot":  # folders are called alike (pretrained_model), and so are revisions
+        raise InvalidOptionError(
+            f"the rows of {policy} need a name: that of a folder or repository does not tell one "
+            "checkpoint from another",
+            f"Give one of your own: --policy {policy} --system act-20000",
+        )
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", target.rstrip("/").split("/")[-1]).strip("-")
     if policy == "replay":
         name = f"replay-{memory or 'full'}"
@@ -109,10 +135,21 @@ def default_system(policy: str, memory: str | None, retrieval: bool) -> str:
     return f"retrieval-{name}" if retrieval else name
 
 
-def identity(config: RunConfig) -> dict[str, Any]:
-    """Return what makes the run the one that it is, as plain values."""
-    return {name: getattr(config, name) for name in IDENTITY} | {
-        "protocol_version": PROTOCOL_VERSION
+def identity(
+    config: RunConfig, policy: Mapping[str, Any], simulator_version: str | None
+) -> dict[str, Any]:
+    """Return what makes the run the one that it is, as plain values.
+
+    Args:
+        config: The settings.
+        policy: What can change a result of the policy; see `policies.options.policy_identity`.
+        simulator_version: Version of the suite of episodes; None where it is not known.
+    """
+    return {
+        **{name: getattr(config, name) for name in IDENTITY},
+        **policy,
+        "simulator_version": simulator_version,
+        "protocol_version": PROTOCOL_VERSION,
     }
 
 
@@ -122,45 +159,29 @@ def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, 
     Raises:
         RunFolderError: It is another; names every difference.
     """
-    names = sorted({*found, *wanted}, key=lambda name: (name not in wanted, name))
-    differing = [name for name in names if found.get(name) != wanted.get(name)]
-    if differing:
-        told = "; ".join(
-            f"{name} is {found.get(name)!r} there, {wanted.get(name)!r} here" for name in differing
-        )
+    there, here = _flat(found), _flat(wanted)
+    names = sorted({*there, *here}, key=lambda name: (name not in here, name))
+    told = [
+        f"{name} is {there.get(name, _NONE)} there, {here.get(name, _NONE)} here"
+        for name in names
+        if there.get(name, _NONE) != here.get(name, _NONE)
+    ]
+    if told:
         raise RunFolderError(
-            f"{folder} holds another run: {told}",
+            f"{folder} holds another run: {'; '.join(told)}",
             "Give another --out, or the settings of the run that is there (see run.json).",
         )
 
 
-def provenance(command: list[str]) -> dict[str, Any]:
-    """Return what produced a run: command, versions, and the state of the source tree."""
-    versions = {"python": platform.python_version()}
-    for name in ("robomme-interference-data", "numpy", "av", "mani-skill", "sapien", "torch"):
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return {"command": command, "versions": versions, "git": _git(), "machine": platform.machine()}
+_NONE = "not known"
 
 
-def _git() -> dict[str, Any] | None:
-    """Return commit and dirty flag of the source tree that runs; None if installed without one."""
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
-        return None
-    try:
-        commit, changes = (
-            subprocess.run(
-                ["git", "-C", str(root), *words],
-                check=True,
-                capture_output=True,
-                text=True,
-                timeout=20,
-            ).stdout.strip()
-            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "-uno"])
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return {"commit": commit, "dirty": bool(changes)}
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return values as text, those of inner maps under names such as `policy_metadata.sha256`."""
+    flat: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = repr(value)
+    return flat

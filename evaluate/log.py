@@ -2,7 +2,8 @@
 
 `rollouts.jsonl` is the record: one line a rollout, on the disk before the next one is counted. A
 line that a crash cut short is dropped, and only that one. `rollouts.parquet` and `rollouts.csv`
-are made from it, whole or not at all; `run.json` says what ran.
+are made from it, whole or not at all; `run.json` says what ran. Where the record is missing, the
+table in `rollouts.parquet` stands for it.
 """
 
 import csv
@@ -10,7 +11,6 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ __all__ = [
     "PARQUET_NAME",
     "RUN_NAME",
     "RunLog",
+    "check_tables",
     "open_log",
     "read_header",
     "read_log",
@@ -47,7 +48,8 @@ ERRORS_NAME = "errors.log"
 LOG_VERSION = 1
 """Version of these files; a reader refuses one that it does not know."""
 
-_COLUMNS = frozenset(field.name for field in fields(Rollout))
+_PLAN = frozenset({"families", "episodes", "conditions", "shard"})
+_ANOTHER = "It was changed or damaged. Give another --out; rollouts.csv still has the rows."
 
 
 class RunLog:
@@ -74,14 +76,19 @@ class RunLog:
 
         Raises:
             FormatError: There is a finished row of this key already.
+            OSError: The file cannot be written; it is named.
         """
         if row.key in self.finished:
             raise FormatError(f"{self.folder} has a row of {row.key} already")
         line = (canonical_json(row.as_dict()) + "\n").encode()
-        with (self.folder / LOG_NAME).open("ab") as file:
-            file.write(line)
-            file.flush()
-            os.fsync(file.fileno())
+        path = self.folder / LOG_NAME
+        try:
+            with path.open("ab") as file:
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:  # from writing, it names no file
+            raise OSError(error.errno, error.strerror, str(path)) from error
         self.rows[row.key] = row
         if traceback:
             with (self.folder / ERRORS_NAME).open("a", encoding="utf-8") as file:
@@ -169,21 +176,25 @@ def open_log(folder: Path, identity: Mapping[str, Any], resume: bool = True) -> 
             check_same_run(folder, header["identity"], identity)
             _drop_torn_line(folder / LOG_NAME)
             log = RunLog(folder, header, read_log(folder))
+            if log.rows and not (folder / LOG_NAME).exists():
+                log.replace(log.rows.values())
         yield log
 
 
 def read_log(folder: Path) -> dict[tuple[Any, ...], Rollout]:
     """Read a run's record: the last row of each key, in the order in which keys first came.
 
-    A last line without an end, which a crash can leave, is not read.
+    A last line without an end, which a crash can leave, is not read. Without a record the rows
+    are those of `rollouts.parquet`.
 
     Raises:
-        FormatError: A line is damaged, has unknown columns, or a finished rollout has two rows.
+        FormatError: A line is damaged, has unknown columns, or a finished rollout has two rows; or
+            the record is missing, and cannot be had from the table.
     """
     path = folder / LOG_NAME
     rows: dict[tuple[Any, ...], Rollout] = {}
     if not path.exists():
-        return rows
+        return _read_table(folder)
     lines = path.read_bytes().split(b"\n")[:-1]
     for number, line in enumerate(lines, 1):
         try:
@@ -197,6 +208,58 @@ def read_log(folder: Path) -> dict[tuple[Any, ...], Rollout]:
             raise FormatError(f"{path}, line {number}: a second row of {row.key}")
         rows[row.key] = row
     return rows
+
+
+def _read_table(folder: Path) -> dict[tuple[Any, ...], Rollout]:
+    """Read the rows of a folder that has lost its record; none where there is no table either."""
+    tables = [name for name in (PARQUET_NAME, CSV_NAME) if (folder / name).exists()]
+    if not tables:
+        return {}
+    try:
+        rows = _table_rows(folder)
+    except (OSError, ValueError) as error:
+        raise FormatError(
+            f"{folder} has {' and '.join(tables)}, but no {LOG_NAME}, and its rows cannot be had "
+            f"from {PARQUET_NAME}: {error}",
+            f"Bring {LOG_NAME} back, or give another --out.",
+        ) from None
+    keyed = {row.key: row for row in rows}
+    if len(keyed) < len(rows):
+        raise FormatError(
+            f"{folder / PARQUET_NAME} has several rows of one rollout, and {LOG_NAME} is missing",
+            f"Bring {LOG_NAME} back, or give another --out.",
+        )
+    return keyed
+
+
+def _table_rows(folder: Path) -> list[Rollout]:
+    found = pq.read_table(folder / PARQUET_NAME)
+    if not found.schema.equals(ROLLOUT_SCHEMA):
+        raise ValueError("its columns are not those of rollouts")
+    return [Rollout(**row) for row in found.to_pylist()]
+
+
+def check_tables(folder: Path) -> None:
+    """Check that a run's tables hold what its record does; if it was killed, they may not.
+
+    Raises:
+        FormatError: They are behind; or the record is damaged.
+    """
+    if not (folder / LOG_NAME).exists():
+        return
+    try:
+        there = {row.key: row for row in _table_rows(folder)}
+    except (OSError, ValueError):
+        return  # to be told by whoever reads it
+    record = read_log(folder)
+    if there != record:
+        newer = sum(there.get(key) != row for key, row in record.items())
+        raise FormatError(
+            f"{newer} of {len(record)} rollouts in {folder / LOG_NAME} are not in the tables "
+            "beside it: the run was killed, or still goes on",
+            f"Make a folder with all of them: robomme-interference merge {folder} --out "
+            f"{folder}-merged",
+        )
 
 
 def read_header(folder: Path) -> dict[str, Any]:
@@ -215,7 +278,12 @@ def read_header(folder: Path) -> dict[str, Any]:
             "Install the version of robomme-interference-data that wrote it.",
         )
     if not isinstance(header.get("identity"), dict):
-        raise FormatError(f"{path} lacks the identity of the run", "Give another --out.")
+        raise FormatError(f"{path} lacks the identity of the run", _ANOTHER)
+    plans = header.get("plans")
+    if not isinstance(plans, list) or not all(
+        isinstance(plan, dict) and plan.keys() >= _PLAN for plan in plans
+    ):
+        raise FormatError(f"{path} lacks the plans of the run, or a part of one", _ANOTHER)
     return header
 
 

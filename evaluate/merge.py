@@ -2,19 +2,14 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import FormatError, RunFolderError
+from robomme_interference_data.errors import RunFolderError
 from robomme_interference_data.evaluate.config import check_same_run
-from robomme_interference_data.evaluate.log import (
-    ERRORS_NAME,
-    open_log,
-    read_header,
-    read_log,
-    summary,
-)
+from robomme_interference_data.evaluate.header import planned, standing
+from robomme_interference_data.evaluate.log import ERRORS_NAME, open_log, read_header, read_log
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, TIMING_COLUMNS, Rollout
 from robomme_interference_data.simulators.base import Status
 
@@ -53,7 +48,8 @@ class Merged:
 def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     """Join runs of the same settings into one, which scores, and goes on, like any other.
 
-    A finished row stands before an error. Videos and `errors.log` come along.
+    A finished row stands before an error. Videos and `errors.log` come along. The split's label
+    in rows is the first run's; by its revision it is the same split in all.
 
     Args:
         shards: Folders of runs.
@@ -72,20 +68,24 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         raise RunFolderError(f"{target} is there already", "Give a new folder to --out.")
     found: dict[tuple[Any, ...], tuple[Rollout, Path]] = {}
     double: dict[tuple[Any, ...], bool] = {}
+    label = headers[0].get("split")
     for folder in folders:
-        for key, row in read_log(folder).items():
+        for own in read_log(folder).values():
+            row = own if label is None else replace(own, split=label)
+            key = row.key
             before = found.get(key)
             if before is None or (before[0].status == Status.ERROR and row.status != Status.ERROR):
                 found[key] = (row, folder)
             elif row.status != Status.ERROR:
                 double[key] = double.get(key, False) or _outcome(row) != _outcome(before[0])
     plans = _whole_plans(headers)
-    planned = list(dict.fromkeys(cell for plan in plans for cell in _cells(plan)))
-    rank = {cell: number for number, cell in enumerate(planned)}
+    items = planned(plans, headers[0]["identity"]["episode_split"])
+    asked = [(item.episode.family, item.condition, item.episode.index) for item in items]
+    rank = {cell: number for number, cell in enumerate(asked)}
     keys = sorted(found, key=lambda key: (rank.get(_cell(key), len(rank)), _cell(key)))
     rows = tuple(found[key][0] for key in keys)
     broken = tuple(_cell(row.key) for row in rows if row.status == Status.ERROR)
-    missing = tuple(cell for cell in planned if cell not in {_cell(key) for key in keys})
+    missing = tuple(cell for cell in asked if cell not in {_cell(key) for key in keys})
     with open_log(target, headers[0]["identity"], resume=False) as log:
         log.header |= {name: headers[0][name] for name in headers[0] if name not in log.header}
         log.header["plans"] = plans
@@ -95,17 +95,16 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         _bring_errors(folders, target)
         log.write_tables({key: number for number, key in enumerate(keys)})
         log.write_header(
-            status="incomplete" if missing or broken else "complete",
+            **standing(log.header, rows),
             stopped=None,
-            planned=len(planned),
-            counts=summary(rows),
+            invocations=[one for header in headers for one in header.get("invocations", [])],
             command=[line for header in headers for line in header.get("command", [])],
             merged=[folder.name for folder in folders],
         )
     return Merged(
         target,
         rows,
-        len(planned),
+        len(asked),
         missing,
         broken,
         tuple(_cell(key) for key in keys if key in double),
@@ -129,18 +128,7 @@ def _whole_plans(headers: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         whole = {**plan, "shard": "1/1"}
         if whole not in plans:
             plans.append(whole)
-    if not plans:
-        raise FormatError("the runs have no plan in run.json", "Run their commands again.")
     return plans
-
-
-def _cells(plan: dict[str, Any]) -> list[Cell]:
-    return [
-        (family, condition, episode)
-        for family in plan["families"]
-        for episode in plan["episodes"]
-        for condition in plan["conditions"]
-    ]
 
 
 def _cell(key: tuple[Any, ...]) -> Cell:

@@ -13,23 +13,22 @@ from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.draw import even_sample
 from robomme_interference_data.errors import PolicyError, RolloutError
+from robomme_interference_data.evaluate.agreement import check_episode, check_lesson
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, Rollout
 from robomme_interference_data.evaluate.watchdog import Watchdog
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.loader import Split
 from robomme_interference_data.retrieval.selector import Selection, Selector
 from robomme_interference_data.simulators.base import (
-    Demonstration,
     EpisodeInfo,
     Observation,
     Simulator,
     Status,
 )
 
-__all__ = ["ACTION_CHUNK", "Watcher", "base_row", "check_lesson", "run_rollout"]
+__all__ = ["ACTION_CHUNK", "Watcher", "base_row", "run_rollout"]
 
 ACTION_CHUNK = 16
 """Actions of a chunk that are executed before the policy is asked again (paper)."""
@@ -117,9 +116,10 @@ def run_rollout(
         demonstration, first, info = simulator.reset(
             str(item.episode), demonstration=config.check_lesson
         )
-    _check_episode(item.episode, split, info)
+    recorded = split.load(item.episode, split.k_values[0]) if buffer is None else buffer
+    check_episode(recorded, demonstration, first, info)
     if config.check_lesson:
-        check_lesson(split.load(item.episode, split.k_values[0]), demonstration, first)
+        check_lesson(recorded, demonstration, first)
     chosen = None
     start, stop = 0, 0 if buffer is None else len(buffer)
     with clock.part("history_s"):
@@ -208,52 +208,6 @@ def _checked(actions: NDArray[np.float32]) -> NDArray[np.float32]:
     if not np.isfinite(executed).all():
         raise PolicyError("the policy returned actions that are not finite numbers")
     return executed
-
-
-def _check_episode(episode: EpisodeId, split: Split, info: EpisodeInfo) -> None:
-    """Check that the simulator's episode is the one that the dataset recorded."""
-    manifest = split.manifest(episode, split.k_values[0])
-    for name in ("seed", "difficulty"):
-        recorded, played = getattr(manifest, name), getattr(info, name)
-        if recorded is not None and recorded != played:
-            raise RolloutError(
-                f"{episode}: {name} is {recorded!r} in the dataset, {played!r} in the simulator",
-                "The dataset was recorded with another version of the simulator: build it again.",
-            )
-
-
-def check_lesson(buffer: Buffer, played: Demonstration, first: Observation) -> None:
-    """Compare the lesson and query frame of the dataset with what the simulator played.
-
-    Raises:
-        RolloutError: They differ in a bit; says where first.
-    """
-    episode = buffer.episode_id
-    lesson = next(s for s in buffer.sessions if s.role == "lesson")
-    if lesson.stop - lesson.start != len(played):
-        raise RolloutError(
-            f"{episode}: the lesson has {lesson.stop - lesson.start} frames, the simulator's "
-            f"demonstration {len(played)}"
-        )
-    if not np.array_equal(buffer.states[lesson.start : lesson.stop], played.states):
-        raise RolloutError(f"{episode}: the lesson's states are not the simulator's")
-    for camera in buffer.cameras:
-        if camera not in first.images:
-            continue
-        for chunk in buffer.stream(64, (camera,), lesson.start, lesson.stop):
-            at = chunk.start - lesson.start
-            theirs = played.images[camera][at : at + len(chunk)]
-            differing = (chunk.frames[camera] != theirs).any(axis=(1, 2, 3))
-            if differing.any():
-                raise RolloutError(
-                    f"{episode}: frame {at + int(differing.argmax())} of the lesson's {camera} "
-                    "camera is not what the simulator shows",
-                    "Another renderer or machine made the dataset; the states agree.",
-                )
-        if not np.array_equal(buffer.query_frame(camera), first.images[camera]):
-            raise RolloutError(
-                f"{episode}: the first live {camera} view is not the recorded query frame"
-            )
 
 
 def _lesson_frames(buffer: Buffer, start: int, stop: int) -> int:

@@ -1,12 +1,11 @@
 """Run an evaluation: check everything, then roll out what is not done yet, and never lose a row."""
 
 import dataclasses
-import datetime
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.checks import (
@@ -16,12 +15,8 @@ from robomme_interference_data.evaluate.checks import (
     check_simulator,
     describe_policy,
 )
-from robomme_interference_data.evaluate.config import (
-    RunConfig,
-    default_system,
-    identity,
-    provenance,
-)
+from robomme_interference_data.evaluate.config import RunConfig, default_system, identity
+from robomme_interference_data.evaluate.header import begun, ended, now, plan_record
 from robomme_interference_data.evaluate.log import RunLog, open_log, read_log, summary
 from robomme_interference_data.evaluate.plan import (
     WorkItem,
@@ -32,12 +27,19 @@ from robomme_interference_data.evaluate.plan import (
     shuffle_work,
     take_shard,
 )
+from robomme_interference_data.evaluate.policies.options import bind_options, policy_identity
+from robomme_interference_data.evaluate.policies.registry import (
+    parse_policy,
+    pin_policy,
+    policy_factory,
+)
 from robomme_interference_data.evaluate.rollout import base_row
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, Rollout
 from robomme_interference_data.evaluate.watchdog import last_words
 from robomme_interference_data.evaluate.worker import RolloutWorker, error_row
 from robomme_interference_data.loader import load_split
 from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.workers import Outcome, end_if_starting, run_tasks
 
 __all__ = ["Listener", "RunResult", "run_evaluation"]
@@ -90,6 +92,7 @@ def run_evaluation(
     shard: str = "1/1",
     system: str | None = None,
     memory: str | None = None,
+    policy_options: Mapping[str, Any] | None = None,
     model_seed: int = 0,
     retrieval: str | None = None,
     retrieval_threshold: float | None = None,
@@ -115,7 +118,7 @@ def run_evaluation(
 
     Args:
         policy: `replay`, `oracle`, `guess`, `hold`, `websocket://host:port[,…]`,
-            `lerobot:REPO_OR_PATH` or `python:module:factory`.
+            `lerobot:REPO[@REVISION]`, `lerobot:FOLDER` or `python:module:factory`.
         split: Folder of the split of buffers.
         out: Folder of the run.
         simulator: `tabletop`, `robomme`, or `module:function` of your own.
@@ -127,6 +130,7 @@ def run_evaluation(
         shard: Which part of the plan to run, such as `2/8`; `merge_runs` joins the parts.
         system: Name for the rows; by default the policy's own, `retrieval-…` with retrieval.
         memory: Memory of `replay`: `full`, `framesamp` or `window`.
+        policy_options: Other options of the policy by name: text, numbers, True, False or None.
         model_seed: Seed for the policy.
         retrieval: Encoder of a retrieval step in front of the policy, or None.
         retrieval_threshold: Cosine below which it cuts; None for the encoder's own rule.
@@ -153,13 +157,15 @@ def run_evaluation(
         PolicyError: The policy cannot be made.
         PolicyServerError: A policy server cannot be reached, or no longer any of them.
         WorkerError: The worker processes cannot start.
+        HubError: The Hub does not know the policy's model, or cannot be reached.
+        FormatError: Files of a run in `out` are damaged.
     """
     end_if_starting()
     opened = load_split(split)
     label = system or default_system(policy, memory, retrieval is not None)
     config = RunConfig(
         system=label,
-        policy=policy,
+        policy=pin_policy(policy),
         memory=memory,
         simulator=simulator,
         split=str(split),
@@ -178,7 +184,9 @@ def run_evaluation(
         cache=cache,
         history_chunk=history_chunk,
         max_errors=max_errors,
+        policy_options=dict(policy_options or {}),
     )
+    options = bind_options(policy, *policy_factory(config.policy), config.policy_arguments)
     about = describe_policy(config)
     check_settings(config, opened, about)
     plan = plan_work(
@@ -194,10 +202,21 @@ def run_evaluation(
     done = {key for key, row in rows.items() if row.status != Status.ERROR}
     if any(_key(config, item) not in done for item in mine):
         check_simulator(config, about)
-    with open_log(Path(out), identity(config), resume) as log:
-        log.write_header(policy=about.metadata, status="running", **provenance(list(command)))
-        log.header["plans"] = [*log.header["plans"], {**_plan_of(plan), "shard": shard}]
-        log.write_header()
+    versions = simulator_versions(simulator, robomme_python)
+    told = policy_identity(parse_policy(policy).kind, policy, options, about.metadata)
+    with open_log(Path(out), identity(config, told, versions.get(simulator)), resume) as log:
+        # The same split may be in another folder by now: rows keep one label for it.
+        label = log.header.setdefault("split", config.split_name)
+        config = dataclasses.replace(config, split_name=label)
+        start = begun(
+            log.header,
+            config,
+            plan_record(plan, shard),
+            command=command,
+            policy=about.metadata,
+            simulator=versions,
+        )
+        log.write_header(**start)
         return _run(config, mine, log, listener)
 
 
@@ -242,8 +261,8 @@ def _run(
         log.write_tables(order)
         rows = tuple(log.rows[key] for key in keys if key in log.rows)
         counts = summary(rows)
-        status = "complete" if stopped is None and not counts[str(Status.ERROR)] else "incomplete"
-        log.write_header(status=status, stopped=stopped, planned=len(plan), counts=counts)
+        mine = {"stopped": stopped, "planned": len(plan), "counts": counts}
+        log.write_header(**ended(log.header, mine, log.rows.values()))
     return RunResult(log.folder, rows, len(plan), counts, stopped)
 
 
@@ -261,9 +280,8 @@ def _row(config: RunConfig, outcome: Outcome, log: RunLog) -> tuple[Rollout, str
             text = f"the simulator hung: no answer for {config.simulator_s:g} s"
         row = error_row(config, outcome.task, text)
     before = log.rows[row.key].attempt if row.key in log.rows else 0
-    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     return (
-        dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=now),
+        dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=now()),
         traceback,
     )
 
@@ -271,11 +289,3 @@ def _row(config: RunConfig, outcome: Outcome, log: RunLog) -> tuple[Rollout, str
 def _key(config: RunConfig, item: WorkItem) -> tuple[object, ...]:
     columns = base_row(config, item)
     return tuple(columns[name] for name in KEY_COLUMNS)
-
-
-def _plan_of(plan: Sequence[WorkItem]) -> dict[str, object]:
-    return {
-        "families": list(dict.fromkeys(item.episode.family for item in plan)),
-        "episodes": sorted({item.episode.index for item in plan}),
-        "conditions": list(dict.fromkeys(item.condition for item in plan)),
-    }

@@ -105,9 +105,8 @@ class RolloutWorker:
             )
 
     def _make_policy(self) -> Policy:
-        memory = self.config.memory
-        options: dict[str, Any] = {} if memory is None else {"memory": memory}
-        return make_policy(self.config.policy, worker=worker_number(), **options)
+        config = self.config
+        return make_policy(config.policy, worker=worker_number(), **config.policy_arguments)
 
     def close(self) -> None:
         """Release everything; no rollout follows."""

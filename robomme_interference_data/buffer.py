@@ -175,6 +175,12 @@ class Buffer:
         self._datasets[query.dataset].read_frames(query.episode_index, feature, query.frame, out)
         return out[0]
 
+    def query_state(self) -> NDArray[np.float32]:
+        """Return the state of the first live observation, `(8,) float32`; see `states`."""
+        query = self.manifest.query
+        dataset = self._datasets[query.dataset]
+        return dataset.read_vectors(query.episode_index, STATE, query.frame, query.frame + 1)[0]
+
     def embeddings(self, encoder: str) -> NDArray[np.float16]:
         """Look up the embeddings of all frames; none is decoded.
 

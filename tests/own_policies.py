@@ -107,3 +107,12 @@ def served(worker: int = 0) -> WebsocketPolicy:
     """One of the servers of SERVERS, host:port with commas between; asked once, not six times."""
     host, port = os.environ["SERVERS"].split(",")[worker].split(":")
     return WebsocketPolicy(host, int(port), attempts=1)
+
+
+CHECKPOINT = "OWN_POLICIES_CHECKPOINT"
+
+
+def from_checkpoint() -> Still:
+    """Return a policy that says which checkpoint an environment variable names."""
+    said = {"policy": "still", "checkpoint": os.environ[CHECKPOINT]}
+    return changed("metadata", lambda: said)

@@ -51,7 +51,7 @@ class World:
         self.trouble = self._trouble()
         buffer = self.split.load(self.episode, 0)
         self.answer = buffer.states[ANSWER_FRAME]
-        self.state = buffer.states[-1]
+        self.state = buffer.query_state()
         self.image = buffer.query_frame("front")
         self.steps = 0
         lesson = Demonstration(

@@ -1,5 +1,6 @@
 """LeRobot policies: the same actions as LeRobot's own loop gives, and what does not fit."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -24,7 +25,8 @@ from robomme_interference_data.errors import (  # noqa: E402
 )
 from robomme_interference_data.evaluate.policies.base import RolloutInfo  # noqa: E402
 from robomme_interference_data.evaluate.policies.lerobot import LeRobotPolicy  # noqa: E402
-from robomme_interference_data.evaluate.policies.registry import make_policy  # noqa: E402
+from robomme_interference_data.evaluate.policies.lerobot_files import digest_files  # noqa: E402
+from robomme_interference_data.evaluate.policies.registry import make_policy, pin_policy  # noqa: E402
 from robomme_interference_data.simulators.base import Observation  # noqa: E402
 
 SEED = 5
@@ -221,6 +223,7 @@ def test_the_registry_makes_it_and_the_record_names_it(act: Path) -> None:
     assert policy.metadata() == {
         "policy": "lerobot",
         "source": str(act),
+        "sha256": digest_files(act),
         "type": "act",
         "n_obs_steps": 1,
         "device": "cpu",
@@ -333,17 +336,50 @@ def test_a_model_of_the_hub_is_recorded_with_its_commit(
         return str(snapshot)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    policy = LeRobotPolicy("me/act", device="cpu", revision="v1")
+    assert LeRobotPolicy("me/act", device="cpu").metadata()["source"] == f"me/act@{commit}"
+    # A run asks once what a branch or tag stands for; its workers then ask for the commit.
+    assert pin_policy("lerobot:me/act@v1") == f"lerobot:me/act@{commit}"
+    policy = make_policy(f"lerobot:me/act@{commit}", device="cpu")
     assert policy.metadata()["source"] == f"me/act@{commit}"
-    assert asked == [("me/act", "v1")]
+    assert asked == [("me/act", None), ("me/act", "v1"), ("me/act", commit)]
+    assert pin_policy(f"lerobot:{act}") == f"lerobot:{act}"
+    with pytest.raises(MissingFileError, match="there is no folder 'me/act@'"):
+        pin_policy("lerobot:me/act@")
+
+
+def test_the_digest_is_over_weights_and_configuration(act: Path, tmp_path: Path) -> None:
+    def digest(folder: Path) -> str:
+        return str(LeRobotPolicy(str(folder), device="cpu").metadata()["sha256"])
+
+    copy = shutil.copytree(act, tmp_path / "elsewhere")
+    (copy / "README.md").write_text("another card")
+    assert digest(copy) == digest(act)
+    weights = copy / "model.safetensors"
+    data = bytearray(weights.read_bytes())
+    data[-1] ^= 1  # in the last weight
+    weights.write_bytes(data)
+    changed = digest(copy)
+    assert changed != digest(act)
+    settings = copy / "config.json"
+    settings.write_text(settings.read_text() + "\n")
+    assert len({changed, digest(copy), digest(act)}) == 3
+
+
+def test_the_digest_is_sha256_of_names_and_digests(tmp_path: Path) -> None:
+    (tmp_path / "model.safetensors").write_bytes(b"weights")
+    (tmp_path / "config.json").write_bytes(b"{}")
+    (tmp_path / "notes.txt").write_bytes(b"not read")
+    lines = "".join(
+        f"{name}\0{hashlib.sha256(data).hexdigest()}\n"
+        for name, data in (("config.json", b"{}"), ("model.safetensors", b"weights"))
+    )
+    assert digest_files(tmp_path) == hashlib.sha256(lines.encode()).hexdigest()
 
 
 def test_options_that_do_not_apply(act: Path) -> None:
     for device in ("cuda:99", "tpu", "cpu:1", "cuda:x"):
         with pytest.raises(InvalidOptionError, match=f"there is no device '{device}'"):
             LeRobotPolicy(str(act), device=device)
-    with pytest.raises(InvalidOptionError, match="has no revision 'main'"):
-        LeRobotPolicy(str(act), revision="main")
 
 
 def test_actions_that_are_not_numbers_are_refused(act: Path) -> None:

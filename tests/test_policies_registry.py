@@ -16,11 +16,18 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.options import (
+    bind_options,
+    policy_identity,
+    read_options,
+    split_options,
+)
 from robomme_interference_data.evaluate.policies.registry import (
     PolicySpec,
     check_workers,
     make_policy,
     parse_policy,
+    policy_factory,
 )
 
 MEMBERS: frozenset[str] = frozenset(Policy.__protocol_attrs__)  # type: ignore[attr-defined]
@@ -123,6 +130,94 @@ def test_options_reach_the_policy() -> None:
     )
     with pytest.raises(InvalidOptionError, match="missing a required argument: 'gripper'"):
         make_policy("python:own_policies:still")
+
+
+@pytest.mark.parametrize(
+    ("texts", "values"),
+    [
+        (["gripper=-1"], {"gripper": -1}),
+        (["gripper=0.5"], {"gripper": 0.5}),
+        ([], {}),
+    ],
+)
+def test_options_that_are_typed_get_the_declared_type(
+    texts: list[str], values: dict[str, Any]
+) -> None:
+    found = read_options(own_policies.still, split_options(texts))
+    assert found == values
+    assert [type(value) for value in found.values()] == [type(v) for v in values.values()]
+
+
+def test_text_stays_text_where_it_is_declared() -> None:
+    def make(a: str, b: str | None, c: int | None, d: bool, e, f: list[int]) -> None: ...  # type: ignore[no-untyped-def]
+
+    typed = split_options(["a=7", "b=null", "c=null", "d=true", "e=x=y", "f=[1]"])
+    assert read_options(make, typed) == {
+        **{"a": "7", "b": "null", "c": None, "d": True, "e": "x=y", "f": [1]},
+    }
+
+
+@pytest.mark.parametrize("text", ["gripper", "=1", "two words=1", ""])
+def test_what_is_no_option(text: str) -> None:
+    with pytest.raises(InvalidOptionError, match="is not an option") as raised:
+        split_options([text])
+    assert raised.value.hint == "Expected NAME=VALUE, such as --policy-option device=cpu."
+
+
+def test_an_option_is_given_once() -> None:
+    with pytest.raises(InvalidOptionError, match="--policy-option a is given twice"):
+        split_options(["a=1", "b=1", "a=2"])
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("websocket://a:1", {"attempts": 2.5}, "attempts is 2.5\nExpected a whole number."),
+        ("websocket://a:1", {"attempts": True}, "attempts is True\nExpected a whole number."),
+        ("websocket://a:1", {"connect_s": "soon"}, "connect_s is 'soon'\nExpected a number."),
+        ("python:own_policies:still", {"gripper": None}, "gripper is None\nExpected a number."),
+        ("hold", {"speed": 1}, "Its options: none."),
+        ("websocket://a:1", {"port": 2}, "port"),
+    ],
+)
+def test_options_that_do_not_fit(text: str, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidOptionError) as raised:
+        make_policy(text, **options)
+    assert words in str(raised.value)
+
+
+def identity_of(text: str, said: dict[str, Any], **options: Any) -> dict[str, Any]:
+    bound = bind_options(text, *policy_factory(text), options)
+    return policy_identity(parse_policy(text).kind, text, bound, said)
+
+
+def test_what_of_a_policy_can_change_a_result() -> None:
+    # A default is the same, given or not.
+    assert identity_of("replay", {}) == identity_of("replay", {}, memory="full")
+    assert identity_of("replay", {}, memory="window")["policy_options"] == {"memory": "window"}
+    here = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
+    assert identity_of("websocket://a:1,b:2", here, response_s=5.0) == {
+        "policy": "websocket",
+        "policy_options": {"chunk_frames": 16},
+        "policy_metadata": {"policy": "websocket", "server_metadata": {"model": "m"}},
+    }
+    loaded = {"source": "out/last", "device": "cuda", "sha256": "ab"}
+    assert policy_identity("lerobot", "lerobot:out/last", {"device": "cuda"}, loaded) == {
+        "policy": "lerobot",
+        "policy_options": {},
+        "policy_metadata": {"sha256": "ab"},
+    }
+    changed = "python:own_policies:changed"
+    assert identity_of(changed, {}, name="x", value=[1])["policy_options"]["value"] == [1]
+    assert "value" not in identity_of(changed, {}, name="x", value=object())["policy_options"]
+    whole = identity_of("python:own_policies:Still", {}, gripper=1)
+    assert repr(whole) == repr(identity_of("python:own_policies:Still", {}))
+    own = identity_of("python:own_policies:Still", {"device": "cuda"}, gripper=0.5)
+    assert own == {
+        "policy": "python:own_policies:Still",
+        "policy_options": {"gripper": 0.5},
+        "policy_metadata": {"device": "cuda"},
+    }
 
 
 def test_a_factory_that_asks_is_told_its_worker() -> None:

@@ -1,6 +1,7 @@
 """One rollout: what the policy gets, when, and what is written of it."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from robomme_interference_data import load_split
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.errors import PolicyError, RolloutError, SimulatorCrashError
 from robomme_interference_data.evaluate import rollout
+from robomme_interference_data.evaluate.agreement import check_lesson
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.builtin import make_builtin
@@ -36,12 +38,18 @@ def config(**changes: Any) -> RunConfig:
     return dataclasses.replace(made, **changes)
 
 
-def roll(condition: str, policy: Any, episode: EpisodeId = EPISODE, **changes: Any) -> Rollout:
+def roll(
+    condition: str,
+    policy: Any,
+    episode: EpisodeId = EPISODE,
+    simulator: World | None = None,
+    **changes: Any,
+) -> Rollout:
     settings = config(**changes)
     return run_rollout(
         settings,
         WorkItem(condition, episode),
-        simulator=World(),
+        simulator=simulator or World(),
         policy=policy,
         split=load_split(settings.split),
     )
@@ -229,47 +237,70 @@ def test_check_lesson_passes_where_all_is_equal() -> None:
     ],
 )
 def test_check_lesson_names_what_differs(spoil: str, message: str) -> None:
-    class Other(World):
-        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
-            lesson, first, info = super().reset(episode_id, demonstration)
-            images = {name: frames.copy() for name, frames in lesson.images.items()}
-            states = lesson.states.copy()
-            if spoil == "frame":
-                images["wrist"][7, 0, 0, 0] ^= 1
-            if spoil == "state":
-                states[3, 2] += 1e-6
-            if spoil == "length":
-                states = states[1:]
-            if spoil == "view":
-                first = Observation({**first.images, "front": first.images["front"] ^ 1}, states[0])
-            return dataclasses.replace(lesson, images=images, states=states), first, info
-
-    settings = config(check_lesson=True)
+    lesson, first, _ = World().reset(str(EPISODE))
+    images = {name: frames.copy() for name, frames in lesson.images.items()}
+    states = lesson.states.copy()
+    if spoil == "frame":
+        images["wrist"][7, 0, 0, 0] ^= 1
+    if spoil == "state":
+        states[3, 2] += 1e-6
+    if spoil == "length":
+        states = states[1:]
+    if spoil == "view":
+        first = Observation({**first.images, "front": first.images["front"] ^ 1}, first.state)
+    played = dataclasses.replace(lesson, images=images, states=states)
     with pytest.raises(RolloutError, match=message):
-        run_rollout(
-            settings,
-            WorkItem("k0", EPISODE),
-            simulator=Other(),
-            policy=Cheat(),
-            split=load_split(settings.split),
-        )
+        check_lesson(load_split(factories.split()).load(EPISODE, 0), played, first)
 
 
-def test_another_version_of_the_simulator_is_noticed() -> None:
+@pytest.mark.parametrize("condition", ["no-history", "k3"])
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        ("seed", r"seed is \d+ in the dataset, \d+ in the simulator"),
+        ("difficulty", "difficulty is '.*' in the dataset, 'other' in the simulator"),
+        ("goal", "goal is '.*' in the dataset, 'do something else' in the simulator"),
+        ("length", "length of the lesson is 36 in the dataset, 35 in the simulator"),
+        ("state", r"the first live state is 0\.0110 away from the recorded one; .* at most 0\.01$"),
+        ("nan", "the first live state is nan away"),
+    ],
+)
+def test_another_version_of_the_simulator_is_noticed(
+    condition: str, spoil: str, message: str
+) -> None:
     class Other(World):
         def reset(self, episode_id: str, demonstration: bool = True) -> Any:
             lesson, first, info = super().reset(episode_id, demonstration)
-            return lesson, first, dataclasses.replace(info, seed=info.seed + 1)
+            state = first.state.copy()
+            state[4] += {"state": 0.011, "nan": np.nan}.get(spoil, 0)
+            changes: dict[str, dict[str, Any]] = {
+                "seed": {"seed": info.seed + 1},
+                "difficulty": {"difficulty": "other"},
+                "goal": {"goal": "do something else", "goals": ("do something else",)},
+            }
+            if spoil == "length":
+                lesson = dataclasses.replace(lesson, states=lesson.states[1:])
+            return (
+                lesson,
+                Observation(first.images, state),
+                dataclasses.replace(info, **changes.get(spoil, {})),
+            )
 
-    settings = config()
-    with pytest.raises(RolloutError, match=r"seed is \d+ in the dataset, \d+ in the simulator"):
-        run_rollout(
-            settings,
-            WorkItem("k0", EPISODE),
-            simulator=Other(),
-            policy=Cheat(),
-            split=load_split(settings.split),
-        )
+    with pytest.raises(RolloutError) as raised:
+        roll(condition, Cheat(), simulator=Other())
+    assert re.search(message, raised.value.message)
+    assert "another version of the simulator" in (raised.value.hint or "")
+
+
+def test_what_another_machine_or_source_changes_is_let_pass() -> None:
+    class Near(World):
+        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
+            lesson, first, info = super().reset(episode_id, demonstration)
+            goals = ("in other words", *info.goals)
+            info = dataclasses.replace(info, goal=goals[0], goals=goals)
+            return lesson, Observation(first.images, first.state + np.float32(0.009)), info
+
+    assert roll("k0", Cheat(), simulator=Near()).status == "success"
 
 
 # --- policies and simulators that break --------------------------------------------------------

@@ -29,8 +29,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate import RunResult, run_evaluation
-from robomme_interference_data.evaluate import config as config_module
-from robomme_interference_data.evaluate.config import EXECUTION, IDENTITY, RunConfig
+from robomme_interference_data.evaluate.config import EXECUTION, IDENTITY, POLICY, RunConfig
 from robomme_interference_data.evaluate.log import read_log
 from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA, TIMING_COLUMNS, Rollout
 
@@ -158,7 +157,7 @@ def test_a_run_may_grow(tmp_path: Path) -> None:
     # A smaller plan keeps the rows of the larger one.
     run(tmp_path / "run", families=["PatternLock"], episodes="1")
     assert pq.read_metadata(tmp_path / "run" / "rollouts.parquet").num_rows == 8
-    assert len(json.loads((tmp_path / "run" / "run.json").read_text())["plans"]) == 3
+    assert len(json.loads((tmp_path / "run" / "run.json").read_text())["plans"]) == 2  # each once
 
 
 @given(cut=st.integers(1, 400))
@@ -231,12 +230,11 @@ def test_another_run_is_refused_and_the_difference_named(
 
 def test_every_setting_is_classed() -> None:
     """A new setting either makes another run of it, or does not: somebody has to say which."""
-    assert set(IDENTITY) | {
-        *("split", "robomme_python", "check_lesson", "videos", "workers", "rollout_s"),
-        *("simulator_s", "cache", "history_chunk", "max_errors"),
+    assert {*IDENTITY, *POLICY} | {
+        *("split", "split_name", "robomme_python", "check_lesson", "videos", "workers"),
+        *("rollout_s", "simulator_s", "cache", "history_chunk", "max_errors"),
     } == {field.name for field in dataclasses.fields(RunConfig)}
-    assert not set(IDENTITY) & set(EXECUTION)
-    assert config_module.IDENTITY is IDENTITY
+    assert not {*IDENTITY, *POLICY} & set(EXECUTION)
 
 
 def test_a_run_may_be_refused_if_one_is_there(tmp_path: Path) -> None:
@@ -304,7 +302,19 @@ def test_a_finished_rollout_with_two_rows_is_refused(tmp_path: Path) -> None:
             InvalidOptionError,
             "need the name of the system that it serves",
         ),
+        (
+            {"policy": "lerobot:out/last/pretrained_model", "system": None},
+            InvalidOptionError,
+            "the rows of lerobot:out/last/pretrained_model need a name",
+        ),
         ({"policy": "hold", "memory": "full"}, InvalidOptionError, "memory"),
+        (
+            {"policy": "replay", "policy_options": {"memory": "window"}},
+            InvalidOptionError,
+            "the memory rule is no --policy-option",
+        ),
+        ({"policy_options": {"a": object()}}, InvalidOptionError, "cannot be written down"),
+        ({"policy_options": {"speed": 2}}, InvalidOptionError, "unexpected keyword argument"),
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
         ({"simulator": "tabletop"}, InvalidOptionError, "recorded on the simulator 'sample'"),
         ({"families": ["MoveCub"]}, UnknownNameError, "'MoveCub' is not in the split"),

@@ -2,7 +2,9 @@
 
 import inspect
 import json
+import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import factories
@@ -13,6 +15,7 @@ from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app, spread
 from robomme_interference_data.errors import FormatError, InvalidIdError, InvalidOptionError
+from robomme_interference_data.evaluate import log as log_module
 from robomme_interference_data.evaluate.log import open_log, read_log
 from robomme_interference_data.evaluate.rows import Rollout, condition_rank
 
@@ -157,3 +160,48 @@ def test_help_is_whole_at_80_columns(run: Any, monkeypatch: pytest.MonkeyPatch) 
     lines = [line.strip() for line in out.splitlines()]
     place = lines.index("robomme-interference evaluate --policy replay --shard 2/8 \\")
     assert lines[place + 1] == "--split S --out runs/shard-2"
+
+
+def test_options_of_the_policy_are_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+    line = "evaluate --policy python:own_policies:Still --simulator rollout_doubles:World "
+    line += "--families MoveCube --conditions no-history --episodes 0 --json "
+    line += "--policy-option gripper=-1"
+    words = [*line.split(), "--split", str(factories.split()), "--out", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, spread(words))
+    assert done.exit_code == 0, done.output
+    header = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert header["identity"]["policy_options"] == {"gripper": -1}
+    with pytest.raises(InvalidOptionError, match="speed") as raised:
+        CliRunner().invoke(
+            app, spread([*words, "--policy-option", "speed=1"]), catch_exceptions=False
+        )
+    assert raised.value.hint == "Its options: gripper."
+
+
+def test_a_full_disk_names_the_file_and_the_command_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+    monkeypatch.setattr(log_module, "os", SimpleNamespace(fsync=full))
+    out = tmp_path / "run"
+    line = "evaluate --policy hold --simulator rollout_doubles:World --families MoveCube "
+    line += "--conditions no-history --episodes 0"
+    words = [*line.split(), "--split", str(factories.split()), "--out", str(out)]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, OSError)
+    assert done.exception.filename == str(out / "rollouts.jsonl")
+    assert f"Finished rollouts are in {out}; once mended, go on with:\nrobomme-inter" in done.stderr
+
+
+def test_the_help_of_merge_is_whole_in_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = CliRunner().invoke(app, ["merge", "--help"]).stdout
+    options = text[text.index("Options") :]
+    assert "--out " in options and not re.search(r"--[a-z-]+…", options)
+    assert re.search(
+        r"^ *robomme-interference merge [^\n]*(\\| --out runs/whole) *$", text, re.MULTILINE
+    )

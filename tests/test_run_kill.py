@@ -1,5 +1,6 @@
 """An evaluation, killed at any moment: no finished rollout is lost, and none is written twice."""
 
+import json
 import os
 import random
 import signal
@@ -105,6 +106,9 @@ def test_the_parent_may_be_killed(tmp_path: Path, undisturbed: dict) -> None:
         assert len(rows) >= min(already, ROLLOUTS)
         before = rows
     assert start(out, 0).wait(timeout=200) == 0
+    # A start that was killed has no end on record.
+    starts = json.loads((out / "run.json").read_text())["invocations"]
+    assert ["ended" in one for one in starts] == [False, False, True]
     # `read_log` refuses a second row of a finished rollout, so none was written twice.
     rows = read_log(out)
     assert all(rows[key] == row for key, row in before.items())
@@ -134,14 +138,17 @@ def test_any_worker_may_be_killed(tmp_path: Path, undisturbed: dict) -> None:
         assert untimed(read_log(out)) == undisturbed
 
 
-def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(tmp_path: Path, undisturbed: dict) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_stops_cleanly_and_the_command_to_go_on_is_told(
+    tmp_path: Path, undisturbed: dict, number: signal.Signals, code: int
+) -> None:
     out = tmp_path / "run"
     running = start(out, 0.01)
     wait_for_rows(out, 2, running)
     workers = children(running.pid)
-    os.killpg(running.pid, signal.SIGINT)
+    os.killpg(running.pid, number)
     _, err = running.communicate(timeout=60)
-    assert running.returncode == 130
+    assert running.returncode == code
     text = err.decode()
     assert "Traceback" not in text
     assert "go on with:" in text
@@ -150,5 +157,8 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(tmp_path: Path, undisturbed:
     done = read_log(out)
     assert 2 <= len(done) < ROLLOUTS
     assert (out / "rollouts.csv").read_text().count("\n") == len(done) + 1
+    header = json.loads((out / "run.json").read_text())
+    assert (header["status"], header["stopped"]) == ("incomplete", "interrupted")
+    assert "ended" in header["invocations"][0]
     assert start(out, 0).wait(timeout=200) == 0
     assert untimed(read_log(out)) == undisturbed

@@ -1,6 +1,7 @@
 """RoboMME's interpreter: those that will not do, and the commands that use one."""
 
 import json
+import platform
 import sys
 from pathlib import Path
 
@@ -17,7 +18,9 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.simulators import make_simulator
+from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
 STAND_IN = Path(__file__).parent / "robomme_stand_in"
 """A package `robomme` with RoboMME's interface, which behaves badly where an index asks for it."""
@@ -44,6 +47,27 @@ def test_the_environment_variable_names_it(python: Path, monkeypatch: pytest.Mon
     simulator = make_simulator("robomme")
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
     simulator.close()
+
+
+def test_versions_are_told(python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = simulator_versions("robomme", str(python))
+    assert told.keys() == {"robomme_python", "robomme_numpy"}  # it is on the path, not installed
+    assert told["robomme_python"] == platform.python_version()
+    assert told["robomme_numpy"].startswith("1.")
+    # What an installer leaves of a package, and of one that came from git.
+    installed = tmp_path / "robomme-0.2.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: robomme\nVersion: 0.2\n")
+    monkeypatch.setenv("PYTHONPATH", f"{STAND_IN}:{tmp_path}")
+    assert simulator_versions("robomme", str(python))["robomme"] == "0.2"
+    origin = {"url": "https://example.org/robomme", "vcs_info": {"vcs": "git", "commit_id": "ab12"}}
+    (installed / "direct_url.json").write_text(json.dumps(origin))
+    assert simulator_versions("robomme", str(python))["robomme"] == "0.2+ab12"
+
+
+def test_versions_of_other_simulators() -> None:
+    assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
+    assert simulator_versions("rollout_doubles:World") == {}
 
 
 @pytest.mark.parametrize("name", ["nowhere/python", "folder", "notes.txt"])

@@ -25,6 +25,7 @@ from robomme_interference_data.evaluate.policies.checks import (
 from robomme_interference_data.evaluate.policies.lerobot_files import (
     check_features,
     choose_device,
+    digest_files,
     explained,
     feature_names,
     find_policy,
@@ -44,9 +45,9 @@ class LeRobotPolicy:
     queue: at first the end of the history, then live ones.
 
     Args:
-        path: Folder that `save_pretrained` wrote, or a model on the Hub, `namespace/name`.
+        path: Folder that `save_pretrained` wrote, or a model on the Hub, `namespace/name` or
+            `namespace/name@revision`.
         device: `cpu`, `cuda` or `cuda:1`; by default the first GPU, if there is one.
-        revision: Branch, tag or commit on the Hub; the commit is in `metadata()`.
 
     Raises:
         InvalidOptionError: The device is not there.
@@ -58,9 +59,9 @@ class LeRobotPolicy:
 
     privileged = False
 
-    def __init__(self, path: str, *, device: str | None = None, revision: str | None = None):
+    def __init__(self, path: str, *, device: str | None = None):
         self._device = choose_device(device)
-        self._folder, self._source = find_policy(path, revision)
+        self._folder, self._source = find_policy(path)
         with explained(path):
             self._config = PreTrainedConfig.from_pretrained(self._folder)
             self._config.device = self._device
@@ -185,10 +186,14 @@ class LeRobotPolicy:
             yield
 
     def metadata(self) -> dict[str, Any]:
-        """Return what was loaded, the commit if it came from the Hub, and the device."""
+        """Return what is loaded, with the SHA-256 of its files, and the device.
+
+        All files are read for it, which takes seconds for a large model.
+        """
         return {
             "policy": "lerobot",
             "source": self._source,
+            "sha256": digest_files(self._folder),
             "type": self._config.type,
             "n_obs_steps": self._steps,
             "device": self._device,

@@ -1,5 +1,6 @@
 """Where a LeRobot policy's files are, and whether it fits the simulators."""
 
+import hashlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -18,12 +19,24 @@ from robomme_interference_data.errors import (
     PolicyError,
 )
 from robomme_interference_data.evaluate.policies.checks import ACTION_SIZE
+from robomme_interference_data.files import sha256_file
 from robomme_interference_data.hub import is_repo_id
 
-__all__ = ["check_features", "choose_device", "explained", "feature_names", "find_policy"]
+__all__ = [
+    "check_features",
+    "choose_device",
+    "digest_files",
+    "explained",
+    "feature_names",
+    "find_policy",
+    "pin_model",
+]
 
 IMAGE_SHAPE = (3, 256, 256)
 """Shape of an image of the simulators, channels first."""
+
+_FILES = ("*.json", "*.safetensors", "*.model")
+"""What a policy is loaded from: configuration, weights, tokenizers."""
 
 _CONFIG = "config.json"
 _WEIGHTS = "model.safetensors"
@@ -52,26 +65,27 @@ def choose_device(device: str | None) -> str:
     return device
 
 
-def find_policy(path: str, revision: str | None) -> tuple[Path, str]:
+def find_policy(path: str) -> tuple[Path, str]:
     """Return the folder with the policy's files, and what names it in the record of a run.
+
+    Args:
+        path: A folder, or a model on the Hub: `namespace/name` or `namespace/name@revision`.
 
     Raises:
         MissingFileError: There is no such folder, or a file is missing in it.
         HubError: The Hub does not know the model, or cannot be reached.
-        InvalidOptionError: A revision of a folder is asked for.
     """
-    folder = Path(path)
-    source = path
+    folder, source = Path(path), path
     if not folder.is_dir():
-        if not is_repo_id(path):
+        repo_id, _, revision = path.partition("@")
+        if not is_repo_id(repo_id) or path.endswith("@"):
             raise MissingFileError(
                 f"there is no folder {path!r}, and a model on the Hub has another kind of name",
-                "Expected a folder that LeRobot saved a policy in, or namespace/name.",
+                "Expected a folder that LeRobot saved a policy in, namespace/name, or "
+                "namespace/name@revision.",
             )
-        folder = _download(path, revision)
-        source = f"{path}@{folder.name}"
-    elif revision is not None:
-        raise InvalidOptionError(f"{path} is a folder, which has no revision {revision!r}")
+        folder = _download(repo_id, revision or None)
+        source = f"{repo_id}@{folder.name}"
     missing = [name for name in (_CONFIG, _WEIGHTS, *_PROCESSORS) if not (folder / name).is_file()]
     if missing:
         raise MissingFileError(
@@ -81,16 +95,35 @@ def find_policy(path: str, revision: str | None) -> tuple[Path, str]:
     return folder, source
 
 
+def pin_model(path: str) -> str:
+    """Return a model on the Hub with its commit, `namespace/name@commit`; a folder as it is.
+
+    Raises:
+        MissingFileError, HubError: As `find_policy`.
+    """
+    return find_policy(path)[1]
+
+
+def digest_files(folder: Path) -> str:
+    """Return the SHA-256 over the names and bytes of a policy's weights and configuration."""
+    found = hashlib.sha256()
+    files = {
+        path.relative_to(folder).as_posix(): path
+        for pattern in _FILES
+        for path in folder.rglob(pattern)
+        if path.is_file()
+    }
+    for name in sorted(files):
+        found.update(f"{name}\0{sha256_file(files[name])}\n".encode())
+    return found.hexdigest()
+
+
 def _download(repo_id: str, revision: str | None) -> Path:
     """Fetch a model's files into the Hub's cache; the folder's name is the commit."""
     from huggingface_hub import snapshot_download
 
     try:
-        return Path(
-            snapshot_download(
-                repo_id, revision=revision, allow_patterns=["*.json", "*.safetensors", "*.model"]
-            )
-        )
+        return Path(snapshot_download(repo_id, revision=revision, allow_patterns=[*_FILES]))
     except (OSError, ValueError) as error:  # the client's errors are all one of them
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise HubError(

@@ -1,6 +1,5 @@
 """Policies by what is written on the command line; each is imported when it is made."""
 
-import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,16 +14,26 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.options import bind_options, signature_of
 from robomme_interference_data.simulators.base import CAMERAS
 
-__all__ = ["BUILTINS", "FORMS", "PolicySpec", "check_workers", "make_policy", "parse_policy"]
+__all__ = [
+    "BUILTINS",
+    "FORMS",
+    "PolicySpec",
+    "check_workers",
+    "make_policy",
+    "parse_policy",
+    "pin_policy",
+    "policy_factory",
+]
 
 BUILTINS = ("oracle", "guess", "hold", "replay")
 """Policies without learned weights, known by name alone."""
 
 FORMS = {
     "websocket": "websocket://host:port, with commas between several servers",
-    "lerobot": "lerobot:namespace/name or lerobot:folder",
+    "lerobot": "lerobot:namespace/name[@revision] or lerobot:folder",
     "python": "python:module:factory",
 }
 """How the other kinds are written."""
@@ -145,6 +154,15 @@ def make_policy(text: str, *, worker: int = 0, **options: Any) -> Policy:
         MissingExtraError: Its libraries are not installed.
         PolicyError: What a factory returned is no policy, or a model does not fit the simulators.
     """
+    factory, fixed = policy_factory(text, worker)
+    bind_options(text, factory, fixed, options)
+    policy = factory(**fixed, **options)
+    _check_protocol(text, policy)
+    return policy
+
+
+def policy_factory(text: str, worker: int = 0) -> tuple[Callable[..., Policy], dict[str, Any]]:
+    """Return what makes a policy, and the arguments that its text gives; see `make_policy`."""
     spec = parse_policy(text)
     fixed: dict[str, Any] = {}
     if spec.kind == "websocket":
@@ -156,17 +174,29 @@ def make_policy(text: str, *, worker: int = 0, **options: Any) -> Policy:
         factory = _load("lerobot", "LeRobotPolicy", "build")
     elif spec.kind == "python":
         factory = _load_factory(spec.target)
-        if "worker" in _signature(factory).parameters:
+        if "worker" in signature_of(factory).parameters:
             fixed["worker"] = worker
     elif spec.kind == "replay":
         factory = _load("replay", "ReplayPolicy", "evaluate")
     else:
         fixed["name"] = spec.kind
         factory = _load("builtin", "make_builtin", "evaluate")
-    _check_options(text, factory, fixed, options)
-    policy = factory(**fixed, **options)
-    _check_protocol(text, policy)
-    return policy
+    return factory, fixed
+
+
+def pin_policy(text: str) -> str:
+    """Return a policy with the commit of its model, if it is one on the Hub; else as it is.
+
+    Asked once, before any worker starts: a branch may move while a run goes on.
+
+    Raises:
+        UnknownNameError, InvalidOptionError: The policy is not written as it should be.
+        HubError: The Hub does not know the model, or cannot be reached.
+    """
+    spec = parse_policy(text)
+    if spec.kind != "lerobot":
+        return text
+    return f"lerobot:{_load('lerobot_files', 'pin_model', 'build')(spec.target)}"
 
 
 def _load(module: str, name: str, extra: str) -> Callable[..., Policy]:
@@ -199,26 +229,6 @@ def _load_factory(target: str) -> Callable[..., Policy]:
         near = nearest(name, [key for key, value in vars(loaded).items() if callable(value)])
         raise UnknownNameError(f"module {module!r} has no function {name!r}", near)
     return factory
-
-
-def _signature(factory: Callable[..., Policy]) -> inspect.Signature:
-    try:
-        return inspect.signature(factory)
-    except ValueError:  # something built in, which does not tell
-        return inspect.signature(lambda **options: None)
-
-
-def _check_options(
-    text: str, factory: Callable[..., Policy], fixed: dict[str, Any], options: dict[str, Any]
-) -> None:
-    signature = _signature(factory)
-    try:
-        signature.bind(**fixed, **options)
-    except TypeError as error:
-        names = [name for name in signature.parameters if name not in fixed]
-        raise InvalidOptionError(
-            f"policy {text!r}: {error}", f"Its options: {', '.join(names) or 'none'}."
-        ) from error
 
 
 def _check_protocol(text: str, policy: Any) -> None:

@@ -16,6 +16,7 @@ from robomme_interference_data.evaluate.log import (
     LOG_VERSION,
     PARQUET_NAME,
     RUN_NAME,
+    check_tables,
 )
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, ROLLOUT_SCHEMA
 from robomme_interference_data.evaluate.score.batches import (
@@ -122,6 +123,7 @@ def _source(path: Path, with_system: bool) -> Source:
                 else "Give the folder of a run, or a file of rows.",
             )
         path = found[0]
+        check_tables(folder)
     elif not path.is_file():
         raise MissingFileError(f"there is no file or folder {path}", "Check the path.")
     if (path.parent / RUN_NAME).is_file() and path.name in (PARQUET_NAME, CSV_NAME):

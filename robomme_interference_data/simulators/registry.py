@@ -8,7 +8,13 @@ from typing import Any
 from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Simulator
 
-__all__ = ["SIMULATORS", "find_simulator", "make_simulator", "own_simulator"]
+__all__ = [
+    "SIMULATORS",
+    "find_simulator",
+    "make_simulator",
+    "own_simulator",
+    "simulator_versions",
+]
 
 
 def _tabletop(**options: Any) -> Simulator:
@@ -67,6 +73,33 @@ def find_simulator(name: str) -> Callable[..., Simulator]:
             "Expected <module>:<function>, which can be imported and returns a simulator.",
         ) from error
     return found
+
+
+def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
+    """Return what is known of a simulator's versions.
+
+    Args:
+        name: As for `make_simulator`.
+        python: RoboMME's interpreter, for `robomme`.
+
+    Returns:
+        Under the simulator's own name the version of its episodes: `SUITE_VERSION` of `tabletop`,
+        that of the installed package of `robomme`; not there if it is not known. With `robomme`
+        also its Python's, `robomme_python`, and its numpy's, `robomme_numpy`.
+
+    Raises:
+        InvalidOptionError, MissingExtraError, SimulatorCrashError: As `RoboMMESimulator`.
+    """
+    if name == "tabletop":
+        from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+
+        return {"tabletop": str(SUITE_VERSION)}
+    if name != "robomme":
+        return {}
+    from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+
+    with RoboMMESimulator(python) as simulator:
+        return simulator.versions
 
 
 @cache

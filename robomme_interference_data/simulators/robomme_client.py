@@ -92,6 +92,11 @@ class RoboMMESimulator:
         """RoboMME's task families."""
         return self._worker.families
 
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions in its interpreter: `robomme_python`, `robomme_numpy`, `robomme` if known."""
+        return self._worker.versions
+
     def reset(
         self, episode_id: str, demonstration: bool = True
     ) -> tuple[Demonstration, Observation, EpisodeInfo]:

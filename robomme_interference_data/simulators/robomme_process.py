@@ -50,6 +50,8 @@ class RoboMMEProcess:
 
     Attributes:
         families: RoboMME's task families.
+        versions: Versions in the interpreter: `robomme_python`, `robomme_numpy`, and `robomme` if
+            it is installed as a package.
 
     Raises:
         InvalidOptionError: The interpreter cannot be run.
@@ -84,6 +86,9 @@ class RoboMMEProcess:
             self.end()
             raise MissingExtraError(f"{python} cannot run RoboMME: {hello['problem']}", _INSTALL)
         self.families: tuple[str, ...] = tuple(hello["families"])
+        self.versions = {f"robomme_{name}": str(hello[name]) for name in ("python", "numpy")}
+        if hello["version"] is not None:
+            self.versions["robomme"] = str(hello["version"])
 
     @property
     def pid(self) -> int | None:

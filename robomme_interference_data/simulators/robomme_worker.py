@@ -9,6 +9,7 @@ arrays one after the other. No pickles: those of numpy 1 and 2 differ.
 """
 
 import importlib
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -103,10 +104,22 @@ def probe() -> dict[str, Any]:
         if int(found["numpy"].split(".")[0]) >= 2:
             return {**found, "problem": f"numpy is {found['numpy']}; RoboMME needs numpy < 2"}
         found["families"] = list(_builder().get_task_list())
+        found["version"] = _version()
     except Exception as error:
         traceback.print_exc()
         return {**found, "problem": f"robomme cannot be imported: {_text(error)}"}
     return found
+
+
+def _version() -> Any:
+    """Return RoboMME's version, with the commit if it was installed from one; None if unknown."""
+    try:
+        installed = importlib.metadata.distribution("robomme")
+    except importlib.metadata.PackageNotFoundError:
+        return None  # it is only on the path
+    origin = json.loads(installed.read_text("direct_url.json") or "{}")
+    commit = origin.get("vcs_info", {}).get("commit_id")
+    return f"{installed.version}+{commit}" if commit else installed.version
 
 
 class UnknownEpisode(Exception):

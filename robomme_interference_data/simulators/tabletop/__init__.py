@@ -8,7 +8,13 @@ on, so that `gymnasium.make` finds them:
 
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 
-__all__ = ["register_environments"]
+__all__ = ["SUITE_VERSION", "register_environments"]
+
+SUITE_VERSION = 1
+"""Version of the episodes; raised with every change to scenes, motions, goals or judgements.
+
+Datasets and runs of another version do not fit this one: see `docs/simulators.md`.
+"""
 
 
 def register_environments() -> None:
