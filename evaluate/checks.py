@@ -74,13 +74,6 @@ def describe_policy(config: RunConfig) -> PolicyTraits:
             things of themselves, or it does not say what it is.
     """
     spec = parse_policy(config.policy)
-    if spec.kind == "python" and spec.target.startswith("__main__:"):
-        raise InvalidOptionError(
-            f"policy {config.policy!r}: worker processes run another program, and find no such "
-            "function in it",
-            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
-            "write python:MODULE:FUNCTION.",
-        )
     check_workers(spec, config.workers)
     with redirect_stdout(sys.stderr):  # stdout is for the rows
         traits = [

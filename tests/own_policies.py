@@ -103,10 +103,17 @@ def insider() -> Still:
     return changed("privileged", True)
 
 
-def served(worker: int = 0) -> WebsocketPolicy:
+class Served(WebsocketPolicy):
+    """Says nothing of where its server listens, which is no part of what it is."""
+
+    def metadata(self) -> dict[str, Any]:
+        return {name: value for name, value in super().metadata().items() if name != "server"}
+
+
+def served(worker: int = 0) -> Served:
     """One of the servers of SERVERS, host:port with commas between; asked once, not six times."""
     host, port = os.environ["SERVERS"].split(",")[worker].split(":")
-    return WebsocketPolicy(host, int(port), attempts=1)
+    return Served(host, int(port), attempts=1)
 
 
 CHECKPOINT = "OWN_POLICIES_CHECKPOINT"

@@ -215,6 +215,13 @@ def _load(module: str, name: str, extra: str) -> Callable[..., Policy]:
 
 def _load_factory(target: str) -> Callable[..., Policy]:
     module, _, name = target.partition(":")
+    if module == "__main__":
+        raise InvalidOptionError(
+            f"policy 'python:{target}': worker processes run another program, and find no such "
+            "function in it",
+            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
+            "write python:MODULE:FUNCTION.",
+        )
     try:
         loaded = import_module(module)
     except ModuleNotFoundError as error:
