@@ -68,8 +68,11 @@ Workers = Annotated[
     int, typer.Option(help="Processes that encode side by side.", show_default="all processors")
 ]
 TimeLimit = Annotated[
-    float,
-    typer.Option(help="Seconds that one episode may take before it is tried once more."),
+    float | None,
+    typer.Option(
+        help="Seconds that one episode may take before it is tried once more.",
+        show_default="120 to play one on tabletop; 1800 otherwise",
+    ),
 ]
 Columns = Annotated[
     str | None,
@@ -94,7 +97,6 @@ Limit = Annotated[
 ]
 
 _CPUS = os.cpu_count() or 1
-_TIME_LIMIT = 1800.0
 
 
 @app.command()
@@ -108,7 +110,7 @@ def demonstrations(
     codec: CodecName = "av1-lossless",
     version: Version = "1.0.0",
     workers: Workers = _CPUS,
-    time_limit: TimeLimit = _TIME_LIMIT,
+    time_limit: TimeLimit = None,
     columns: Columns = None,
     families_file: FamiliesFile = None,
     robomme_python: RoboMMEPython = None,
@@ -137,7 +139,7 @@ def distractors(
     codec: CodecName = "av1-lossless",
     version: Version = "1.0.0",
     workers: Workers = _CPUS,
-    time_limit: TimeLimit = _TIME_LIMIT,
+    time_limit: TimeLimit = None,
     columns: Columns = None,
     families_file: FamiliesFile = None,
     as_json: AsJson = False,
@@ -190,7 +192,7 @@ def build_all(
     seed: Seed = 0,
     position_limit: Limit = str(POSITION_LIMIT),
     workers: Workers = _CPUS,
-    time_limit: TimeLimit = _TIME_LIMIT,
+    time_limit: TimeLimit = None,
     columns: Columns = None,
     families_file: FamiliesFile = None,
 ) -> None:

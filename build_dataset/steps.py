@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def build_one(
     source: list[str],
     out: Path,
     filters: tuple[str | None, str | None, str | None],
-    settings: tuple[str, str | None, str, int, float],
+    settings: tuple[str, str | None, str, int, float | None],
     opening: tuple[str | None, Path | None, str | None],
     *,
     as_json: bool,
@@ -62,7 +63,7 @@ def build_one(
         cameras=_names(cameras),
         version=version,
         workers=workers,
-        time_limit=time_limit,
+        time_limit=_time_limit(None, time_limit),
     )
     wanted = Filters(
         families=_names(families),
@@ -74,7 +75,8 @@ def build_one(
         opened = []
         for text in source:
             if text in SIMULATORS:
-                played = _record(text, kind, out, recordings, wanted, chosen, robomme_python)
+                playing = replace(chosen, time_limit=_time_limit(text, time_limit))
+                played = _record(text, kind, out, recordings, wanted, playing, robomme_python)
                 if played is None:
                     MESSAGES.print(f"{out}: was built before")
                     return
@@ -144,6 +146,14 @@ def _record(
         ):
             progress.advance(1)
     return RecordedSource(folder, simulator)
+
+
+def _time_limit(simulator: str | None, given: float | None) -> float:
+    """Return the seconds that playing an episode on a simulator, or encoding one, may take."""
+    if given is not None:
+        return given
+    # An episode takes the tabletop seconds, and RoboMME minutes.
+    return 120.0 if simulator == "tabletop" else 1800.0
 
 
 def plan_buffers(

@@ -1,6 +1,8 @@
 """Simulators for the tests of worker processes: no physics, and bad behaviour on demand."""
 
+import multiprocessing.connection
 import os
+import struct
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ STEPS = 3
 
 
 class Double:
-    """Succeeds after three steps; what index 1 to 4 do instead is written at `reset`.
+    """Succeeds after three steps; what 1, 2, 3 and 49 do instead is written at `reset`.
 
     Args:
         marks: Folder where bad behaviour is marked, so that it happens once only; None: always.
@@ -49,6 +51,8 @@ class Double:
             if episode.index == 1:
                 os._exit(7)  # dies
             time.sleep(600)  # hangs
+        if episode.index == 49:
+            multiprocessing.connection.Connection.send_bytes = _die_in_mid_message
         if episode.index == 3:
             raise UnknownNameError("no such episode", "Take another.")
         self.left = STEPS
@@ -87,6 +91,12 @@ class Double:
             return False
         mark.touch()
         return True
+
+
+def _die_in_mid_message(pipe: multiprocessing.connection.Connection, message: Any) -> None:
+    """Announce the message's length, as a pipe does, send four bytes of it, and die."""
+    os.write(pipe.fileno(), struct.pack("!i", len(message)) + message[:4])
+    os._exit(9)
 
 
 def make(**options: Any) -> Double:

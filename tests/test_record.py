@@ -1,9 +1,13 @@
 """Episodes of a simulator become recordings, whatever its workers do."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from simulator_doubles import Double
+from typer.testing import CliRunner
 
 from robomme_interference_data import Dataset
 from robomme_interference_data.build_dataset.record import (
@@ -14,6 +18,7 @@ from robomme_interference_data.build_dataset.record import (
     list_episodes,
     record_episodes,
 )
+from robomme_interference_data.cli import app
 from robomme_interference_data.errors import BuildError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.ids import EpisodeId
@@ -203,3 +208,29 @@ def test_the_tabletop_simulator_through_the_command_line(tmp_path: Path) -> None
     assert record.simulator == "tabletop"
     assert record.exact
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+@pytest.mark.parametrize(
+    ("simulator", "given", "expected"),
+    [("tabletop", [], 120.0), ("robomme", [], 1800.0), ("tabletop", ["--time-limit", "7"], 7.0)],
+)
+def test_the_time_limit_is_the_simulators(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    simulator: str,
+    given: list[str],
+    expected: float,
+) -> None:
+    taken = []
+
+    def stand_in(*_: Any, time_limit: float, **__: Any) -> Iterator[EpisodeId]:
+        taken.append(time_limit)
+        raise BuildError("enough")
+
+    steps = "robomme_interference_data.build_dataset.steps"
+    monkeypatch.setattr(f"{steps}.record_episodes", stand_in)
+    monkeypatch.setattr(f"{steps}.make_simulator", lambda *_, **__: Double())
+    words = ["build", "demonstrations", "--source", simulator, "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*words, *given])
+    assert isinstance(done.exception, BuildError)
+    assert taken == [expected]

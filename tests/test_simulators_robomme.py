@@ -245,6 +245,15 @@ def test_there_must_be_an_episode(simulator: RoboMMESimulator) -> None:
         simulator.reset("MoveCube/test/0")
 
 
+def test_a_refused_episode_leaves_none_to_step(simulator: RoboMMESimulator) -> None:
+    for refused in ("MoveCub/test/0", "MoveCube-test-0"):
+        simulator.reset("MoveCube/test/0")
+        with pytest.raises((UnknownNameError, InvalidIdError)):
+            simulator.reset(refused)
+        with pytest.raises(SimulatorCrashError, match="no episode"):
+            simulator.step(HOLD)
+
+
 def test_unknown_cameras(python: Path) -> None:
     with pytest.raises(UnknownNameError, match="'wrist'"):
         RoboMMESimulator(python, cameras=["wirst"])

@@ -16,6 +16,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import SIMULATORS, Status, make_simulator
+from robomme_interference_data.simulators.base import action_array, camera_names
 from robomme_interference_data.simulators.registry import own_simulator
 from robomme_interference_data.simulators.score import Outcome, markdown_table, play_all
 from robomme_interference_data.simulators.tabletop.episodes import (
@@ -137,6 +138,35 @@ def test_a_process_keeps_one_simulator_of_a_name_and_options() -> None:
     kept = own_simulator("simulator_doubles:make")
     assert own_simulator("simulator_doubles:make") is kept
     assert own_simulator("simulator_doubles:make", render=False) is not kept
+    front = own_simulator("simulator_doubles:make", cameras=["front"])
+    assert own_simulator("simulator_doubles:make", cameras=("front",)) is front
+
+
+def test_an_option_that_a_simulator_does_not_have_is_named() -> None:
+    with pytest.raises(InvalidOptionError, match="robomme simulator has no option 'camera'") as e:
+        make_simulator("robomme", camera=("front",))
+    assert e.value.hint == "Did you mean 'cameras'?"
+
+
+def test_cameras_are_a_list_of_known_names() -> None:
+    assert camera_names("tabletop", ["wrist", "front"]) == ("front", "wrist")
+    assert camera_names("tabletop", ()) == ()
+    with pytest.raises(InvalidOptionError, match="cameras 'front'; expected a list of names"):
+        camera_names("tabletop", "front")
+    with pytest.raises(UnknownNameError, match="tabletop simulator has no camera 'fornt'") as e:
+        camera_names("tabletop", ["fornt"])
+    assert e.value.hint == "Did you mean 'front'?"
+
+
+@pytest.mark.parametrize(
+    "action", [["a"] * 8, [[1.0], [1.0, 2.0]], None, [0.0] * 7, [0.0] * 7 + [float("nan")]]
+)
+def test_an_action_is_eight_finite_numbers(action: object) -> None:
+    with pytest.raises(InvalidOptionError, match="an action is 8 finite numbers, not ") as e:
+        action_array(action)
+    assert e.value.hint is not None
+    assert e.value.hint.startswith("Expected 7 absolute joint targets in rad")
+    assert action_array([1] * 8).dtype == "float32"
 
 
 def test_simulate_prints_what_came_of_it_as_json() -> None:
@@ -162,6 +192,36 @@ def test_an_unknown_policy_is_refused_at_once(command: str) -> None:
     done = CliRunner().invoke(app, given)
     assert isinstance(done.exception, UnknownNameError)
     assert "Did you mean 'oracle'" in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    ("made", "given", "why"),
+    [
+        ("a", "a/out.mp4", "File exists"),  # `a` is a file
+        ("out.mp4/", "out.mp4", "it is a folder"),
+    ],
+)
+def test_a_video_that_cannot_be_written_is_refused_before_playing(
+    tmp_path: Path, made: str, given: str, why: str
+) -> None:
+    if made.endswith("/"):
+        (tmp_path / made).mkdir()
+    else:
+        (tmp_path / made).touch()
+    words = ["simulate", "--family", "MoveCube", "--episode", "3", "--video", str(tmp_path / given)]
+    done = CliRunner().invoke(app, [*words, "--simulator", "simulator_doubles:make"])
+    assert isinstance(done.exception, InvalidOptionError)  # playing would refuse the episode
+    assert why in str(done.exception)
+    assert "where you may write" in str(done.exception)
+
+
+def test_a_video_that_can_be_written_leaves_no_trace_of_the_check(tmp_path: Path) -> None:
+    given = ["simulate", "--family", "MoveCube", "--video", str(tmp_path / "new" / "out.mp4")]
+    done = CliRunner().invoke(
+        app, [*given, "--episode", "3", "--simulator", "simulator_doubles:make"]
+    )
+    assert isinstance(done.exception, UnknownNameError)  # the double has no episode 3
+    assert list(tmp_path.rglob("*")) == [tmp_path / "new"]
 
 
 def test_a_video_must_be_an_mp4(tmp_path) -> None:

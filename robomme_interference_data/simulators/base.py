@@ -1,13 +1,25 @@
 """What every simulator serves, whatever engine is behind it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CAMERAS", "Demonstration", "EpisodeInfo", "Observation", "Simulator", "Status"]
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+
+__all__ = [
+    "CAMERAS",
+    "Demonstration",
+    "EpisodeInfo",
+    "Observation",
+    "Simulator",
+    "Status",
+    "action_array",
+    "camera_names",
+]
 
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""
@@ -102,6 +114,8 @@ class Simulator(Protocol):
         Raises:
             InvalidIdError: The text is not an episode id.
             UnknownNameError: There is no such family or episode.
+            SimulatorCrashError: The simulator is closed. Whatever is raised, there is then no
+                episode to step.
         """
         ...
 
@@ -115,7 +129,7 @@ class Simulator(Protocol):
 
         Raises:
             InvalidOptionError: The action has another shape, or is not finite.
-            SimulatorCrashError: There is no episode to step: reset first.
+            SimulatorCrashError: There is no episode to step, or the simulator is closed.
         """
         ...
 
@@ -128,9 +142,48 @@ class Simulator(Protocol):
 
         Raises:
             UnknownNameError: The simulator has no such policy.
+            SimulatorCrashError: There is no episode to act in, or the simulator is closed.
         """
         ...
 
     def close(self) -> None:
         """Release everything. Further calls but `close` are errors."""
         ...
+
+
+def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:
+    """Return the cameras that are asked of a simulator, in the order of `CAMERAS`.
+
+    Raises:
+        InvalidOptionError: `cameras` is no list or tuple.
+        UnknownNameError: There is no such camera.
+    """
+    if not isinstance(cameras, list | tuple):
+        raise InvalidOptionError(
+            f"cameras {cameras!r}; expected a list of names", f"Known: {', '.join(CAMERAS)}"
+        )
+    for camera in cameras:
+        if camera not in CAMERAS:
+            raise UnknownNameError(
+                f"the {simulator} simulator has no camera {camera!r}",
+                nearest(str(camera), CAMERAS),
+            )
+    return tuple(camera for camera in CAMERAS if camera in cameras)
+
+
+def action_array(action: ArrayLike) -> NDArray[np.float32]:
+    """Return an action as `(8,) float32`.
+
+    Raises:
+        InvalidOptionError: It has another shape, or is not finite numbers.
+    """
+    hint = "Expected 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
+    try:
+        array = np.asarray(action, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise InvalidOptionError(f"an action is 8 finite numbers, not {action!r}", hint) from error
+    if array.shape != (8,) or not np.isfinite(array).all():
+        raise InvalidOptionError(
+            f"an action is 8 finite numbers, not {array.shape} {array.tolist()}", hint
+        )
+    return array

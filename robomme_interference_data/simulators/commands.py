@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated, Any
 
 import numpy as np
@@ -65,6 +66,8 @@ def simulate(
         raise InvalidOptionError(
             f"cannot write {video}: only .mp4 is written", "Give a path that ends in .mp4."
         )
+    if video is not None:
+        _check_folder(video)
     name = EpisodeId(family, split, episode)
     options: dict[str, Any] = {}
     if simulator == "tabletop":
@@ -139,6 +142,19 @@ def _check(policy: str, policies: Sequence[str]) -> None:
             f"there is no built-in policy {policy!r} here; expected {' or '.join(policies)}",
             nearest(policy, policies),
         )
+
+
+def _check_folder(video: Path) -> None:
+    """Make the folder of a video, before minutes are spent on what is to be in it."""
+    hint = "Give a path in a folder where you may write."
+    if video.is_dir():
+        raise InvalidOptionError(f"cannot write {video}: it is a folder", hint)
+    try:
+        video.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=video.parent):
+            pass
+    except OSError as error:
+        raise InvalidOptionError(f"cannot write {video}: {error.strerror}", hint) from error
 
 
 def _one(seen: Observation) -> dict[str, NDArray[np.uint8]]:

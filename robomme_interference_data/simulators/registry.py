@@ -3,9 +3,15 @@
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
+from inspect import signature
 from typing import Any
 
-from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    UnknownNameError,
+    nearest,
+)
 from robomme_interference_data.simulators.base import Simulator
 
 __all__ = [
@@ -25,13 +31,23 @@ def _tabletop(**options: Any) -> Simulator:
             f"the tabletop simulator needs {error.name or 'a library'}, which is not installed",
             "pip install 'robomme-interference-data[sim]'",
         ) from error
-    return TabletopSimulator(**options)
+    return _with_options("tabletop", TabletopSimulator, options)
 
 
 def _robomme(**options: Any) -> Simulator:
     from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
 
-    return RoboMMESimulator(**options)
+    return _with_options("robomme", RoboMMESimulator, options)
+
+
+def _with_options(name: str, make: Callable[..., Simulator], options: dict[str, Any]) -> Simulator:
+    known = signature(make).parameters
+    for option in options:
+        if option not in known:
+            raise InvalidOptionError(
+                f"the {name} simulator has no option {option!r}", nearest(option, known)
+            )
+    return make(**options)
 
 
 SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop, "robomme": _robomme}
@@ -102,10 +118,16 @@ def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
         return simulator.versions
 
 
-@cache
 def own_simulator(name: str, **options: Any) -> Simulator:
     """Return this process's simulator of a name and options; it is made once and kept.
 
-    For functions that `workers.run_tasks` calls in its worker processes, each many times.
+    For functions that `workers.run_tasks` calls in its worker processes, each many times. Lists
+    among the options count as the tuples of the same items.
     """
+    hashable = {key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
+    return _kept(name, **hashable)
+
+
+@cache
+def _kept(name: str, **options: Any) -> Simulator:
     return make_simulator(name, **options)

@@ -21,6 +21,8 @@ from robomme_interference_data.simulators.base import (
     EpisodeInfo,
     Observation,
     Status,
+    action_array,
+    camera_names,
 )
 from robomme_interference_data.simulators.robomme_process import RoboMMEProcess, find_python
 
@@ -74,12 +76,7 @@ class RoboMMESimulator:
         reset_s: float = 900.0,
         step_s: float = 600.0,
     ):
-        for camera in cameras:
-            if camera not in CAMERAS:
-                raise UnknownNameError(
-                    f"the robomme simulator has no camera {camera!r}", nearest(camera, CAMERAS)
-                )
-        self._cameras = tuple(camera for camera in CAMERAS if camera in cameras)
+        self._cameras = camera_names(self.name, cameras)
         self._python = find_python(python)
         self._limits = {"start": start_s, "reset": reset_s, "step": step_s}
         self._episode: EpisodeId | None = None
@@ -105,14 +102,14 @@ class RoboMMESimulator:
         Raises:
             InvalidOptionError: RoboMME draws images of another size than 256×256.
         """
+        self._episode = None  # an episode that is refused, or breaks, leaves none to step
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
         episode = EpisodeId.parse(str(episode_id))
         if episode.family not in self.families:
             raise UnknownNameError(
                 f"robomme has no family {episode.family!r}", nearest(episode.family, self.families)
             )
-        if self._closed:
-            raise SimulatorCrashError("the simulator is closed", "Make another one.")
-        self._episode = None
         if self._worker.pid is None or self._played >= EPISODES:
             self._worker.end()
             self._worker = RoboMMEProcess(self._python, self._limits)
@@ -151,12 +148,7 @@ class RoboMMESimulator:
             raise SimulatorCrashError(
                 "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
             )
-        action = np.asarray(action, dtype=np.float32)
-        if action.shape != (8,) or not np.isfinite(action).all():
-            raise InvalidOptionError(
-                f"an action is 8 finite numbers, not {action.shape} {action.tolist()}",
-                "Expected 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
-            )
+        action = action_array(action)
         running, self._episode = self._episode, None  # an episode that breaks is over
         where = str(running)
         answer, arrays = self._worker.call(

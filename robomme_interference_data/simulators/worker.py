@@ -2,7 +2,10 @@
 
 import multiprocessing
 import pickle
+import signal
 import time
+from contextlib import suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Self
 
@@ -25,7 +28,9 @@ class RemoteSimulator:
     """The same as `make_simulator(name, **options)`, in a worker process.
 
     The process starts with the first reset. When it dies, or takes too long over an episode, it
-    is ended and the call raises `SimulatorCrashError`; the next reset starts a fresh one.
+    is ended and the call raises `SimulatorCrashError`; the next reset starts a fresh one. So it
+    does after an exception that interrupts a call, such as `KeyboardInterrupt`, which stays
+    itself: no answer is ever taken for that of another call.
 
     Args:
         name: Name of the simulator.
@@ -40,13 +45,14 @@ class RemoteSimulator:
         self._left = episode_s
         self._process: Any = None
         self._pipe: Connection | None = None
+        self._closed = False
 
     def reset(
         self, episode_id: str, demonstration: bool = True
     ) -> tuple[Demonstration, Observation, EpisodeInfo]:
         """Start an episode; see `Simulator.reset`."""
         self._left = self._episode_s
-        if self._process is None:
+        if self._process is None and not self._closed:
             self._start()
         result: tuple[Demonstration, Observation, EpisodeInfo] = self._call(
             "reset", episode_id, demonstration
@@ -75,17 +81,12 @@ class RemoteSimulator:
         return None if self._process is None else self._process.pid
 
     def close(self) -> None:
-        """End the worker."""
-        process, pipe = self._process, self._pipe
-        self._process = self._pipe = None
-        if pipe is not None:
-            pipe.close()  # the worker ends when it reads the end of its pipe
-        if process is not None:
-            process.join(timeout=5)
-            if process.is_alive():
-                process.kill()
-                process.join()
-            process.close()
+        """End the worker; further calls but `close` are errors."""
+        self._closed = True
+        if self._pipe is not None:
+            self._pipe.close()  # the worker ends when it reads the end of its pipe
+            self._process.join(timeout=5)
+            self._end()
 
     def __enter__(self) -> Self:
         return self
@@ -96,62 +97,76 @@ class RemoteSimulator:
     def _start(self) -> None:
         # Not a fork: the parent may hold threads and locks, of torch or of a video decoder.
         context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(
+        pipe, theirs = context.Pipe()
+        process = context.Process(
             target=_serve, args=(theirs, self._name, self._options), daemon=True
         )
-        self._process.start()
+        # Ctrl-C is the parent's to handle: the worker inherits the mask, from its first moment.
+        resource_tracker.ensure_running()  # else the start does it, which takes the mask away
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            process.start()
+            self._process, self._pipe = process, pipe
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         theirs.close()
 
     def _call(self, what: str, *arguments: Any) -> Any:
+        if self._closed:
+            raise SimulatorCrashError(
+                f"cannot {what}: the simulator is closed", "Make another one."
+            )
         if self._pipe is None:
             raise SimulatorCrashError(
                 f"cannot {what}: the simulator's process has ended", "Reset to start another one."
             )
-        started = time.monotonic()
+        started, answered = time.monotonic(), False
         try:
             _send(self._pipe, (what, arguments))
             if not self._pipe.poll(max(self._left, 0.0)):
-                self._end()
                 raise SimulatorCrashError(
                     f"the {self._name} simulator took more than {self._episode_s:g} s over an "
                     f"episode, waiting for {what}; its process was ended"
                 )
             worked, result = _receive(self._pipe)
-        except (EOFError, ConnectionError) as error:
+            answered = True
+        except (EOFError, OSError) as error:
             self._process.join(timeout=5)
-            code = self._process.exitcode
-            self._end()
             raise SimulatorCrashError(
-                f"the {self._name} simulator's process died during {what}, exit code {code}"
+                f"the {self._name} simulator's process died during {what}, "
+                f"exit code {self._process.exitcode}"
             ) from error
         finally:
             self._left -= time.monotonic() - started
+            if not answered:  # what is still to come would be taken for the next call's answer
+                self._end()
         if not worked:
             raise result
         return result
 
     def _end(self) -> None:
-        if self._process is not None and self._process.is_alive():
-            self._process.kill()
-        self.close()
+        process, pipe = self._process, self._pipe
+        self._process = self._pipe = None
+        process.kill()
+        process.join()
+        process.close()
+        if pipe is not None:
+            pipe.close()
 
 
 def _serve(pipe: Connection, name: str, options: dict[str, Any]) -> None:
     """Answer calls until the other side closes the pipe."""
     simulator = None
-    while True:
-        try:
+    with suppress(EOFError, OSError):
+        while True:
             what, arguments = _receive(pipe)
-        except (EOFError, ConnectionError):
-            break
-        try:
-            simulator = simulator or make_simulator(name, **options)
-            asked = getattr(simulator, what)
-            answer = True, asked(*arguments) if callable(asked) else asked
-        except Exception as error:
-            answer = False, error
-        _send(pipe, answer)
+            try:
+                simulator = simulator or make_simulator(name, **options)
+                asked = getattr(simulator, what)
+                answer = True, asked(*arguments) if callable(asked) else asked
+            except Exception as error:
+                answer = False, error
+            _send(pipe, answer)
     if simulator is not None:
         simulator.close()
 

@@ -1,7 +1,7 @@
 """The embedded suite: nine task families on ManiSkill and sapien.
 
 Importing this package registers a Gymnasium environment per family, `tabletop/MoveCube-v1` and so
-on, so that `gymnasium.make` finds them:
+on, so that `gymnasium.make("tabletop/MoveCube-v1")` finds them. Gymnasium imports it itself for
 
     gymnasium.make("robomme_interference_data.simulators.tabletop:tabletop/MoveCube-v1")
 """

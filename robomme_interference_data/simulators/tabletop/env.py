@@ -15,7 +15,12 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES, FPS
-from robomme_interference_data.errors import UnknownNameError, nearest
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    NoRendererError,
+    UnknownNameError,
+    nearest,
+)
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation, Status
 from robomme_interference_data.simulators.tabletop.episodes import DIFFICULTIES, difficulty_of
 from robomme_interference_data.simulators.tabletop.families import family_class
@@ -35,33 +40,55 @@ FRONT_VIEW = math.radians(43)
 _ANSWER_STREAM = 1_000_003
 _GUESS_STREAM = 2_000_003
 
+_POSSIBLE: dict[str, tuple[Any, ...]] = {
+    "num_envs": (1,),
+    "obs_mode": ("rgb", "state", "state_dict", "none"),
+    "reward_mode": ("sparse", "none"),
+    "control_mode": ("pd_joint_pos",),
+    "render_mode": (None, "rgb_array", "sensors"),
+    "robot_uids": (PANDA,),
+    "sim_backend": ("physx_cpu", "cpu", "auto"),
+}
+# Where nothing is drawn.
+_POSSIBLE_BLIND = _POSSIBLE | {"obs_mode": ("none", "state", "state_dict"), "render_mode": (None,)}
+
 
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
     """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
 
-    `demonstrated` names the cameras that draw the demonstration. `reset` takes the options
-    `difficulty`, and `answer`, the index of the hidden answer to use instead of the seed's own.
-    Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
+    `demonstrated` names the cameras that draw the demonstration. `reset` takes seeds from 0 to
+    2**32 - 1 and the options `difficulty`, and `answer`, the index of the hidden answer to use
+    instead of the seed's own. Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
 
     Args:
         family: Task family to start with; `family` may be set before a reset.
         render: Whether to draw; without, observations hold no images.
-        **options: As for any ManiSkill environment.
+        **options: As for any ManiSkill environment, but one environment on the processor, joint
+            targets as actions, `obs_mode` `rgb`, `state`, `state_dict` or `none`, `render_mode`
+            `rgb_array` (the front view) or `sensors` (both cameras), a sparse reward or none.
+
+    Raises:
+        InvalidOptionError: An option is none of these.
+        NoRendererError: No Vulkan device of this machine can render.
     """
 
     SUPPORTED_ROBOTS = [PANDA]  # noqa: RUF012, ManiSkill's name and type
+    metadata = {"render_modes": ["rgb_array", "sensors"]}  # noqa: RUF012, Gymnasium's
 
     def __init__(self, family: str = FAMILIES[0], render: bool = True, **options: Any):
         self.family = family
         self.drawing = render
         self.demonstrated: Sequence[str] = CAMERAS
         self._demonstrating = False
-        options.setdefault("obs_mode", "rgb" if render else "none")
-        options.setdefault("reward_mode", "sparse")
+        for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
+            if options.setdefault(name, values[0]) not in values:
+                raise InvalidOptionError(
+                    f"{name} {options[name]!r} is not possible here",
+                    f"Expected {' or '.join(map(repr, values))}.",
+                )
         options.setdefault("render_backend", "cpu" if render else "none")
-        super().__init__(
-            robot_uids=PANDA, control_mode="pd_joint_pos", sim_backend="physx_cpu", **options
-        )
+        _find_renderer()  # sapien wants one even where nothing is drawn
+        super().__init__(**options)
         self._demonstrating = True
 
     # --- what ManiSkill asks for ---------------------------------------------------------------
@@ -112,21 +139,28 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of a seed: play its demonstration, then set the live scene."""
+        """Start the episode of a seed: play its demonstration, then set the live scene.
+
+        Raises:
+            InvalidOptionError: The seed or the answer is outside what it may be.
+            UnknownNameError: There is no such family or difficulty.
+        """
         options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
         if seed is None:
             seed = int(self._main_rng.randint(2**31))
-        number = int(np.ravel(seed)[0])
+        number = _index(np.ravel(seed)[0], 0, 2**32, "seed")
         difficulty = options.get("difficulty", difficulty_of(number))
         if difficulty not in DIFFICULTIES:
             raise UnknownNameError(
-                f"{difficulty!r} is not a difficulty", nearest(difficulty, DIFFICULTIES)
+                f"{difficulty!r} is not a difficulty", nearest(str(difficulty), DIFFICULTIES)
             )
-        self.episode: Family = family_class(self.family)(difficulty, RandomState(number))
-        answers = self.episode.answers
-        drawn = RandomState(number + _ANSWER_STREAM).randint(len(answers))
-        self._answer = answers[options.get("answer", drawn)]
-        self._guess = answers[RandomState(number + _GUESS_STREAM).randint(len(answers))]
+        episode: Family = family_class(self.family)(difficulty, RandomState(number))
+        answers = episode.answers
+        drawn = RandomState((number + _ANSWER_STREAM) % 2**32).randint(len(answers))
+        answer = _index(options.get("answer", drawn), -len(answers), len(answers), "answer")
+        self.episode, self._answer = episode, answers[answer]
+        guessed = RandomState((number + _GUESS_STREAM) % 2**32).randint(len(answers))
+        self._guess = answers[guessed]
         observed, info = super().reset(seed=number, options=options)
         if self._demonstrating:
             info["demonstration"] = self._demonstrate()
@@ -162,6 +196,11 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
                 images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
         return Observation(images, self.arm.state)
 
+    def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
+        """Return the view of a camera, front by default, `(1, 256, 256, 3) uint8` RGB."""
+        name = camera_name or CAMERAS[0]
+        return torch.from_numpy(self.observe((name,)).images[name])[None]
+
     @property
     def chance(self) -> float:
         """Probability that a guess is right."""
@@ -191,3 +230,23 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         robot.set_qvel(np.zeros_like(qpos))
         self.agent.controller.reset()
         self.agent.set_action(torch.from_numpy(self.arm.action)[None])
+
+
+def _index(value: Any, start: int, stop: int, what: str) -> int:
+    """Return a whole number from start up to, not including, stop."""
+    if not isinstance(value, int | np.integer) or not start <= value < stop:
+        raise InvalidOptionError(
+            f"{what} {value!r}; expected a whole number, {start} to {stop - 1}"
+        )
+    return int(value)
+
+
+def _find_renderer() -> None:
+    try:
+        sapien.render.RenderSystem(sapien.Device("cpu"))
+    except RuntimeError as error:
+        raise NoRendererError(
+            f"no Vulkan device on this machine can render: {error}",
+            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
+            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
+        ) from error

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.errors import (
-    InvalidOptionError,
-    NoRendererError,
     SimulatorCrashError,
     UnknownNameError,
     nearest,
@@ -21,6 +19,8 @@ from robomme_interference_data.simulators.base import (
     EpisodeInfo,
     Observation,
     Status,
+    action_array,
+    camera_names,
 )
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
@@ -46,25 +46,22 @@ class TabletopSimulator:
     name = "tabletop"
 
     def __init__(self, render: bool = True, cameras: Sequence[str] = CAMERAS):
-        for camera in cameras:
-            if camera not in CAMERAS:
-                raise UnknownNameError(
-                    f"the tabletop simulator has no camera {camera!r}", nearest(camera, CAMERAS)
-                )
-        self._cameras = tuple(name for name in CAMERAS if name in cameras)
-        _find_renderer()  # sapien wants one even where nothing is drawn
+        self._cameras = camera_names(self.name, cameras)
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
         self._env = TabletopEnv(render=render, obs_mode="none")
         self._env.observe(self._cameras)  # the first picture is slow: shaders are compiled
         self._steps: int | None = None
+        self._closed = False
 
     def reset(
         self, episode_id: str, demonstration: bool = True
     ) -> tuple[Demonstration, Observation, EpisodeInfo]:
         """Start an episode; see `Simulator.reset`."""
+        self._steps = None  # an episode that is refused, or breaks, leaves none to step
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
         episode = EpisodeId.parse(str(episode_id))
         seed = seed_of(episode)
-        self._steps = None
         self._env.family = episode.family
         self._env.demonstrated = self._cameras if demonstration else ()
         _, info = self._env.reset(seed=seed)
@@ -75,13 +72,7 @@ class TabletopSimulator:
     def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
         """Execute one action; see `Simulator.step`."""
         steps = self._running()
-        action = np.asarray(action, dtype=np.float32)
-        if action.shape != (8,) or not np.isfinite(action).all():
-            raise InvalidOptionError(
-                f"an action is 8 finite numbers, not {action.shape} {action.tolist()}",
-                "Expected 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
-            )
-        self._env._step_action(action)
+        self._env._step_action(action_array(action))
         self._steps = steps + 1
         status = self._env.status
         if status is Status.ONGOING and self._steps >= MAX_STEPS:
@@ -102,8 +93,8 @@ class TabletopSimulator:
         return self._env.chance
 
     def close(self) -> None:
-        """Release the scene."""
-        self._steps = None
+        """Release the scene; further calls but `close` are errors."""
+        self._steps, self._closed = None, True
         self._env.close()
 
     def __enter__(self) -> Self:
@@ -113,21 +104,10 @@ class TabletopSimulator:
         self.close()
 
     def _running(self) -> int:
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
         if self._steps is None:
             raise SimulatorCrashError(
                 "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
             )
         return self._steps
-
-
-def _find_renderer() -> None:
-    import sapien
-
-    try:
-        sapien.render.RenderSystem(sapien.Device("cpu"))
-    except RuntimeError as error:
-        raise NoRendererError(
-            f"no Vulkan device on this machine can render: {error}",
-            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
-            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
-        ) from error
