@@ -38,7 +38,7 @@ class Measured:
         lesson: The true lesson.
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
         query_cosines: Cosine of each frame with the first live observation, `(T,) float32`.
-        typical: Median cosine of two frames of the demonstrations.
+        typical: Median cosine of two frames of different distractor units.
     """
 
     episode_id: EpisodeId

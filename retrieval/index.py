@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
+    DISTRACTORS,
     FORMAT_VERSION,
     INDEX_CENTRE,
     INDEX_EMBEDDINGS,
@@ -27,7 +28,7 @@ from robomme_interference_data.constants import (
     INDEX_ROWS,
 )
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.embeddings import index_folder, normalised
+from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -61,7 +62,7 @@ class IndexReport:
         folder: Where the index lies.
         frames: Frames in it.
         embedded: Frames that were embedded now; the others were there already.
-        typical_cosine: Median cosine of two frames.
+        typical_cosine: Median cosine of two frames of the train pool.
     """
 
     folder: Path
@@ -80,11 +81,13 @@ def build_index(
 ) -> list[IndexReport]:
     """Embed every stored frame of datasets whose frames are to be compared with each other.
 
-    The same data, encoder and device give the same bytes, interrupted or not. An index that is
-    there and right is left as it is.
+    What an encoder is centred on, and what it finds in any two frames, come from the train pool
+    alone: the distractor units. So the embedding of a frame, and where its history is cut, depend
+    on no other query. The same data, encoder and device give the same bytes, interrupted or not.
+    An index that is there and right is left as it is.
 
     Args:
-        roots: Folders of the datasets; a centred encoder is centred on all of them together.
+        roots: Folders of the datasets, one of them the distractor units.
         encoder: What embeds.
         progress: Shows how far it is.
         camera: Camera to embed, with or without `observation.images.`.
@@ -92,34 +95,38 @@ def build_index(
 
     Raises:
         UnknownNameError: A dataset has no such camera.
+        InvalidOptionError: There are no distractor units among them.
         BuildError: Another process makes one of the indexes.
         MissingFileError, FormatError, TruncatedVideoError: A dataset cannot be read.
     """
     if threads < 1:
         raise InvalidOptionError(f"threads={threads}; expected 1 or more")
     datasets = [Dataset(LocalFiles(root)) for root in roots]
-    works = [_Work(dataset, encoder, camera, datasets) for dataset in datasets]
+    units = next((dataset for dataset in datasets if dataset.kind == DISTRACTORS), None)
+    if units is None:
+        raise InvalidOptionError(
+            f"{datasets[0].files.describe()} holds {datasets[0].kind}; expected distractor units "
+            "beside them, which tell what any two frames share",
+            "Index both at once: robomme-interference index --data SPLIT",
+        )
+    works = [_Work(dataset, encoder, camera, units.revision) for dataset in datasets]
     with ExitStack() as held:
         for work in works:
             held.enter_context(work.holding())
-        if all(work.is_done() for work in works):
-            return [work.report(0) for work in works]
-        for work in works:
-            work.begin()
         progress.start(encoder.name, sum(work.frames for work in works))
-        embedded = [work.embed(encoder, progress, threads) for work in works]
-        centre = _mean(works) if encoder.centred else None
-        for work in works:
-            work.finish(centre)
-        return [work.report(count) for work, count in zip(works, embedded, strict=True)]
+        pool: EmbeddingIndex | None = None
+        reports = {}
+        for work in sorted(works, key=lambda work: work.dataset is not units):
+            reports[work] = work.make(encoder, progress, threads, pool)
+            if pool is None:
+                pool = units.index(encoder.name)
+        return [reports[work] for work in works]
 
 
 class _Work:
     """The index of one dataset, being made."""
 
-    def __init__(
-        self, dataset: Dataset, encoder: Encoder, camera: str, together: Sequence[Dataset]
-    ):
+    def __init__(self, dataset: Dataset, encoder: Encoder, camera: str, pool: str):
         assert isinstance(dataset.files, LocalFiles)
         self.dataset = dataset
         self.camera = CAMERA_PREFIX + camera.removeprefix(CAMERA_PREFIX)
@@ -138,9 +145,9 @@ class _Work:
                 "name": self.folder.name,
                 "fingerprint": encoder.fingerprint,
                 "computed_in": encoder.computed_in,
-                "centred_on": [one.revision for one in together] if encoder.centred else None,
             },
             "camera": self.camera,
+            "pool": pool,
             "revision": dataset.revision,
         }
 
@@ -149,10 +156,37 @@ class _Work:
         busy = BuildError(f"another process makes {self.folder}", "Wait for it to end, or stop it.")
         return hold(self.parts / "lock", busy)
 
-    def is_done(self) -> bool:
+    def make(
+        self, encoder: Encoder, progress: BuildProgress, threads: int, pool: EmbeddingIndex | None
+    ) -> IndexReport:
+        """Make the index unless it is there.
+
+        Args:
+            encoder: What embeds.
+            progress: Shows how far it is.
+            threads: Threads that decode and preprocess.
+            pool: The index of the train pool, or None if this is the one.
+        """
+        embedded = 0
+        if self.is_done(pool):
+            progress.advance(self.frames, before=True)
+        else:
+            self.begin()
+            embedded = self.embed(encoder, progress, threads)
+            self.finish(encoder.centred, pool)
+        shutil.rmtree(self.parts)
+        header = read_json(self.folder / INDEX_HEADER)
+        return IndexReport(self.folder, self.frames, embedded, header["typical_cosine"])
+
+    def is_done(self, pool: EmbeddingIndex | None) -> bool:
         """Tell whether the index is there, made as planned, and whole."""
         try:
             header = read_json(self.folder / INDEX_HEADER)
+            if pool is not None and (
+                header["encoder"]["sha256"] != pool.fingerprint
+                or header["typical_cosine"] != pool.typical_cosine
+            ):
+                return False
             described = {name: header[name] for name in self.plan}
             described["encoder"] = {n: header["encoder"][n] for n in self.plan["encoder"]}
             return canonical_json(described) == canonical_json(self.plan) and all(
@@ -202,9 +236,10 @@ class _Work:
                 )
             yield part
 
-    def finish(self, centre: NDArray[np.float32] | None) -> None:
-        """Write the index, its header last, and remove the parts."""
+    def finish(self, centred: bool, pool: EmbeddingIndex | None) -> None:
+        """Write the index, its header last."""
         (self.folder / INDEX_HEADER).unlink(missing_ok=True)
+        centre = (self._mean() if pool is None else pool.centre) if centred else None
         size = next(self.features()).shape[1]
         names = [INDEX_EMBEDDINGS, INDEX_ROWS]
         with atomic_path(self.folder / INDEX_EMBEDDINGS) as partial:
@@ -216,7 +251,10 @@ class _Work:
                 out[first : first + len(features)] = normalised(features, centre)
                 first += len(features)
             out.flush()
-            typical = typical_cosine(out)
+            if pool is None:
+                typical = typical_cosine(np.split(out, np.cumsum(self.lengths)[:-1]))
+            else:
+                typical = pool.typical_cosine
             del out
         with atomic_path(self.folder / INDEX_ROWS) as partial:
             pq.write_table(self._rows(), partial)
@@ -245,12 +283,6 @@ class _Work:
             },
         }
         write_json(self.folder / INDEX_HEADER, header)
-        shutil.rmtree(self.parts)
-
-    def report(self, embedded: int) -> IndexReport:
-        header = read_json(self.folder / INDEX_HEADER)
-        shutil.rmtree(self.parts, ignore_errors=True)
-        return IndexReport(self.folder, self.frames, embedded, header["typical_cosine"])
 
     def _prepared(
         self, encoder: Encoder, episodes: Sequence[int], threads: int
@@ -291,6 +323,11 @@ class _Work:
             return None
         return part if len(part) == self.lengths[episode] else None
 
+    def _mean(self) -> NDArray[np.float32]:
+        """Return the mean of the features, `(D,) float32`, each episode weighing the same."""
+        total = sum(features.mean(axis=0, dtype=np.float64) for features in self.features())
+        return np.asarray(total / len(self.lengths), np.float32)
+
     def _rows(self) -> pa.Table:
         episodes = np.repeat(np.arange(len(self.lengths)), self.lengths)
         firsts = np.cumsum([0, *self.lengths[:-1]])
@@ -303,13 +340,3 @@ class _Work:
                 "row": pa.array(rows, pa.int64()),
             }
         )
-
-
-def _mean(works: Sequence[_Work]) -> NDArray[np.float32]:
-    """Return the mean of all features of all datasets, `(D,) float32`."""
-    total, count = np.float64(0), 0
-    for work in works:
-        for features in work.features():
-            total = total + features.sum(axis=0, dtype=np.float64)
-            count += len(features)
-    return np.asarray(total / count, np.float32)

@@ -193,7 +193,7 @@ class Buffer:
         query = self.query_index(encoder)
         for entry in self.manifest.sessions:
             index = self._datasets[entry.dataset].index(encoder)
-            if (index.fingerprint, index.camera) != (query.fingerprint, query.camera):
+            if index.made != query.made:
                 raise StaleIndexError(
                     f"the embeddings of encoder {encoder!r} were made differently in "
                     f"{self._datasets[self.manifest.query.dataset].files.describe()} and in "

@@ -35,7 +35,10 @@ from robomme_interference_data.files import Files, check_names, read_json
 
 __all__ = ["EmbeddingIndex", "index_folder", "normalised"]
 
-_HEADER_KEYS = ("encoder", "camera", "revision", "frames", "size", "typical_cosine", "files")
+_HEADER_KEYS = (
+    *("encoder", "camera", "revision", "pool"),
+    *("frames", "size", "typical_cosine", "files"),
+)
 
 
 def index_folder(encoder: str) -> str:
@@ -130,13 +133,23 @@ class EmbeddingIndex:
         return str(self.header["encoder"]["sha256"])
 
     @property
+    def made(self) -> tuple[str, str, str]:
+        """What embeddings that are compared with each other share: encoder, camera and pool."""
+        return self.fingerprint, self.camera, self.pool
+
+    @property
+    def pool(self) -> str:
+        """Revision of the distractor units that `centre` and `typical_cosine` are of."""
+        return str(self.header["pool"])
+
+    @property
     def size(self) -> int:
         """Values in an embedding."""
         return int(self.header["size"])
 
     @property
     def typical_cosine(self) -> float:
-        """Median cosine of two frames of the dataset: what the encoder finds in any two."""
+        """Median cosine of two frames of different distractor units of the pool."""
         return float(self.header["typical_cosine"])
 
     @cached_property

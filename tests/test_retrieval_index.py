@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from robomme_interference_data import Dataset, load_buffer, load_split
+from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.embeddings import index_folder, normalised
 from robomme_interference_data.errors import (
     FormatError,
@@ -140,8 +141,8 @@ def test_an_interrupted_run_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch
             make_index(split)
     with pytest.raises(MissingIndexError):
         load_buffer(EPISODE, 0, split).embeddings("thumbnail")
-    # Three demonstrations, of 21, 37 and 21 frames, were done.
-    assert make_index(split) == [4 * (21 + 37) - 79, 7 * 32]
+    # Three units of 32 frames were done.
+    assert make_index(split) == [4 * (21 + 37), 4 * 32]
     assert files_of(split) == once
 
 
@@ -175,17 +176,51 @@ def test_what_cannot_be_used_is_refused(split: Path) -> None:
     with pytest.raises(StaleIndexError, match="another version of the encoder"):
         Selector("thumbnail").select(load_buffer(EPISODE, 0, split), buffer.query_frame())
     refused(StaleIndexError, "made differently", camera="observation.images.wrist")
+    refused(StaleIndexError, "made differently", pool="0" * 64)
     header.write_text(json.dumps(whole))
     (header.parent / "rows.parquet").write_bytes(b"PAR1")
     refused(FormatError, "rows.parquet")
 
 
-def test_the_datasets_of_a_split_must_be_centred_together(split: Path) -> None:
+def test_retrieval_does_not_depend_on_other_queries(split: Path, tmp_path: Path) -> None:
     make_index(split)
+    # The same but for the queries: one of each family instead of two.
+    sample = tmp_path / "sample"
+    for _ in write_sample(
+        sample, families=factories.FAMILIES, train=2, test=1, size=64, demonstration=20
+    ):
+        pass
+    fewer = factories.build_split(sample, tmp_path / "fewer")
+    assert make_index(fewer) == [4 * 21, 7 * 32]
+    one, other = (load_buffer(EPISODE, 0, folder) for folder in (split, fewer))
+    assert np.array_equal(one.embeddings("thumbnail"), other.embeddings("thumbnail"))
+    indexes = [buffer.query_index("thumbnail") for buffer in (one, other)]
+    assert indexes[0].typical_cosine == indexes[1].typical_cosine
+    assert indexes[0].made == indexes[1].made
+
+
+def test_the_centre_is_the_mean_of_the_units(split: Path) -> None:
+    make_index(split)
+    units = load_split(split).datasets["distractors"]
+    features = []
+    for episode in range(7):
+        images = np.empty((32, 64, 64, 3), np.uint8)
+        units.read_frames(episode, "observation.images.front", 0, images)
+        features.append(Thumbnail().prepare(images))
+    index = load_buffer(EPISODE, 0, split).query_index("thumbnail")
+    expected = np.concatenate(features).mean(axis=0, dtype=np.float64)
+    assert index.centre == pytest.approx(expected, abs=1e-6)
+    assert index.pool == units.revision
+
+
+def test_units_are_indexed_alone_but_no_demonstrations(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    shutil.rmtree(split / "distractors" / "index")
     build_index([split / "distractors"], make_encoder("thumbnail"), QUIET)
-    load_buffer(EPISODE, 0, split).embeddings("thumbnail")  # demonstrations only
-    with pytest.raises(StaleIndexError, match="both at once"):
-        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+    assert files_of(split) == once
+    with pytest.raises(InvalidOptionError, match="demonstrations; expected distractor units"):
+        build_index([split / "demonstrations"], make_encoder("thumbnail"), QUIET)
 
 
 def test_the_selector(split: Path) -> None:
@@ -283,7 +318,7 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
 
 
 def test_siglip_makes_an_index(split: Path, model: str) -> None:
-    build_index([split / "demonstrations"], make_encoder(model, device="cpu"), QUIET)
+    build_index(datasets_in(split), make_encoder(model, device="cpu"), QUIET)
     index = Dataset(LocalFiles(split / "demonstrations")).index(model)
     assert index.embeddings.shape == (232, 32) and index.centre is None
     lengths = np.linalg.norm(index.embeddings.astype(np.float32), axis=1)
