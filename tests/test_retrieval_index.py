@@ -345,6 +345,69 @@ def test_other_weights_are_another_encoder(model: str, tmp_path: Path) -> None:
     assert one.fingerprint["weights_sha256"] != other.fingerprint["weights_sha256"]
 
 
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("num_attention_heads", 4), ("hidden_act", "relu"), ("layer_norm_eps", 0.5)],
+)
+def test_other_settings_are_another_encoder(
+    setting: str, value: object, model: str, tmp_path: Path
+) -> None:
+    folder = Path(model.partition(":")[2])
+    changed = shutil.copytree(folder, tmp_path / "tiny")
+    config = json.loads((changed / "config.json").read_text())
+    config["vision_config"][setting] = value
+    (changed / "config.json").write_text(json.dumps(config))
+    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
+    differing = {key for key in one.fingerprint if one.fingerprint[key] != other.fingerprint[key]}
+    assert differing == {"tower"} and other.fingerprint["tower"][setting] == value
+    # They are told apart because they see differently.
+    image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
+    rows = [encoder.features(encoder.prepare(image)) for encoder in (one, other)]
+    assert not np.array_equal(*rows)
+
+
+def test_the_fingerprint_names_the_code(model: str) -> None:
+    import transformers
+
+    found = make_encoder(model, device="cpu").fingerprint
+    assert found["transformers"] == transformers.__version__
+    assert found["preprocessing"]["class"] == "SiglipImageProcessorPil"
+
+
+def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    folder = shutil.copytree(model.partition(":")[2], tmp_path / "part")
+    path = folder / "model.safetensors"
+    tensors = load_file(path)
+    # Of the second layer: two norms, four projections and two of the MLP, weight and bias each.
+    part = {
+        name: value for name, value in tensors.items() if "vision_model.encoder.layers.1" in name
+    }
+    assert len(part) == 16
+    kept = {name: value for name, value in tensors.items() if name not in part}
+    save_file(kept, path, metadata={"format": "pt"})
+    with pytest.raises(FormatError, match=r"lacks 16 of the .* such as .*layers\.1") as caught:
+        make_encoder(f"siglip:{folder}", device="cpu")
+    assert "download or save it again" in str(caught.value.hint)
+    text = {name: value for name, value in tensors.items() if name.startswith("text")}
+    save_file(text, path, metadata={"format": "pt"})
+    with pytest.raises(FormatError, match="lacks"):
+        make_encoder(f"siglip:{folder}", device="cpu")
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(FormatError, match="cannot be loaded"):
+        make_encoder(f"siglip:{folder}", device="cpu")
+
+
+def test_weights_of_another_shape_are_refused(model: str, tmp_path: Path) -> None:
+    folder = shutil.copytree(model.partition(":")[2], tmp_path / "other")
+    config = json.loads((folder / "config.json").read_text())
+    config["vision_config"]["intermediate_size"] = 48
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(FormatError, match="cannot be loaded"):
+        make_encoder(f"siglip:{folder}", device="cpu")
+
+
 def test_weights_that_are_not_there(tmp_path: Path) -> None:
     pytest.importorskip("transformers")
     with pytest.raises(MissingWeightsError) as caught:
