@@ -200,7 +200,7 @@ def calibrate(
     """Fit the cosine below which histories are cut, and show what others would give.
 
     The released rule: midway between the 99th percentile of the cosines across true cuts and the
-    1st percentile of the lowest cosine inside each lesson.
+    1st percentile of the lowest cosine inside each session, every stored span once.
 
     Example: robomme-interference calibrate --split my-split --sweep 0.30 0.99 --out cuts.png
     """

@@ -17,14 +17,41 @@ from robomme_interference_data.intervals import wilson
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
 from robomme_interference_data.retrieval.select import Rule, pick
 from robomme_interference_data.retrieval.selector import lot_of, true_lesson
+from robomme_interference_data.sessions import Session
 
-__all__ = ["ALL", "PASS_MARK", "Cell", "Grade", "Measured", "cells", "grade", "mean_of", "measure"]
+__all__ = [
+    "ALL",
+    "PASS_MARK",
+    "Cell",
+    "Grade",
+    "Measured",
+    "TrueSession",
+    "cells",
+    "grade",
+    "mean_of",
+    "measure",
+]
 
 PASS_MARK = 0.9
 """Least mean purity and mean coverage of a good cell (released reference)."""
 
 ALL = "all"
 """Stands for all families together."""
+
+
+@dataclass(frozen=True)
+class TrueSession:
+    """A session of a buffer, for grading.
+
+    Attributes:
+        span: First frame in the buffer, and the one after the last.
+        family: Its family.
+        stored: Names the stored frames that it holds, the same in every buffer of a split.
+    """
+
+    span: Span
+    family: str
+    stored: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +70,7 @@ class Measured:
 
     episode_id: EpisodeId
     k: int
-    sessions: tuple[Span, ...]
+    sessions: tuple[TrueSession, ...]
     lesson: Span
     adjacent: NDArray[np.float32]
     query_cosines: NDArray[np.float32]
@@ -130,12 +157,18 @@ def measure(buffer: Buffer, encoder: str) -> Measured:
     return Measured(
         buffer.episode_id,
         buffer.k,
-        tuple(session.span for session in buffer.sessions),
+        tuple(_true_session(session) for session in buffer.sessions),
         true_lesson(buffer),
         adjacent_cosines(embeddings),
         cosines(embeddings, buffer.query_embedding(encoder)),
         buffer.query_index(encoder).typical_cosine,
     )
+
+
+def _true_session(session: Session) -> TrueSession:
+    entry = session.entry
+    stored = f"{entry.dataset}/{entry.episode_index}/{entry.start}-{entry.stop}x{entry.repeat}"
+    return TrueSession(session.span, session.family, stored)
 
 
 def grade(measured: Measured, rule: Rule) -> Grade:
@@ -152,8 +185,9 @@ def grade(measured: Measured, rule: Rule) -> Grade:
     frames = choice.frames
     start, stop = measured.lesson
     of_lesson = int(((frames >= start) & (frames < stop)).sum())
-    starts = [first for first, _ in measured.sessions]
-    touched = {measured.sessions[n] for n in np.searchsorted(starts, frames, side="right") - 1}
+    spans = [session.span for session in measured.sessions]
+    starts = [first for first, _ in spans]
+    touched = {spans[n] for n in np.searchsorted(starts, frames, side="right") - 1}
     return Grade(
         str(rule),
         threshold,

@@ -236,9 +236,10 @@ def calibration_text(found: Calibration, rule: str, own: float, title: str) -> s
         "",
         f"Fitted by the released rule: {found.threshold:.3f}; in use ({rule}): {own:.3f}",
         f"99th percentile of {len(found.cuts)} true cuts: {found.cut_percentile:.3f}; 1st "
-        f"percentile of the lowest cosine inside {len(found.lowest)} lessons: "
+        f"percentile of the lowest cosine inside {len(found.lowest)} sessions: "
         f"{found.lowest_percentile:.3f}; {gap}",
-        "Fitted and tried on the same split; only the families left out below are unseen.",
+        "Each stored span counts once, and each cut between the same two. Fitted and tried on the "
+        "same split; only the families left out below are unseen.",
     ]
     parts = ["\n".join(lines)]
     if found.held_out:
@@ -252,7 +253,8 @@ def calibration_text(found: Calibration, rule: str, own: float, title: str) -> s
         rows = tuple((o.family, o.threshold, o.purity, o.coverage) for o in found.held_out)
         left_out = Table(
             "held_out",
-            f"Fitted without one family, tried on that family: thresholds from {min(values):.3f} "
+            f"Fitted without any frame of one family, tried on it: thresholds from "
+            f"{min(values):.3f} "
             f"to {max(values):.3f}",
             columns,
             rows,

@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -288,6 +289,9 @@ def test_calibration(run: Run, tmp_path: Path) -> None:
     assert [point["threshold"] for point in found["sweep"][::3]] == [
         round(0.8 + n / 100, 2) for n in range(20)
     ]
-    # Eight lessons, each followed by three sessions at most; nested cuts count once.
-    assert len(found["lowest"]) == 8 and len(found["cuts"]) == 8 * 3
+    # Units return in many buffers, and cuts under k = 1 and 3: each counts once.
+    rows = [m for m in load_split(indexed()).manifests() if m.k == 3]
+    pairs = {(a.source, b.source) for m in rows for a, b in pairwise(m.sessions)}
+    assert len(found["cuts"]) == len(pairs) <= 8 * 3
+    assert len(found["lowest"]) == len({s.source for m in rows for s in m.sessions}) < 8 * 4
     assert {one["family"] for one in found["held_out"]} == set(factories.FAMILIES)

@@ -10,10 +10,24 @@ from hypothesis import strategies as st
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.intervals import wilson
-from robomme_interference_data.retrieval.calibrate import calibrate, fit, steps
+from robomme_interference_data.retrieval.calibrate import (
+    calibrate,
+    fit,
+    lowest_inside,
+    steps,
+    true_cuts,
+)
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.encoders.names import DEFAULT_MODEL
-from robomme_interference_data.retrieval.grade import ALL, Cell, Grade, Measured, cells, grade
+from robomme_interference_data.retrieval.grade import (
+    ALL,
+    Cell,
+    Grade,
+    Measured,
+    TrueSession,
+    cells,
+    grade,
+)
 from robomme_interference_data.retrieval.report import cell_table, shown_table, verdict
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import METHODS, Rule, parse_rules
@@ -30,15 +44,24 @@ def made(
     sessions: tuple[Span, ...] = SESSIONS,
     inside: float = 1.0,
     typical: float = 0.0,
+    units: tuple[str, ...] = (),
 ) -> Measured:
-    """A buffer whose adjacent cosines are `inside` but before `cuts`, and 0 with the query."""
+    """A buffer whose adjacent cosines are `inside` but before `cuts`, and 0 with the query.
+
+    The sessions behind the lesson are those `units`, or else its own.
+    """
     frames = sessions[-1][1]
     adjacent, alike = np.full(frames - 1, inside, np.float32), np.zeros(frames, np.float32)
     for place, value in cuts.items():
         adjacent[place - 1] = value
     for place, value in high.items():
         alike[place] = value
-    return Measured(EpisodeId.parse(episode), k, sessions, sessions[0], adjacent, alike, typical)
+    names = [episode, *(units or (f"Other/train/{episode} {n}" for n in range(len(sessions) - 1)))]
+    true = tuple(
+        TrueSession(span, name.partition("/")[0], name)
+        for span, name in zip(sessions, names, strict=True)
+    )
+    return Measured(EpisodeId.parse(episode), k, true, sessions[0], adjacent, alike, typical)
 
 
 # --- rules -----------------------------------------------------------------------------------
@@ -198,10 +221,13 @@ def test_tables() -> None:
 
 
 def three() -> list[Measured]:
-    """Cuts of 0, 0.4 and 0.2 (each family's own), lessons with 0.9, 0.7 and 0.8 at lowest."""
+    """Cuts of 0, 0.4 and 0.2 (each family's own), lessons with 0.9, 0.7 and 0.8 at lowest.
+
+    Units of one frame: nothing is inside them.
+    """
     made_of = (("MoveCube", 0.0, 0.9), ("InsertPeg", 0.4, 0.7), ("RouteStick", 0.2, 0.8))
     return [
-        made(f"{family}/test/0", k, cuts={6: cut, 3: low}, high={1: 1}, sessions=((0, 6), (6, 11)))
+        made(f"{family}/test/0", k, cuts={6: cut, 3: low}, high={1: 1}, sessions=((0, 6), (6, 7)))
         for family, cut, low in made_of
         for k in (1, 2)  # nested: each cut returns
     ]
@@ -220,19 +246,39 @@ def test_the_released_rule_by_hand() -> None:
     assert (held_out["InsertPeg"].purity, held_out["InsertPeg"].coverage) == (1, 1)
     sweep = {(point.threshold, point.k): point for point in found.sweep}
     assert len(sweep) == 6
-    # At 0.3 InsertPeg is not cut: 6 of 11 frames are lesson. At 0.95 lessons fall into 3 and 3.
-    assert sweep[0.3, 1].purity == pytest.approx((1 + 1 + 6 / 11) / 3)
+    # At 0.3 InsertPeg is not cut: 6 of 7 frames are lesson. At 0.95 lessons fall into 3 and 3.
+    assert sweep[0.3, 1].purity == pytest.approx((1 + 1 + 6 / 7) / 3)
     assert (sweep[0.549, 2].purity, sweep[0.549, 2].coverage) == (1, 1)
-    # Both halves are too short to be chosen, but the other session is not.
-    assert (sweep[0.95, 2].purity, sweep[0.95, 2].coverage) == (0, 0)
+    # All three parts are too short, so all may be chosen: the first half is.
+    assert (sweep[0.95, 2].purity, sweep[0.95, 2].coverage) == (1, 0.5)
+
+
+def test_every_session_counts_and_each_once() -> None:
+    # MoveCube's lesson, then units A and B; InsertPeg's lesson, then the same A and B.
+    units = ("RouteStick/train/0", "PatternLock/train/0")
+    one = made(cuts={3: 0.9, 6: 0.1, 8: 0.5, 11: 0.2, 13: 0.6}, high={}, units=units)
+    other = made(
+        "InsertPeg/test/0", cuts={3: 0.8, 6: 0.3, 8: 0.5, 11: 0.2, 13: 0.6}, high={}, units=units
+    )
+    assert lowest_inside([one, other]) == pytest.approx([0.5, 0.6, 0.8, 0.9])
+    assert true_cuts([one, other]) == pytest.approx([0.1, 0.2, 0.3])  # A to B once
+    # Without RouteStick, A's 0.5 goes, and every cut: A is on one side of each.
+    assert lowest_inside([one, other], without="RouteStick") == pytest.approx([0.6, 0.8, 0.9])
+    assert true_cuts([one, other], without="RouteStick") == []
+    # Without PatternLock, B's 0.6 goes, and the cut from A to B.
+    assert true_cuts([one, other], without="PatternLock") == pytest.approx([0.1, 0.3])
+    # Without MoveCube: its query goes as a whole. 99th percentile of 0.2, 0.3: 0.299; 1st of 0.5,
+    # 0.6, 0.8: 0.502.
+    fitted = fit([one, other], without="MoveCube")
+    assert fitted == pytest.approx(((0.299 + 0.502) / 2, 0.299, 0.502), abs=1e-6)
 
 
 def test_nothing_to_fit() -> None:
     alone = made(k=0, cuts={}, high={}, sessions=((0, 6),))
     with pytest.raises(InvalidOptionError, match="1 buffers without any cut between sessions"):
         fit([alone])
-    short = made(cuts={}, high={}, sessions=((0, 1), (1, 6)))
-    with pytest.raises(InvalidOptionError, match="without any lesson of two frames"):
+    short = made(cuts={}, high={}, sessions=((0, 1), (1, 2)))
+    with pytest.raises(InvalidOptionError, match="without any session of two frames"):
         fit([short])
     assert calibrate(three()[:2], [0.5]).held_out == ()  # one family
 
