@@ -47,11 +47,13 @@ def index(
     threads: Annotated[
         int | None, typer.Option(help="Threads that decode.", show_default="all processors")
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Make it again from nothing.")] = False,
     as_json: Json = False,
 ) -> None:
     """Embed every stored frame once, and keep the embeddings beside the data.
 
-    Goes on where an interrupted run stopped; does nothing if the index is there and right.
+    Goes on where an interrupted run stopped. An index that is there and right is kept, even if
+    another device computed it.
 
     Example: robomme-interference index --data my-split --encoder thumbnail
     """
@@ -64,7 +66,7 @@ def index(
     if threads is None:
         threads = os.cpu_count() or 1
     with BuildProgress(quiet=as_json) as progress:
-        reports = build_index(roots, made, progress, camera=camera, threads=threads)
+        reports = build_index(roots, made, progress, camera=camera, threads=threads, force=force)
     if as_json:
         rows = [
             {
@@ -72,6 +74,8 @@ def index(
                 "frames": report.frames,
                 "embedded": report.embedded,
                 "typical_cosine": report.typical_cosine,
+                "computed_in": report.computed_in,
+                "batch": report.batch,
             }
             for report in reports
         ]
@@ -79,6 +83,12 @@ def index(
         return
     for report in reports:
         typer.echo(f"{report.folder}: {report.frames} frames, {report.embedded} embedded now")
+        if (report.computed_in, report.batch) != (made.computed_in, made.batch):
+            MESSAGES.print(
+                f"{report.folder} is kept, computed with {report.computed_in}, {report.batch} "
+                f"images at a time; --force makes it again with {made.computed_in}, {made.batch} "
+                "at a time"
+            )
 
 
 def retrieve(

@@ -14,6 +14,7 @@ from robomme_interference_data import Dataset, load_buffer, load_split
 from robomme_interference_data.build_dataset.sample import write_sample
 from robomme_interference_data.embeddings import index_folder, normalised
 from robomme_interference_data.errors import (
+    BuildError,
     FormatError,
     InvalidOptionError,
     MissingFileError,
@@ -126,12 +127,22 @@ def test_an_interrupted_run_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch
     once = files_of(split)
     for path in split.glob("*/index"):
         shutil.rmtree(path)
+    interrupted(split, monkeypatch)
+    with pytest.raises(MissingIndexError):
+        load_buffer(EPISODE, 0, split).embeddings("thumbnail")
+    # Three units of 32 frames were done.
+    assert make_index(split) == [4 * (21 + 37), 4 * 32]
+    assert files_of(split) == once
+
+
+def interrupted(split: Path, monkeypatch: pytest.MonkeyPatch, after: int = 3) -> None:
+    """Begin an index, and break off after some batches."""
     calls = 0
 
     def features(_: Thumbnail, prepared: Any) -> Any:
         nonlocal calls
         calls += 1
-        if calls > 3:
+        if calls > after:
             raise KeyboardInterrupt
         return prepared
 
@@ -139,11 +150,61 @@ def test_an_interrupted_run_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch
         patch.setattr(Thumbnail, "features", features)
         with pytest.raises(KeyboardInterrupt):
             make_index(split)
-    with pytest.raises(MissingIndexError):
-        load_buffer(EPISODE, 0, split).embeddings("thumbnail")
-    # Three units of 32 frames were done.
-    assert make_index(split) == [4 * (21 + 37), 4 * 32]
+
+
+def test_parts_of_another_batch_or_device_are_refused(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(split, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(Thumbnail, "batch", 8)
+        with pytest.raises(BuildError, match="computed with numpy, 64 images") as caught:
+            make_index(split)
+        assert "--batch 64" in str(caught.value.hint) and "--force" in str(caught.value.hint)
+        # All 7 units, though three were done.
+        assert make_index(split, force=True) == [4 * (21 + 37), 7 * 32]
+    header = json.loads((split / "distractors/index/thumbnail/index.json").read_text())
+    assert header["computed"] == {"in": "numpy", "batch": 8}
+
+
+def test_each_dataset_is_made_by_itself(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    for kind, embedded in (("distractors", [0, 7 * 32]), ("demonstrations", [4 * (21 + 37), 0])):
+        shutil.rmtree(split / kind / "index")
+        assert make_index(split) == embedded
+        assert files_of(split) == once
+
+
+def test_an_index_of_another_device_is_kept(split: Path) -> None:
+    make_index(split)
+    for path in split.glob("*/index/thumbnail/index.json"):
+        header = json.loads(path.read_text())
+        header["computed"] = {"in": "cuda, bfloat16", "batch": 32}
+        path.write_text(json.dumps(header))
+    reports = build_index(datasets_in(split), make_encoder("thumbnail"), QUIET)
+    assert [r.embedded for r in reports] == [0, 0]
+    assert {(r.computed_in, r.batch) for r in reports} == {("cuda, bfloat16", 32)}
+    assert make_index(split, force=True) == [4 * (21 + 37), 7 * 32]
+
+
+def test_what_a_killed_run_left_is_swept(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    left = split / "distractors" / "index" / "thumbnail" / ".embeddings.npy.a1b2.partial"
+    left.write_bytes(b"half")
+    assert make_index(split) == [0, 0]
     assert files_of(split) == once
+
+
+def test_what_is_not_finite_is_not_stored(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def features(_: Thumbnail, prepared: Any) -> Any:
+        prepared[-1, 5] = np.inf
+        return prepared
+
+    monkeypatch.setattr(Thumbnail, "features", features)
+    with pytest.raises(BuildError, match=r"not finite for frames up to 31 of VideoRepick/train/0"):
+        make_index(split)
 
 
 def test_a_damaged_index_is_made_again(split: Path) -> None:
