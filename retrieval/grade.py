@@ -146,22 +146,22 @@ class Cell:
         return self.purity.value >= PASS_MARK and self.coverage.value >= PASS_MARK
 
 
-def measure(buffer: Buffer, encoder: str) -> Measured:
+def measure(buffer: Buffer, encoder: str, camera: str = "front") -> Measured:
     """Look up the embeddings of a buffer and of its first live observation, and compare them.
 
     Raises:
         MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
         InvalidOptionError: The buffer has no lesson, or has it in several parts.
     """
-    embeddings = buffer.embeddings(encoder)
+    embeddings = buffer.embeddings(encoder, camera)
     return Measured(
         buffer.episode_id,
         buffer.k,
         tuple(_true_session(session) for session in buffer.sessions),
         true_lesson(buffer),
         adjacent_cosines(embeddings),
-        cosines(embeddings, buffer.query_embedding(encoder)),
-        buffer.query_index(encoder).typical_cosine,
+        cosines(embeddings, buffer.query_embedding(encoder, camera)),
+        buffer.query_index(encoder, camera).typical_cosine,
     )
 
 

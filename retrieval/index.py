@@ -25,7 +25,12 @@ from robomme_interference_data.constants import (
     INDEX_ROWS,
 )
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
+from robomme_interference_data.embeddings import (
+    EmbeddingIndex,
+    encoder_id,
+    index_folder,
+    normalised,
+)
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -122,7 +127,7 @@ def build_index(
         for work in sorted(works, key=lambda work: work.dataset is not units):
             reports[work] = work.make(progress, threads, pool, force=force)
             if pool is None:
-                pool = units.index(encoder.name)
+                pool = units.index(encoder.name, camera)
         return [reports[work] for work in works]
 
 
@@ -139,12 +144,12 @@ class _Work:
             raise UnknownNameError(
                 f"camera {camera!r} is not in {dataset.files.describe()}", nearest(camera, known)
             )
-        self.folder = dataset.files.root / index_folder(encoder.name)
+        self.folder = dataset.files.root / index_folder(encoder.name, feature)
         self.parts = Parts(self.folder.parent / f".{self.folder.name}.building", dataset, feature)
         self.frames = sum(self.parts.lengths)
         self.plan: dict[str, Any] = {
             "format_version": FORMAT_VERSION,
-            "encoder": {"name": self.folder.name, "fingerprint": encoder.fingerprint},
+            "encoder": {"name": encoder_id(encoder.name), "fingerprint": encoder.fingerprint},
             "computed": {"in": encoder.computed_in, "batch": encoder.batch},
             "camera": feature,
             "pool": pool,

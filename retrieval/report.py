@@ -131,12 +131,25 @@ def grade_table(grades: Sequence[Grade], title: str) -> Table:
     return Table("rows", title, columns, tuple(rows))
 
 
+_WHY = {
+    "max": "no segment long enough has a frame of a higher cosine with what the robot sees now",
+    "mean": "no segment long enough has a higher mean cosine with what the robot sees now",
+    "last": "it is the last segment that is long enough",
+    "random": "it was drawn by lot among the segments that are long enough",
+    "oracle": "it is the true lesson, which this rule is told",
+}
+"""Method to the reason for its choice; followed by the score, if it has one."""
+
+
 @dataclass(frozen=True)
 class Reasons:
     """Why a part of a history was chosen.
 
     Attributes:
         grade: The choice, compared with the true lesson.
+        camera: Camera whose frames were compared.
+        method: The method, one of `select.METHODS`.
+        score: What it scored the chosen segment by, or None if it scores none.
         lesson: The true lesson.
         closest: Chosen frame closest to what the robot sees.
         cosine: Its cosine.
@@ -147,6 +160,9 @@ class Reasons:
     """
 
     grade: Grade
+    camera: str
+    method: str
+    score: float | None
     lesson: Span
     closest: int
     cosine: float
@@ -160,6 +176,8 @@ class Reasons:
         return {
             "episode_id": str(self.grade.episode_id),
             "k": self.grade.k,
+            "camera": self.camera,
+            "score": self.score,
             "rule": self.grade.rule,
             "threshold": self.grade.threshold,
             "history_frames": self.grade.history_frames,
@@ -184,10 +202,13 @@ class Reasons:
         one = self.grade
         parts = f"{one.segments} segment{'s' if one.segments > 1 else ''}"
         lines = [
-            f"{one.episode_id} at k={one.k}, rule {one.rule}: {one.history_frames} history frames, "
-            f"cut into {parts} where the cosine of adjacent frames is below {one.threshold:.3f}",
+            f"{one.episode_id} at k={one.k}, {self.camera} camera, rule {one.rule}: "
+            f"{one.history_frames} history frames, cut into {parts} where the cosine of "
+            f"adjacent frames is below {one.threshold:.3f}",
             f"Chosen: frames {one.start} to {one.stop - 1}, of {', '.join(self.sessions)}",
-            f"Why: frame {self.closest} has cosine {self.cosine:.3f} with what the robot sees now"
+            f"Why: {_WHY[self.method]}" + ("" if self.score is None else f", {self.score:.3f}"),
+            f"What the robot sees now is closest to frame {self.closest} of these, with cosine "
+            f"{self.cosine:.3f}"
             + (
                 f"; the closest one outside is frame {self.other} of {self.other_source}, "
                 f"{self.other_cosine:.3f}"
@@ -201,7 +222,7 @@ class Reasons:
         return "\n".join(lines)
 
 
-def reasons(buffer: Buffer, choice: Choice, grade: Grade) -> Reasons:
+def reasons(buffer: Buffer, choice: Choice, grade: Grade, camera: str) -> Reasons:
     """Collect why a span was chosen."""
     start, stop = choice.span
     alike = choice.query_cosines
@@ -213,6 +234,9 @@ def reasons(buffer: Buffer, choice: Choice, grade: Grade) -> Reasons:
     lesson = next(one.span for one in buffer.sessions if one.role == "lesson")
     return Reasons(
         grade,
+        camera,
+        choice.method,
+        dict(zip(choice.segments, choice.scores, strict=True)).get((start, stop)),
         lesson,
         closest,
         float(alike[closest]),

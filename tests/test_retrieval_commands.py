@@ -142,7 +142,7 @@ def test_the_table_by_family_and_k(run: Run) -> None:
     code, out, err = run("retrieval-score", "--split", indexed())
     assert code == 0 and "buffers/s" in err
     title, _, heads, rule, *rest = out.splitlines()
-    assert title == "Retrieval on indexed, encoder thumbnail, rule max/adaptive"
+    assert title == "Retrieval on indexed, encoder thumbnail, camera front, rule max/adaptive"
     assert heads.split()[:3] == ["family", "k", "queries"] and set(rule) == {"-", " "}
     rows = [line.split()[:3] for line in rest[: rest.index("")]]
     queries = dict.fromkeys(factories.FAMILIES, "2") | {"all": "8"}
@@ -190,6 +190,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path) -> Non
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     found = json.loads(runs[0][1])
     assert (found["split"], found["encoder"], found["buffers"]) == ("indexed", "thumbnail", 24)
+    assert found["camera"] == "front"
     assert found["rules"] == ["max/adaptive"] and found["pass_mark"] == 0.9
     assert found["revision"] == load_split(indexed()).revision
     cell = next(c for c in found["cells"] if (c["family"], c["k"]) == ("all", 0))
@@ -236,10 +237,14 @@ def test_why(run: Run, tmp_path: Path) -> None:
     words = ("retrieve", EPISODE, "--k", 3, "--split", indexed(), "--out", out_file)
     code, out, err = run(*words, "--rule", "oracle")
     assert code == 0 and f"{out_file} written" in err
-    first, chosen, why, lesson = out.splitlines()
-    assert first.startswith(f"{EPISODE} at k=3, rule oracle/adaptive: 116 history frames, cut into")
+    first, chosen, why, closest, lesson = out.splitlines()
+    assert first.startswith(
+        f"{EPISODE} at k=3, front camera, rule oracle/adaptive: 116 history frames, cut into"
+    )
     assert chosen == f"Chosen: frames 0 to 19, of lesson {EPISODE}"
-    assert why.startswith("Why: frame ") and "the closest one outside is frame " in why
+    assert why == "Why: it is the true lesson, which this rule is told"
+    assert closest.startswith("What the robot sees now is closest to frame ")
+    assert "the closest one outside is frame " in closest
     assert lesson == (
         "The lesson is frames 0 to 19: purity 100.0%, coverage 100.0%, 0 false sessions"
     )
@@ -247,6 +252,29 @@ def test_why(run: Run, tmp_path: Path) -> None:
     once = out_file.read_bytes()
     run(*words, "--rule", "oracle")
     assert out_file.read_bytes() == once
+
+
+@pytest.mark.parametrize(
+    ("rule", "reason"),
+    [
+        ("max/-1", "no segment long enough has a frame of a higher cosine"),
+        ("mean/-1", "no segment long enough has a higher mean cosine"),
+        ("last/-1", "it is the last segment that is long enough"),
+        ("random/-1", "it was drawn by lot among the segments that are long enough"),
+    ],
+)
+def test_why_is_the_reason_of_the_rule(rule: str, reason: str, run: Run) -> None:
+    words = ("retrieve", EPISODE, "--k", 1, "--split", indexed(), "--rule", rule)
+    code, out, _ = run(*words)
+    why = out.splitlines()[2]
+    assert code == 0 and why.startswith(f"Why: {reason}")
+    found = json.loads(run(*words, "--json")[1])
+    if rule in ("last/-1", "random/-1"):
+        assert found["score"] is None and why == f"Why: {reason}"
+    else:
+        assert why.endswith(f", {found['score']:.3f}")
+    if rule == "max/-1":  # one segment: its score is that of the closest frame
+        assert found["score"] == found["cosine"]
 
 
 def test_why_as_json_is_what_the_score_says(run: Run, tmp_path: Path) -> None:

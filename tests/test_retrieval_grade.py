@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.intervals import wilson
@@ -18,7 +19,6 @@ from robomme_interference_data.retrieval.calibrate import (
     true_cuts,
 )
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
-from robomme_interference_data.retrieval.encoders.names import DEFAULT_MODEL
 from robomme_interference_data.retrieval.grade import (
     ALL,
     Cell,
@@ -69,7 +69,7 @@ def made(
 
 @given(
     st.sampled_from(sorted(METHODS)),
-    st.one_of(st.none(), st.just("adaptive"), st.integers(-1000, 1000).map(lambda n: n / 1000)),
+    st.one_of(st.none(), st.just("adaptive"), st.floats(-1, 1)),
 )
 def test_rules_are_read_as_they_are_written(method: str, cut: float | None) -> None:
     rule = Rule(method, cut)
@@ -80,6 +80,8 @@ def test_the_cut_is_the_encoders_own_unless_given() -> None:
     assert str(Rule().settled(0.923)) == "max/0.923"
     assert str(Rule().settled(None)) == "max/adaptive"
     assert str(Rule("mean", 0.5).settled(0.923)) == "mean/0.5"
+    assert str(Rule("max", 0.9234567)) == "max/0.9234567"  # not the same as max/0.923457
+    assert str(Rule("max", -1)) == "max/-1"
     assert Rule("max", 0.923).threshold(0.1) == 0.923
     assert Rule("max", "adaptive").threshold(0.5) == 0.75
     with pytest.raises(InvalidOptionError, match="not settled"):
@@ -109,8 +111,11 @@ def test_rules_that_are_none(text: str, error: type[Exception], said: str) -> No
 
 
 def test_names_of_encoders() -> None:
-    assert encoder_name(f"siglip:{DEFAULT_MODEL}") == encoder_name("siglip") == "siglip"
-    assert published_threshold(f"siglip:{DEFAULT_MODEL}") == 0.923
+    assert encoder_name(f"siglip:{PAPER_ENCODER}") == encoder_name("siglip") == "siglip"
+    assert published_threshold(f"siglip:{PAPER_ENCODER}") == 0.923
+    # At a revision it is the same model, and the revision is kept for loading it.
+    assert published_threshold(f"siglip:{PAPER_ENCODER}@main") == 0.923
+    assert encoder_name(f"siglip:{PAPER_ENCODER}@main") == f"siglip:{PAPER_ENCODER}@main"
     assert published_threshold("siglip:google/siglip2-base-patch16-224") is None
     assert published_threshold("thumbnail") is None
 

@@ -1,8 +1,10 @@
 """Encoders, the index beside the data, and the selector of rollouts."""
 
+import io
 import json
 import shutil
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,8 @@ import pytest
 
 from robomme_interference_data import Dataset, load_buffer, load_split
 from robomme_interference_data.build_dataset.sample import write_sample
-from robomme_interference_data.embeddings import index_folder, normalised
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.embeddings import encoder_id, index_folder, normalised
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -93,10 +96,127 @@ def test_normalising() -> None:
         ("siglip", "index/siglip"),
         ("siglip:google/siglip2-base@abc", "index/siglip-siglip2-base"),
         ("siglip:models/my model", "index/siglip-my-model"),
+        ("siglip:google/siglip-so400m-patch14-384", "index/siglip"),
+        ("siglip:google/siglip-so400m-patch14-384@main", "index/siglip"),
     ],
 )
 def test_folders(encoder: str, folder: str) -> None:
-    assert index_folder(encoder) == folder
+    assert index_folder(encoder) == index_folder(encoder, "observation.images.front") == folder
+    assert index_folder(encoder, "wrist") == f"{folder}@wrist"
+
+
+def test_a_model_in_a_folder_is_called_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    for model in (".", "../tiny", str(folder)):
+        assert encoder_id(f"siglip:{model}") == "siglip:tiny"
+        assert index_folder(f"siglip:{model}") == "index/siglip-tiny"
+    assert index_folder("siglip:/") == "index/siglip-"  # not the paper's model
+
+
+def test_two_models_of_one_name_are_told_apart(split: Path) -> None:
+    encoder = Thumbnail()
+    encoder.name = "siglip:one/tiny"
+    build_index(datasets_in(split), encoder, QUIET)
+    buffer = load_buffer(EPISODE, 1, split)
+    assert len(buffer.embeddings("siglip:one/tiny@v2")) == 20 + 32
+    with pytest.raises(StaleIndexError, match="of encoder 'siglip:one/tiny'") as caught:
+        buffer.embeddings("siglip:two/tiny")
+    assert "index --data" in str(caught.value.hint)
+
+
+def test_each_camera_has_an_index_of_its_own(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    assert make_index(split, camera="wrist") == [4 * (21 + 37), 7 * 32]
+    both = files_of(split)
+    assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
+    buffer = load_buffer(EPISODE, 1, split)
+    centre = buffer.query_index("thumbnail", "wrist").centre
+    expected = normalised(Thumbnail().prepare(buffer.frames("wrist")), centre)
+    assert np.array_equal(buffer.embeddings("thumbnail", "wrist"), expected)
+    selector = Selector("thumbnail", camera="wrist")
+    assert (selector.name, selector.camera) == ("thumbnail@wrist/max/adaptive", "wrist")
+    chosen = selector.select(buffer, buffer.query_frame("wrist"))
+    stored = select(buffer, "thumbnail", selector.rule, camera="wrist")
+    assert (chosen.start, chosen.stop) == (stored.start, stored.stop)
+    for path in split.glob("*/index/thumbnail@wrist"):
+        shutil.rmtree(path)
+    with pytest.raises(MissingIndexError, match="camera 'wrist'") as caught:
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail", "wrist")
+    assert str(caught.value.hint).endswith("--encoder thumbnail --camera wrist")
+
+
+def test_contents_are_checked(split: Path) -> None:
+    make_index(split)
+    folder = split / "demonstrations" / "index" / "thumbnail"
+    assert not list(verify_split(split, decode=False))
+    whole = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def refused(name: str, content: bytes, said: str) -> None:
+        (folder / name).write_bytes(content)
+        with pytest.raises(FormatError, match=said) as caught:
+            load_buffer(EPISODE, 1, split).query_index("thumbnail").check()
+        assert f"index --data {split} --encoder thumbnail" in str(caught.value.hint)
+        (found,) = verify_split(split, decode=False)
+        assert found.where == "demonstrations/index/thumbnail" and said in found.what
+        (folder / name).write_bytes(whole[name])
+
+    rows = np.load(folder / "embeddings.npy")
+    turned, holed = io.BytesIO(), io.BytesIO()
+    np.save(turned, rows[::-1])
+    rows[3] = np.nan
+    np.save(holed, rows)
+    for name, content in (
+        ("embeddings.npy", turned.getvalue()),
+        ("centre.npy", whole["centre.npy"][:-1] + b"x"),
+        ("rows.parquet", whole["rows.parquet"] + b"x"),
+    ):
+        refused(name, content, f"{name} does not have the SHA-256")
+    # As made by something else: the hash is right, the content is not.
+    header = json.loads(whole["index.json"])
+    header["files"]["embeddings.npy"]["sha256"] = sha256(holed.getvalue()).hexdigest()
+    whole["embeddings.npy"] = holed.getvalue()
+    (folder / "embeddings.npy").write_bytes(holed.getvalue())
+    refused("index.json", json.dumps(header).encode(), "no finite number")
+    (folder / "index.json").write_bytes(whole["index.json"])
+    (folder / "rows.parquet").unlink()
+    with pytest.raises(FormatError, match=r"rows\.parquet is missing") as caught:
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+    assert f"index --data {split} --encoder thumbnail" in str(caught.value.hint)
+
+
+def test_verify_names_an_index_that_does_not_belong(split: Path) -> None:
+    make_index(split)
+    path = split / "demonstrations" / "index" / "thumbnail" / "index.json"
+    header = json.loads(path.read_text())
+    for change, said in (
+        ({"pool": "0" * 64}, "other distractors"),
+        ({"camera": "observation.images.wrist"}, "camera observation.images.wrist"),
+        ({"encoder": None}, "does not say of which encoder"),
+    ):
+        path.write_text(json.dumps(header | change))
+        (found,) = verify_split(split, decode=False)
+        assert found.where == "demonstrations/index/thumbnail" and said in found.what
+
+
+def test_what_identifies_a_selector(split: Path) -> None:
+    make_index(split)
+    buffer = load_buffer(EPISODE, 1, split)
+    index = buffer.query_index("thumbnail")
+    assert Selector("thumbnail").identity(buffer) == {
+        "encoder": "thumbnail",
+        "fingerprint": index.fingerprint,
+        "camera": "front",
+        "method": "max",
+        "cut": "adaptive",
+        "threshold": (1 + index.typical_cosine) / 2,
+    }
+    fixed = Selector("thumbnail", method="mean", threshold=0.5).identity(buffer)
+    assert (fixed["method"], fixed["cut"], fixed["threshold"]) == ("mean", 0.5, 0.5)
 
 
 def test_a_buffers_embeddings_are_those_of_its_frames(split: Path) -> None:
@@ -232,11 +352,16 @@ def test_what_cannot_be_used_is_refused(split: Path) -> None:
     refused(StaleIndexError, "revision 0000", revision="0" * 64)
     refused(FormatError, "format version 2", format_version=2)
     refused(FormatError, "expected float16 of shape", size=7)
+    lacking = {name: value for name, value in whole.items() if name != "pool"}
+    header.write_text(json.dumps(lacking))
+    with pytest.raises(FormatError, match="lacks pool") as caught:
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+    assert f"index --data {split} --encoder thumbnail" in str(caught.value.hint)
     other = whole["encoder"] | {"sha256": "0" * 64}
     refused(StaleIndexError, "made differently", encoder=other)
     with pytest.raises(StaleIndexError, match="another version of the encoder"):
         Selector("thumbnail").select(load_buffer(EPISODE, 0, split), buffer.query_frame())
-    refused(StaleIndexError, "made differently", camera="observation.images.wrist")
+    refused(StaleIndexError, "camera 'wrist'", camera="observation.images.wrist")
     refused(StaleIndexError, "made differently", pool="0" * 64)
     header.write_text(json.dumps(whole))
     (header.parent / "rows.parquet").write_bytes(b"PAR1")

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
     MissingExtraError,
     MissingWeightsError,
 )
-from robomme_interference_data.retrieval.encoders.names import DEFAULT_MODEL, encoder_name
+from robomme_interference_data.retrieval.encoders.names import encoder_name
 
 __all__ = ["Siglip"]
 
@@ -50,7 +51,7 @@ class Siglip:
     centred = False
 
     def __init__(
-        self, model: str = DEFAULT_MODEL, *, device: str | None = None, batch: int | None = None
+        self, model: str = PAPER_ENCODER, *, device: str | None = None, batch: int | None = None
     ):
         torch, transformers = _libraries()
         self._transformers_version = str(transformers.__version__)
@@ -183,7 +184,7 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
         if kind not in classes:
             raise FormatError(
                 f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
-                f"For example: --encoder siglip:{DEFAULT_MODEL}",
+                f"For example: --encoder siglip:{PAPER_ENCODER}",
             )
         vision, loading = classes[kind].from_pretrained(
             folder, dtype="float32", local_files_only=True, output_loading_info=True
