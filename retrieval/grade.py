@@ -94,6 +94,9 @@ class Grade:
         purity: Share of the chosen frames that are of the lesson.
         coverage: Share of the lesson's frames that were chosen.
         false_sessions: Sessions other than the lesson of which a frame was chosen.
+        true_cuts: Borders between true sessions.
+        found_cuts: How many of them are borders of segments.
+        false_cuts: Borders of segments inside a true session.
     """
 
     rule: str
@@ -108,6 +111,9 @@ class Grade:
     purity: float
     coverage: float
     false_sessions: int
+    true_cuts: int
+    found_cuts: int
+    false_cuts: int
 
     @property
     def hit(self) -> bool:
@@ -129,6 +135,9 @@ class Cell:
             a single episode.
         coverage: Mean coverage, likewise.
         false_sessions: Mean number of false sessions, likewise.
+        true_cuts: Borders between true sessions, in all its queries together.
+        found_cuts: How many of them are borders of segments.
+        false_cuts: Borders of segments inside true sessions.
     """
 
     rule: str
@@ -139,6 +148,9 @@ class Cell:
     purity: Interval
     coverage: Interval
     false_sessions: Interval
+    true_cuts: int
+    found_cuts: int
+    false_cuts: int
 
     @property
     def passed(self) -> bool:
@@ -187,6 +199,7 @@ def grade(measured: Measured, rule: Rule) -> Grade:
     of_lesson = int(((frames >= start) & (frames < stop)).sum())
     spans = [session.span for session in measured.sessions]
     starts = [first for first, _ in spans]
+    borders, cuts = set(starts[1:]), {first for first, _ in choice.segments[1:]}
     touched = {spans[n] for n in np.searchsorted(starts, frames, side="right") - 1}
     return Grade(
         str(rule),
@@ -201,6 +214,9 @@ def grade(measured: Measured, rule: Rule) -> Grade:
         of_lesson / len(frames),
         of_lesson / (stop - start),
         len(touched - {measured.lesson}),
+        len(borders),
+        len(borders & cuts),
+        len(cuts - borders),
     )
 
 
@@ -223,7 +239,21 @@ def _cell(rule: str, family: str, k: int, grades: Sequence[Grade]) -> Cell:
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
     # One key: equal values have equal intervals, whatever the rule, family and k.
     drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
-    return Cell(rule, family, k, count, Interval(hits / count, *wilson(hits, count)), *drawn)
+    hit = Interval(hits / count, *wilson(hits, count))
+    purity, coverage, false_sessions = drawn
+    return Cell(
+        rule,
+        family,
+        k,
+        count,
+        hit,
+        purity,
+        coverage,
+        false_sessions,
+        sum(one.true_cuts for one in grades),
+        sum(one.found_cuts for one in grades),
+        sum(one.false_cuts for one in grades),
+    )
 
 
 def mean_of(grades: Iterable[Grade]) -> tuple[float, float]:

@@ -29,8 +29,9 @@ NOTE = (
     "hit: queries for which any lesson frame was chosen, with the 95% Wilson interval. Means over "
     "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of the "
     "chosen frames that are lesson; coverage, the share of the lesson that was chosen; false "
-    "sessions, how many others were touched. pass: mean purity and mean coverage are both at "
-    f"least {PASS_MARK:.0%}."
+    "sessions, how many others were touched. cuts found: of all cuts between true sessions, in all "
+    "queries together; false cuts: those inside one. pass: mean purity and mean coverage are both "
+    f"at least {PASS_MARK:.0%}."
 )
 
 
@@ -53,6 +54,8 @@ def shown_table(cells: Sequence[Cell], title: str) -> Table:
             cell.episodes,
             *(_rate(value) for value in (cell.hit, cell.purity, cell.coverage)),
             cell.false_sessions.value,
+            f"{cell.found_cuts} of {cell.true_cuts}",
+            cell.false_cuts,
             cell.passed,
         )
         for cell in cells
@@ -66,6 +69,8 @@ def shown_table(cells: Sequence[Cell], title: str) -> Table:
         Column("purity"),
         Column("coverage"),
         Column("false_sessions", "ratio"),
+        Column("cuts_found"),
+        Column("false_cuts", "count"),
         Column("pass", "flag"),
     )
     return Table("retrieval", title, columns, tuple(rows), NOTE)
@@ -76,6 +81,7 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
     columns = [Column("rule"), Column("family"), Column("k", "count"), Column("queries", "count")]
     for name in ("hit", "purity", "coverage", "false_sessions"):
         columns += [Column(name + suffix, "ratio") for suffix in ("", "_low", "_high")]
+    columns += [Column(name, "count") for name in ("true_cuts", "found_cuts", "false_cuts")]
     columns.append(Column("pass", "flag"))
     rows = [
         (
@@ -87,6 +93,9 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
             *_bounds(cell.purity),
             *_bounds(cell.coverage),
             *_bounds(cell.false_sessions),
+            cell.true_cuts,
+            cell.found_cuts,
+            cell.false_cuts,
             cell.passed,
         )
         for cell in cells
@@ -108,6 +117,7 @@ def grade_table(grades: Sequence[Grade], title: str) -> Table:
         Column("purity", "ratio"),
         Column("coverage", "ratio"),
         Column("false_sessions", "count"),
+        *(Column(name, "count") for name in ("true_cuts", "found_cuts", "false_cuts")),
     )
     rows = [
         (
@@ -125,6 +135,9 @@ def grade_table(grades: Sequence[Grade], title: str) -> Table:
             one.purity,
             one.coverage,
             one.false_sessions,
+            one.true_cuts,
+            one.found_cuts,
+            one.false_cuts,
         )
         for one in grades
     ]

@@ -171,6 +171,8 @@ def test_rules_side_by_side(run: Run, tmp_path: Path) -> None:
     assert {row["coverage"] for row in whole} == {"1.000000"}
     for row in whole:
         assert float(row["false_sessions"]) == int(row["k"])
+        assert (row["found_cuts"], row["false_cuts"]) == ("0", "0")
+        assert int(row["true_cuts"]) == int(row["k"]) * int(row["queries"])
     with (tmp_path / "rows.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * 8 * 3

@@ -141,6 +141,9 @@ def test_a_grade_by_hand() -> None:
         purity=2 / 5,
         coverage=2 / 6,
         false_sessions=1,
+        true_cuts=2,  # before 6 and before 11; found are those before 4, 9 and 11
+        found_cuts=1,
+        false_cuts=2,
     )
     assert found.hit
     last = grade(one, Rule("last", 0.5))
@@ -188,6 +191,10 @@ def test_cells_by_hand() -> None:
     assert (everything.hit.low, everything.hit.high) == wilson(2, 3)
     assert everything.false_sessions.value == pytest.approx((0 + 1 + 2) / 3)
     assert not both.passed
+    # MoveCube's two queries have two borders each; `good` finds the one before 6, `poor` one and
+    # two false ones; `alone` has none to find.
+    assert (both.true_cuts, both.found_cuts, both.false_cuts) == (4, 2, 2)
+    assert (single.true_cuts, single.found_cuts, single.false_cuts) == (0, 0, 0)
     assert verdict(found).endswith("pass: max/0.5: 1 of 3")
 
 
@@ -196,7 +203,7 @@ def test_the_pass_mark() -> None:
 
     def cell(purity: float, coverage: float) -> Cell:
         values = [Interval(value, 0, 1) for value in (1, purity, coverage, 0)]
-        return Cell("max", "MoveCube", 7, 50, *values)
+        return Cell("max", "MoveCube", 7, 50, *values, 0, 0, 0)
 
     assert cell(0.9, 0.9).passed and cell(1, 0.95).passed
     assert not cell(0.89, 1).passed and not cell(1, 0.8999).passed
@@ -209,14 +216,17 @@ def test_tables() -> None:
     # The closest frame is in the lesson twice; the third time it is in the other nine.
     assert lines[0] == "Title"
     assert lines[2].split() == [
-        *("family", "k", "queries", "hit", "purity", "coverage", "false", "sessions", "pass")
+        *("family", "k", "queries", "hit", "purity", "coverage", "false", "sessions"),
+        *("cuts", "found", "false", "cuts", "pass"),
     ]
     assert lines[4].startswith("MoveCube  k2        3  66.7% (20.8 to 93.9)  66.7% (0.0 to 100.0)")
-    assert lines[4].endswith("0.67  no")
+    # Of three times two borders the one before 6 is found each time.
+    assert lines[4].split()[-6:] == ["0.67", "3", "of", "6", "0", "no"]
     assert lines[5].startswith("all       k2        3")
     record = cell_table(found, "Title").records()[0]
     assert record["family"] == "MoveCube" and record["purity"] == pytest.approx(2 / 3)
     assert record["pass"] is False
+    assert (record["true_cuts"], record["found_cuts"], record["false_cuts"]) == (6, 3, 0)
     two = [grade(one, rule) for rule in (Rule("max", 0.5), Rule("last", 0.5)) for one in measured]
     lines = shown_table(list(cells(two)), "Title").text().splitlines()
     assert [line.split()[0] for line in lines[4:6]] == ["max/0.5", "last/0.5"]
