@@ -4,7 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import pyarrow as pa
@@ -17,6 +17,8 @@ from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
     IDENTITY_PATH,
+    INDEX_DIR,
+    INDEX_HEADER,
     MANIFEST_JSON,
     MANIFEST_JSONL,
     MANIFEST_PARQUET,
@@ -26,8 +28,9 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.digest import combine
+from robomme_interference_data.embeddings import index_folder
 from robomme_interference_data.errors import InterferenceError, InvalidIdError
-from robomme_interference_data.files import LocalFiles, sha256_file
+from robomme_interference_data.files import LocalFiles, read_json, sha256_file
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.manifest_io import ManifestReader
 from robomme_interference_data.schema import EpisodeRecord
@@ -66,8 +69,9 @@ def verify_split(
     """Check a split, yielding violations as they are found.
 
     Checked are: the hashes of the manifest files; the identity of both datasets; with `decode`,
-    every frame and vector of every episode against its recorded hashes; and every manifest row,
-    which is made anew from the datasets, rules and seed and compared field by field.
+    every frame and vector of every episode against its recorded hashes; embeddings that lie
+    beside the data, if any, against theirs (they are not made anew); and every manifest row, which
+    is made anew from the datasets, rules and seed and compared field by field.
 
     Args:
         root: Folder of the split.
@@ -94,6 +98,7 @@ def verify_split(
             if decode:
                 yield from _episode(name, dataset, record)
                 advance(record.length)
+        yield from _indexes(name, dataset, datasets[DISTRACTORS].revision)
     yield from _rows(root, reader, datasets)
 
 
@@ -158,6 +163,28 @@ def _episode(name: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Vio
                 yield Violation(where, f"{feature} ({what}) does not have the recorded SHA-256")
         if combine(features) != whole:
             yield Violation(where, f"the SHA-256 of its {what} is not that of their features")
+
+
+def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
+    """Check the embeddings beside a dataset, whatever encoders and cameras they are of."""
+    for path in dataset.files.list(INDEX_DIR, f"/{INDEX_HEADER}"):
+        folder = str(PurePath(path).parent)
+        where = f"{name}/{folder}"
+        try:
+            header = read_json(dataset.files.path(path))
+            made = header["encoder"]["name"], header["camera"]
+            if index_folder(*made) != folder:
+                yield Violation(where, f"holds the embeddings of {made[0]}, camera {made[1]}")
+                continue
+            index = dataset.index(*made)
+            index.check()
+        except InterferenceError as error:
+            yield Violation(where, error.message)
+        except (KeyError, TypeError, AttributeError):
+            yield Violation(where, f"its {INDEX_HEADER} does not say of which encoder and camera")
+        else:
+            if index.pool != pool:
+                yield Violation(where, "its centre and typical cosine are of other distractors")
 
 
 def _rows(root: Path, reader: ManifestReader, datasets: dict[str, Dataset]) -> Iterator[Violation]:

@@ -52,6 +52,7 @@ __all__ = [
     "check_settings",
     "check_simulator",
     "describe_policy",
+    "retrieval_identity",
 ]
 
 
@@ -241,6 +242,18 @@ def check_plan(
         selector = make_selector(config)
         buffer = split.load(longest.episode, longest.k)
         selector.select(buffer, buffer.query_frame(selector.camera))
+
+
+def retrieval_identity(config: RunConfig, split: Split) -> dict[str, Any] | None:
+    """Return what the choices of the retrieval step depend on, None without it.
+
+    Raises:
+        MissingIndexError, StaleIndexError, FormatError: The split has no fitting index.
+    """
+    if config.retrieval is None:
+        return None
+    buffer = split.load(split.episode_ids[0], split.k_values[0])
+    return make_selector(config).identity(buffer)
 
 
 def check_simulator(config: RunConfig, policy: PolicyTraits) -> None:

@@ -136,7 +136,10 @@ def default_system(policy: str, memory: str | None, retrieval: bool) -> str:
 
 
 def identity(
-    config: RunConfig, policy: Mapping[str, Any], simulator_version: str | None
+    config: RunConfig,
+    policy: Mapping[str, Any],
+    simulator_version: str | None,
+    retrieval_index: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return what makes the run the one that it is, as plain values.
 
@@ -144,11 +147,14 @@ def identity(
         config: The settings.
         policy: What can change a result of the policy; see `policies.options.policy_identity`.
         simulator_version: Version of the suite of episodes; None where it is not known.
+        retrieval_index: What the choices of the retrieval step depend on; see
+            `Selector.identity`. None without the step.
     """
     return {
         **{name: getattr(config, name) for name in IDENTITY},
         **policy,
         "simulator_version": simulator_version,
+        "retrieval_index": None if retrieval_index is None else dict(retrieval_index),
         "protocol_version": PROTOCOL_VERSION,
     }
 

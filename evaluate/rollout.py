@@ -18,6 +18,7 @@ from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, Rollout
+from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.evaluate.watchdog import Watchdog
 from robomme_interference_data.loader import Split
 from robomme_interference_data.retrieval.selector import Selection, Selector
@@ -105,6 +106,7 @@ def run_rollout(
 
     Raises:
         RolloutError: Simulator and dataset speak of different episodes.
+        HistoryTooLongError: What retrieval chose exceeds the system's position limit.
         PolicyError: The policy broke, or returned no actions.
         SimulatorCrashError: The simulator broke.
     """
@@ -126,6 +128,7 @@ def run_rollout(
         if selector is not None and buffer is not None and len(buffer):
             chosen = selector.select(buffer, first.images[selector.camera])
             start, stop = chosen.start, chosen.stop
+            check_history(name_system(config.system), stop - start)
     if watcher is not None:
         watcher.begin(buffer, start, stop, first, info)
     with clock.part("history_s"):

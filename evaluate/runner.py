@@ -14,6 +14,7 @@ from robomme_interference_data.evaluate.checks import (
     check_settings,
     check_simulator,
     describe_policy,
+    retrieval_identity,
 )
 from robomme_interference_data.evaluate.config import RunConfig, default_system, identity
 from robomme_interference_data.evaluate.header import begun, ended, now, plan_record
@@ -204,7 +205,8 @@ def run_evaluation(
         check_simulator(config, about)
     versions = simulator_versions(simulator, robomme_python)
     told = policy_identity(parse_policy(policy).kind, policy, options, about.metadata)
-    with open_log(Path(out), identity(config, told, versions.get(simulator)), resume) as log:
+    known = identity(config, told, versions.get(simulator), retrieval_identity(config, opened))
+    with open_log(Path(out), known, resume) as log:
         # The same split may be in another folder by now: rows keep one label for it.
         label = log.header.setdefault("split", config.split_name)
         config = dataclasses.replace(config, split_name=label)

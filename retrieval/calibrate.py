@@ -1,13 +1,15 @@
 """Fit the cosine below which a history is cut, and tell how much hangs on it: pure.
 
 The released rule: midway between the 99th percentile of the cosines across true cuts and the 1st
-percentile of the lowest cosine inside each lesson. It looks at true sessions, so a threshold that
-is fitted on a split must not be graded on the same split without saying so; `held_out` grades each
-family with a threshold that the others gave.
+percentile of the lowest cosine inside each session. Buffers share their sessions; each stored span
+counts once, and each cut between the same two (ours). The rule looks at true sessions, so a
+threshold that is fitted on a split must not be graded on the same split without saying so;
+`held_out` grades each family with a threshold to which no frame of it contributed.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -26,7 +28,7 @@ class HeldOut:
 
     Attributes:
         family: The family.
-        threshold: Fitted without its queries.
+        threshold: Fitted without its queries, and without its sessions in other buffers.
         purity: Mean over its queries under all k.
         coverage: The same.
     """
@@ -61,7 +63,7 @@ class Calibration:
     Attributes:
         threshold: What it fits.
         cuts: Cosines across true cuts, each once, ascending.
-        lowest: Lowest cosine inside each lesson, ascending.
+        lowest: Lowest cosine inside each session, each once, ascending.
         cut_percentile: The 99th percentile of `cuts`.
         lowest_percentile: The 1st percentile of `lowest`; where it is below the former, no
             threshold parts the two.
@@ -86,14 +88,14 @@ def calibrate(measured: Sequence[Measured], thresholds: Sequence[float]) -> Cali
         thresholds: What to try, ascending.
 
     Raises:
-        InvalidOptionError: There is no true cut, or no lesson with two frames.
+        InvalidOptionError: There is no true cut, or no session with two frames.
     """
     threshold, cut_percentile, lowest_percentile = fit(measured)
     families = list(dict.fromkeys(one.episode_id.family for one in measured))
     held_out = []
     for family in families if len(families) > 1 else ():
         within = [one for one in measured if one.episode_id.family == family]
-        without, _, _ = fit([one for one in measured if one.episode_id.family != family])
+        without, _, _ = fit(measured, without=family)
         grades = (grade(one, Rule(cut=without)) for one in within)
         held_out.append(HeldOut(family, without, *mean_of(grades)))
     ks = sorted({one.k for one in measured})
@@ -113,46 +115,60 @@ def calibrate(measured: Sequence[Measured], thresholds: Sequence[float]) -> Cali
     )
 
 
-def fit(measured: Sequence[Measured]) -> tuple[float, float, float]:
+def fit(measured: Sequence[Measured], *, without: str | None = None) -> tuple[float, float, float]:
     """Return the threshold of the released rule, and the two percentiles it lies between.
 
+    Args:
+        measured: Buffers.
+        without: Family to leave out: its queries, and every session and cut of it elsewhere.
+
     Raises:
-        InvalidOptionError: There is no true cut, or no lesson with two frames.
+        InvalidOptionError: There is no true cut, or no session with two frames.
     """
-    cuts, lowest = true_cuts(measured), lowest_inside(measured)
+    kept = [one for one in measured if one.episode_id.family != without]
+    cuts, lowest = true_cuts(kept, without=without), lowest_inside(kept, without=without)
     if not cuts or not lowest:
-        missing = "cut between sessions" if not cuts else "lesson of two frames or more"
+        missing = "cut between sessions" if not cuts else "session of two frames or more"
         raise InvalidOptionError(
-            f"{len(measured)} buffers without any {missing}: nothing to fit a threshold to",
-            "Take a split with buffers of k ≥ 1, and of two families or more to leave one out.",
+            f"{len(kept)} buffers without any {missing}: nothing to fit a threshold to",
+            "Take a split with buffers of k ≥ 2, and of four families or more to leave one out.",
         )
     high, low = float(np.percentile(cuts, 99)), float(np.percentile(lowest, 1))
     return tuple(round(value, _DIGITS) for value in ((high + low) / 2, high, low))  # type: ignore[return-value]
 
 
-def true_cuts(measured: Sequence[Measured]) -> list[float]:
-    """Return the cosines across true cuts, ascending.
+def true_cuts(measured: Sequence[Measured], *, without: str | None = None) -> list[float]:
+    """Return the cosines across true cuts, ascending; each pair of stored spans once (ours).
 
-    Buffers of a query are nested, so its cuts return under each k: each counts once (ours).
+    Args:
+        measured: Buffers.
+        without: Family whose sessions are left out, on either side of a cut.
     """
     found = {
-        (one.episode_id, start, float(one.adjacent[start - 1]))
+        (before.stored, after.stored): float(one.adjacent[after.span[0] - 1])
         for one in measured
-        for start, _ in one.sessions
-        if start > 0
+        for before, after in pairwise(one.sessions)
+        if without not in (before.family, after.family)
     }
-    return sorted(value for *_, value in found)
+    return sorted(found.values())
 
 
-def lowest_inside(measured: Sequence[Measured]) -> list[float]:
-    """Return the lowest cosine of adjacent frames inside each lesson, ascending; each once."""
-    found = {
-        (one.episode_id, float(one.adjacent[start : stop - 1].min()))
-        for one in measured
-        for start, stop in (one.lesson,)
-        if stop - start > 1
-    }
-    return sorted(value for _, value in found)
+def lowest_inside(measured: Sequence[Measured], *, without: str | None = None) -> list[float]:
+    """Return the lowest cosine of adjacent frames inside each session, ascending.
+
+    Each stored span counts once (ours): units return in many buffers, a lesson under each k.
+
+    Args:
+        measured: Buffers.
+        without: Family whose sessions are left out.
+    """
+    found = {}
+    for one in measured:
+        for session in one.sessions:
+            start, stop = session.span
+            if stop - start > 1 and session.family != without:
+                found[session.stored] = float(one.adjacent[start : stop - 1].min())
+    return sorted(found.values())
 
 
 def steps(first: float, last: float) -> list[float]:

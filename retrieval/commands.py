@@ -30,6 +30,7 @@ Encoder = Annotated[
         "folder of another SigLIP or SigLIP 2 model."
     ),
 ]
+Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
@@ -47,11 +48,13 @@ def index(
     threads: Annotated[
         int | None, typer.Option(help="Threads that decode.", show_default="all processors")
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Make it again from nothing.")] = False,
     as_json: Json = False,
 ) -> None:
     """Embed every stored frame once, and keep the embeddings beside the data.
 
-    Goes on where an interrupted run stopped; does nothing if the index is there and right.
+    Goes on where an interrupted run stopped. An index that is there and right is kept, even if
+    another device computed it.
 
     Example: robomme-interference index --data my-split --encoder thumbnail
     """
@@ -64,7 +67,7 @@ def index(
     if threads is None:
         threads = os.cpu_count() or 1
     with BuildProgress(quiet=as_json) as progress:
-        reports = build_index(roots, made, progress, camera=camera, threads=threads)
+        reports = build_index(roots, made, progress, camera=camera, threads=threads, force=force)
     if as_json:
         rows = [
             {
@@ -72,6 +75,8 @@ def index(
                 "frames": report.frames,
                 "embedded": report.embedded,
                 "typical_cosine": report.typical_cosine,
+                "computed_in": report.computed_in,
+                "batch": report.batch,
             }
             for report in reports
         ]
@@ -79,6 +84,12 @@ def index(
         return
     for report in reports:
         typer.echo(f"{report.folder}: {report.frames} frames, {report.embedded} embedded now")
+        if (report.computed_in, report.batch) != (made.computed_in, made.batch):
+            MESSAGES.print(
+                f"{report.folder} is kept, computed with {report.computed_in}, {report.batch} "
+                f"images at a time; --force makes it again with {made.computed_in}, {made.batch} "
+                "at a time"
+            )
 
 
 def retrieve(
@@ -89,6 +100,7 @@ def retrieve(
     rule: Annotated[
         str, typer.Option(help="METHOD or METHOD/CUT, as for retrieval-score.")
     ] = "max",
+    camera: Camera = "front",
     out: Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -108,14 +120,14 @@ def retrieve(
     name = encoder_name(encoder)
     settled = Rule.parse(rule).settled(published_threshold(name))
     buffer = load_buffer(episode, k, split)
-    selection = select(buffer, name, settled)
-    graded = grade(measure(buffer, name), settled)
+    selection = select(buffer, name, settled, camera=camera)
+    graded = grade(measure(buffer, name, camera), settled)
     if out is not None:
         from robomme_interference_data.retrieval.picture import draw_retrieval
 
-        draw_retrieval(buffer, selection.choice, graded, name, out)
+        draw_retrieval(buffer, selection.choice, graded, name, camera, out)
         MESSAGES.print(f"{out} written")
-    found = reasons(buffer, selection.choice, graded)
+    found = reasons(buffer, selection.choice, graded, camera)
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else found.text())
 
 
@@ -130,6 +142,7 @@ def retrieval_score(
             "left out for the encoder's own."
         ),
     ] = ["max"],  # noqa: B006 - typer copies it
+    camera: Camera = "front",
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for cells.csv, rows.csv (each query) and retrieval.png."),
@@ -156,10 +169,10 @@ def retrieval_score(
 
     name = encoder_name(encoder)
     wanted = parse_rules(rules, published_threshold(name))
-    opened, measured = _measured(split, name, quiet=as_json)
+    opened, measured = _measured(split, name, camera, quiet=as_json)
     grades = [grade(one, rule) for rule in wanted for one in measured]
     found = list(cells(grades))
-    title = f"Retrieval on {opened.name}, encoder {name}"
+    title = f"Retrieval on {opened.name}, encoder {name}, camera {camera}"
     if len(wanted) == 1:
         title += f", rule {wanted[0]}"
     table = cell_table(found, title)
@@ -175,6 +188,7 @@ def retrieval_score(
         _print_json(
             opened,
             name,
+            camera,
             {
                 "buffers": len(measured),
                 "rules": [str(rule) for rule in wanted],
@@ -194,13 +208,14 @@ def calibrate(
         tuple[float, float],
         typer.Option(help="First and last threshold to try, in steps of 0.01."),
     ] = (0.80, 0.99),
+    camera: Camera = "front",
     out: Annotated[Path | None, typer.Option(help="Figure to write, .png or .svg.")] = None,
     as_json: Json = False,
 ) -> None:
     """Fit the cosine below which histories are cut, and show what others would give.
 
     The released rule: midway between the 99th percentile of the cosines across true cuts and the
-    1st percentile of the lowest cosine inside each lesson.
+    1st percentile of the lowest cosine inside each session, every stored span once.
 
     Example: robomme-interference calibrate --split my-split --sweep 0.30 0.99 --out cuts.png
     """
@@ -212,11 +227,11 @@ def calibrate(
 
     name = encoder_name(encoder)
     thresholds = steps(*sweep)
-    opened, measured = _measured(split, name, quiet=as_json)
+    opened, measured = _measured(split, name, camera, quiet=as_json)
     found = compute(measured, thresholds)
     rule = Rule().settled(published_threshold(name))
     own = rule.threshold(measured[0].typical)
-    title = f"Threshold of {name} on {opened.name}"
+    title = f"Threshold of {name}, camera {camera}, on {opened.name}"
     if out is not None:
         from robomme_interference_data.retrieval.figures import draw_calibration
 
@@ -224,13 +239,15 @@ def calibrate(
         MESSAGES.print(f"{out} written")
     if as_json:
         _print_json(
-            opened, name, {"in_use": {"rule": str(rule), "threshold": own}, **asdict(found)}
+            opened, name, camera, {"in_use": {"rule": str(rule), "threshold": own}, **asdict(found)}
         )
     else:
         typer.echo(calibration_text(found, str(rule), own, title))
 
 
-def _measured(folder: Path, encoder: str, *, quiet: bool) -> tuple["Split", list["Measured"]]:
+def _measured(
+    folder: Path, encoder: str, camera: str, *, quiet: bool
+) -> tuple["Split", list["Measured"]]:
     """Open a split and compare the embeddings of all its buffers."""
     from robomme_interference_data.loader import load_split
     from robomme_interference_data.progress import BuildProgress
@@ -241,13 +258,14 @@ def _measured(folder: Path, encoder: str, *, quiet: bool) -> tuple["Split", list
     with BuildProgress(unit="buffers", quiet=quiet) as progress:
         progress.start(encoder, len(opened))
         for buffer in opened.buffers():
-            measured.append(measure(buffer, encoder))
+            measured.append(measure(buffer, encoder, camera))
             progress.advance(1)
     return opened, measured
 
 
-def _print_json(split: "Split", encoder: str, found: dict[str, Any]) -> None:
-    value = {"split": split.name, "revision": split.revision, "encoder": encoder, **found}
+def _print_json(split: "Split", encoder: str, camera: str, found: dict[str, Any]) -> None:
+    made = {"encoder": encoder, "camera": camera}
+    value = {"split": split.name, "revision": split.revision, **made, **found}
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
 
 

@@ -144,7 +144,7 @@ def draw_calibration(found: Calibration, own: float, title: str, out: Path) -> N
 def _distributions(axes: Any, found: Calibration, own: float) -> None:
     named = (
         ("across true cuts", found.cuts, INK, "-"),
-        ("lowest inside a lesson", found.lowest, _COVERAGE, "-"),
+        ("lowest inside a session", found.lowest, _COVERAGE, "-"),
     )
     for name, values, colour, line in named:
         shares = [100 * (n + 1) / len(values) for n in range(len(values))]

@@ -17,14 +17,41 @@ from robomme_interference_data.intervals import wilson
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
 from robomme_interference_data.retrieval.select import Rule, pick
 from robomme_interference_data.retrieval.selector import lot_of, true_lesson
+from robomme_interference_data.sessions import Session
 
-__all__ = ["ALL", "PASS_MARK", "Cell", "Grade", "Measured", "cells", "grade", "mean_of", "measure"]
+__all__ = [
+    "ALL",
+    "PASS_MARK",
+    "Cell",
+    "Grade",
+    "Measured",
+    "TrueSession",
+    "cells",
+    "grade",
+    "mean_of",
+    "measure",
+]
 
 PASS_MARK = 0.9
 """Least mean purity and mean coverage of a good cell (released reference)."""
 
 ALL = "all"
 """Stands for all families together."""
+
+
+@dataclass(frozen=True)
+class TrueSession:
+    """A session of a buffer, for grading.
+
+    Attributes:
+        span: First frame in the buffer, and the one after the last.
+        family: Its family.
+        stored: Names the stored frames that it holds, the same in every buffer of a split.
+    """
+
+    span: Span
+    family: str
+    stored: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +65,12 @@ class Measured:
         lesson: The true lesson.
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
         query_cosines: Cosine of each frame with the first live observation, `(T,) float32`.
-        typical: Median cosine of two frames of the demonstrations.
+        typical: Median cosine of two frames of different distractor units.
     """
 
     episode_id: EpisodeId
     k: int
-    sessions: tuple[Span, ...]
+    sessions: tuple[TrueSession, ...]
     lesson: Span
     adjacent: NDArray[np.float32]
     query_cosines: NDArray[np.float32]
@@ -67,6 +94,9 @@ class Grade:
         purity: Share of the chosen frames that are of the lesson.
         coverage: Share of the lesson's frames that were chosen.
         false_sessions: Sessions other than the lesson of which a frame was chosen.
+        true_cuts: Borders between true sessions.
+        found_cuts: How many of them are borders of segments.
+        false_cuts: Borders of segments inside a true session.
     """
 
     rule: str
@@ -81,6 +111,9 @@ class Grade:
     purity: float
     coverage: float
     false_sessions: int
+    true_cuts: int
+    found_cuts: int
+    false_cuts: int
 
     @property
     def hit(self) -> bool:
@@ -102,6 +135,9 @@ class Cell:
             a single episode.
         coverage: Mean coverage, likewise.
         false_sessions: Mean number of false sessions, likewise.
+        true_cuts: Borders between true sessions, in all its queries together.
+        found_cuts: How many of them are borders of segments.
+        false_cuts: Borders of segments inside true sessions.
     """
 
     rule: str
@@ -112,6 +148,9 @@ class Cell:
     purity: Interval
     coverage: Interval
     false_sessions: Interval
+    true_cuts: int
+    found_cuts: int
+    false_cuts: int
 
     @property
     def passed(self) -> bool:
@@ -119,23 +158,29 @@ class Cell:
         return self.purity.value >= PASS_MARK and self.coverage.value >= PASS_MARK
 
 
-def measure(buffer: Buffer, encoder: str) -> Measured:
+def measure(buffer: Buffer, encoder: str, camera: str = "front") -> Measured:
     """Look up the embeddings of a buffer and of its first live observation, and compare them.
 
     Raises:
         MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
         InvalidOptionError: The buffer has no lesson, or has it in several parts.
     """
-    embeddings = buffer.embeddings(encoder)
+    embeddings = buffer.embeddings(encoder, camera)
     return Measured(
         buffer.episode_id,
         buffer.k,
-        tuple(session.span for session in buffer.sessions),
+        tuple(_true_session(session) for session in buffer.sessions),
         true_lesson(buffer),
         adjacent_cosines(embeddings),
-        cosines(embeddings, buffer.query_embedding(encoder)),
-        buffer.query_index(encoder).typical_cosine,
+        cosines(embeddings, buffer.query_embedding(encoder, camera)),
+        buffer.query_index(encoder, camera).typical_cosine,
     )
+
+
+def _true_session(session: Session) -> TrueSession:
+    entry = session.entry
+    stored = f"{entry.dataset}/{entry.episode_index}/{entry.start}-{entry.stop}x{entry.repeat}"
+    return TrueSession(session.span, session.family, stored)
 
 
 def grade(measured: Measured, rule: Rule) -> Grade:
@@ -152,8 +197,10 @@ def grade(measured: Measured, rule: Rule) -> Grade:
     frames = choice.frames
     start, stop = measured.lesson
     of_lesson = int(((frames >= start) & (frames < stop)).sum())
-    starts = [first for first, _ in measured.sessions]
-    touched = {measured.sessions[n] for n in np.searchsorted(starts, frames, side="right") - 1}
+    spans = [session.span for session in measured.sessions]
+    starts = [first for first, _ in spans]
+    borders, cuts = set(starts[1:]), {first for first, _ in choice.segments[1:]}
+    touched = {spans[n] for n in np.searchsorted(starts, frames, side="right") - 1}
     return Grade(
         str(rule),
         threshold,
@@ -167,6 +214,9 @@ def grade(measured: Measured, rule: Rule) -> Grade:
         of_lesson / len(frames),
         of_lesson / (stop - start),
         len(touched - {measured.lesson}),
+        len(borders),
+        len(borders & cuts),
+        len(cuts - borders),
     )
 
 
@@ -189,7 +239,21 @@ def _cell(rule: str, family: str, k: int, grades: Sequence[Grade]) -> Cell:
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
     # One key: equal values have equal intervals, whatever the rule, family and k.
     drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
-    return Cell(rule, family, k, count, Interval(hits / count, *wilson(hits, count)), *drawn)
+    hit = Interval(hits / count, *wilson(hits, count))
+    purity, coverage, false_sessions = drawn
+    return Cell(
+        rule,
+        family,
+        k,
+        count,
+        hit,
+        purity,
+        coverage,
+        false_sessions,
+        sum(one.true_cuts for one in grades),
+        sum(one.found_cuts for one in grades),
+        sum(one.false_cuts for one in grades),
+    )
 
 
 def mean_of(grades: Iterable[Grade]) -> tuple[float, float]:

@@ -31,7 +31,9 @@ _CURVE_INK = "#555555"
 _SEGMENT = "#d9d9d9"
 
 
-def draw_retrieval(buffer: Buffer, choice: Choice, grade: Grade, encoder: str, out: Path) -> None:
+def draw_retrieval(
+    buffer: Buffer, choice: Choice, grade: Grade, encoder: str, camera: str, out: Path
+) -> None:
     """Draw a choice: film strip, true sessions, cuts, segments, and cosines with the query.
 
     The same choice gives the same bytes with the same version of matplotlib.
@@ -41,6 +43,7 @@ def draw_retrieval(buffer: Buffer, choice: Choice, grade: Grade, encoder: str, o
         choice: What was chosen of it; a span.
         grade: The same choice, graded.
         encoder: Name of the encoder.
+        camera: Camera whose frames were compared.
         out: File to write, `.png` or `.svg`.
 
     Raises:
@@ -48,9 +51,7 @@ def draw_retrieval(buffer: Buffer, choice: Choice, grade: Grade, encoder: str, o
         MissingExtraError: matplotlib is not installed.
         MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
     """
-    index = buffer.query_index(encoder)
-    camera = index.camera
-    found = reasons(buffer, choice, grade)
+    found = reasons(buffer, choice, grade, camera)
     colors = session_colors(buffer.sessions)
     with open_page(out, _WIDTH) as page:
         page.height = 6.1
@@ -72,7 +73,7 @@ def _head(page: Page, buffer: Buffer, found: Reasons, encoder: str) -> float:
     grade = found.grade
     title = f"{buffer.episode_id}   k = {buffer.k}"
     page.text(0.1, 0.06, title, 10, align="left", bold=True, width=0.55 * _WIDTH)
-    how = f"{encoder}, rule {grade.rule}"
+    how = f"{encoder}, {found.camera} camera, rule {grade.rule}"
     page.text(_RIGHT, 0.1, how, 6.5, align="right", color=GREY, width=0.4 * _WIDTH)
     text = f"Goal: {buffer.goal}"
     page.text(0.1, 0.27, text, 7.5, align="left", width=_WIDTH - 0.2)

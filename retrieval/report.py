@@ -29,8 +29,9 @@ NOTE = (
     "hit: queries for which any lesson frame was chosen, with the 95% Wilson interval. Means over "
     "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of the "
     "chosen frames that are lesson; coverage, the share of the lesson that was chosen; false "
-    "sessions, how many others were touched. pass: mean purity and mean coverage are both at "
-    f"least {PASS_MARK:.0%}."
+    "sessions, how many others were touched. cuts found: of all cuts between true sessions, in all "
+    "queries together; false cuts: those inside one. pass: mean purity and mean coverage are both "
+    f"at least {PASS_MARK:.0%}."
 )
 
 
@@ -53,6 +54,8 @@ def shown_table(cells: Sequence[Cell], title: str) -> Table:
             cell.episodes,
             *(_rate(value) for value in (cell.hit, cell.purity, cell.coverage)),
             cell.false_sessions.value,
+            f"{cell.found_cuts} of {cell.true_cuts}",
+            cell.false_cuts,
             cell.passed,
         )
         for cell in cells
@@ -66,6 +69,8 @@ def shown_table(cells: Sequence[Cell], title: str) -> Table:
         Column("purity"),
         Column("coverage"),
         Column("false_sessions", "ratio"),
+        Column("cuts_found"),
+        Column("false_cuts", "count"),
         Column("pass", "flag"),
     )
     return Table("retrieval", title, columns, tuple(rows), NOTE)
@@ -76,6 +81,7 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
     columns = [Column("rule"), Column("family"), Column("k", "count"), Column("queries", "count")]
     for name in ("hit", "purity", "coverage", "false_sessions"):
         columns += [Column(name + suffix, "ratio") for suffix in ("", "_low", "_high")]
+    columns += [Column(name, "count") for name in ("true_cuts", "found_cuts", "false_cuts")]
     columns.append(Column("pass", "flag"))
     rows = [
         (
@@ -87,6 +93,9 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
             *_bounds(cell.purity),
             *_bounds(cell.coverage),
             *_bounds(cell.false_sessions),
+            cell.true_cuts,
+            cell.found_cuts,
+            cell.false_cuts,
             cell.passed,
         )
         for cell in cells
@@ -108,6 +117,7 @@ def grade_table(grades: Sequence[Grade], title: str) -> Table:
         Column("purity", "ratio"),
         Column("coverage", "ratio"),
         Column("false_sessions", "count"),
+        *(Column(name, "count") for name in ("true_cuts", "found_cuts", "false_cuts")),
     )
     rows = [
         (
@@ -125,10 +135,23 @@ def grade_table(grades: Sequence[Grade], title: str) -> Table:
             one.purity,
             one.coverage,
             one.false_sessions,
+            one.true_cuts,
+            one.found_cuts,
+            one.false_cuts,
         )
         for one in grades
     ]
     return Table("rows", title, columns, tuple(rows))
+
+
+_WHY = {
+    "max": "no segment long enough has a frame of a higher cosine with what the robot sees now",
+    "mean": "no segment long enough has a higher mean cosine with what the robot sees now",
+    "last": "it is the last segment that is long enough",
+    "random": "it was drawn by lot among the segments that are long enough",
+    "oracle": "it is the true lesson, which this rule is told",
+}
+"""Method to the reason for its choice; followed by the score, if it has one."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +160,9 @@ class Reasons:
 
     Attributes:
         grade: The choice, compared with the true lesson.
+        camera: Camera whose frames were compared.
+        method: The method, one of `select.METHODS`.
+        score: What it scored the chosen segment by, or None if it scores none.
         lesson: The true lesson.
         closest: Chosen frame closest to what the robot sees.
         cosine: Its cosine.
@@ -147,6 +173,9 @@ class Reasons:
     """
 
     grade: Grade
+    camera: str
+    method: str
+    score: float | None
     lesson: Span
     closest: int
     cosine: float
@@ -160,6 +189,8 @@ class Reasons:
         return {
             "episode_id": str(self.grade.episode_id),
             "k": self.grade.k,
+            "camera": self.camera,
+            "score": self.score,
             "rule": self.grade.rule,
             "threshold": self.grade.threshold,
             "history_frames": self.grade.history_frames,
@@ -184,10 +215,13 @@ class Reasons:
         one = self.grade
         parts = f"{one.segments} segment{'s' if one.segments > 1 else ''}"
         lines = [
-            f"{one.episode_id} at k={one.k}, rule {one.rule}: {one.history_frames} history frames, "
-            f"cut into {parts} where the cosine of adjacent frames is below {one.threshold:.3f}",
+            f"{one.episode_id} at k={one.k}, {self.camera} camera, rule {one.rule}: "
+            f"{one.history_frames} history frames, cut into {parts} where the cosine of "
+            f"adjacent frames is below {one.threshold:.3f}",
             f"Chosen: frames {one.start} to {one.stop - 1}, of {', '.join(self.sessions)}",
-            f"Why: frame {self.closest} has cosine {self.cosine:.3f} with what the robot sees now"
+            f"Why: {_WHY[self.method]}" + ("" if self.score is None else f", {self.score:.3f}"),
+            f"What the robot sees now is closest to frame {self.closest} of these, with cosine "
+            f"{self.cosine:.3f}"
             + (
                 f"; the closest one outside is frame {self.other} of {self.other_source}, "
                 f"{self.other_cosine:.3f}"
@@ -201,7 +235,7 @@ class Reasons:
         return "\n".join(lines)
 
 
-def reasons(buffer: Buffer, choice: Choice, grade: Grade) -> Reasons:
+def reasons(buffer: Buffer, choice: Choice, grade: Grade, camera: str) -> Reasons:
     """Collect why a span was chosen."""
     start, stop = choice.span
     alike = choice.query_cosines
@@ -213,6 +247,9 @@ def reasons(buffer: Buffer, choice: Choice, grade: Grade) -> Reasons:
     lesson = next(one.span for one in buffer.sessions if one.role == "lesson")
     return Reasons(
         grade,
+        camera,
+        choice.method,
+        dict(zip(choice.segments, choice.scores, strict=True)).get((start, stop)),
         lesson,
         closest,
         float(alike[closest]),
@@ -236,9 +273,10 @@ def calibration_text(found: Calibration, rule: str, own: float, title: str) -> s
         "",
         f"Fitted by the released rule: {found.threshold:.3f}; in use ({rule}): {own:.3f}",
         f"99th percentile of {len(found.cuts)} true cuts: {found.cut_percentile:.3f}; 1st "
-        f"percentile of the lowest cosine inside {len(found.lowest)} lessons: "
+        f"percentile of the lowest cosine inside {len(found.lowest)} sessions: "
         f"{found.lowest_percentile:.3f}; {gap}",
-        "Fitted and tried on the same split; only the families left out below are unseen.",
+        "Each stored span counts once, and each cut between the same two. Fitted and tried on the "
+        "same split; only the families left out below are unseen.",
     ]
     parts = ["\n".join(lines)]
     if found.held_out:
@@ -252,7 +290,8 @@ def calibration_text(found: Calibration, rule: str, own: float, title: str) -> s
         rows = tuple((o.family, o.threshold, o.purity, o.coverage) for o in found.held_out)
         left_out = Table(
             "held_out",
-            f"Fitted without one family, tried on that family: thresholds from {min(values):.3f} "
+            f"Fitted without any frame of one family, tried on it: thresholds from "
+            f"{min(values):.3f} "
             f"to {max(values):.3f}",
             columns,
             rows,

@@ -4,7 +4,7 @@ The paper's rule: a cut wherever the cosine of adjacent frames is below a thresh
 threshold for its encoder alone; `adaptive_threshold` gives one for any encoder.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,34 +83,40 @@ def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[Span, ...
     return tuple(zip(starts, stops, strict=True))
 
 
-def typical_cosine(embeddings: NDArray[np.float16]) -> float:
-    """Return the median cosine of two different frames of an even sample of at most 1024.
+def typical_cosine(episodes: Sequence[NDArray[np.float16]]) -> float:
+    """Return the median cosine of two frames of different episodes.
 
-    It tells what an encoder finds in any two frames of the data, related or not: near 1 for
-    SigLIP, which sees a robot at a table every time, and near 0 for a centred encoder. It needs no
-    session boundaries.
+    It tells what an encoder finds in two frames that have nothing to do with each other: near 1
+    for SigLIP, which sees a robot at a table every time, and near 0 for a centred encoder. Every
+    episode weighs the same: of each there are as many frames in an even sample of about 1024.
 
     Args:
-        embeddings: `(T, D) float16`, each of length 1; may be a memory map.
+        episodes: The train pool: of each episode `(T, D) float16`, each of length 1, T at least 1;
+            may be memory maps.
 
     Returns:
-        From −1 to 1; 0 if there are fewer than two frames.
+        From −1 to 1; 0 if there are fewer than two episodes.
     """
-    count = min(len(embeddings), _SAMPLE)
-    if count < 2:
+    if len(episodes) < 2:
         return 0.0
-    # Exact integers: index j of linspace(0, T − 1, n) is floor(j·(T − 1) / (n − 1)).
-    indices = [j * (len(embeddings) - 1) // (count - 1) for j in range(count)]
-    sample = embeddings[indices].astype(np.float32)
-    pairs = (sample @ sample.T)[np.triu_indices(count, 1)]
+    chosen = [episodes[n] for n in _middles(len(episodes), min(len(episodes), _SAMPLE))]
+    each = _SAMPLE // len(chosen)
+    sample = np.concatenate([one[_middles(len(one), each)] for one in chosen]).astype(np.float32)
+    owner = np.repeat(np.arange(len(chosen)), each)
+    pairs = (sample @ sample.T)[owner[:, None] < owner]
     return round(float(np.median(pairs)), 4)
 
 
-def adaptive_threshold(typical: float) -> float:
-    """Return the cut that is halfway from what any two frames share (`typical`) to equality.
+def _middles(length: int, count: int) -> list[int]:
+    """Return the middle of each of `count` equal parts of `range(length)`."""
+    return [(2 * part + 1) * length // (2 * count) for part in range(count)]
 
-    Ours. It has no free parameter and knows no session boundary; with it, a threshold need not
-    be fitted for every encoder.
+
+def adaptive_threshold(typical: float) -> float:
+    """Return the cut that is halfway from what unrelated frames share (`typical`) to equality.
+
+    Ours. It has no free parameter, and knows the train pool but no test episode; with it, a
+    threshold need not be fitted for every encoder.
 
     Raises:
         InvalidOptionError: `typical` is no cosine.

@@ -162,10 +162,11 @@ class Rule:
         return adaptive_threshold(typical) if self.cut == ADAPTIVE else float(self.cut)
 
     def __str__(self) -> str:
-        """Return what `parse` reads."""
+        """Return what `parse` reads, with every digit of the cut."""
         if self.cut is None:
             return self.method
-        return f"{self.method}/{self.cut if self.cut == ADAPTIVE else format(self.cut, 'g')}"
+        cut = ADAPTIVE if self.cut == ADAPTIVE else repr(float(self.cut)).removesuffix(".0")
+        return f"{self.method}/{cut}"
 
 
 def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:

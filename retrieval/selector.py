@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,12 @@ from numpy.typing import NDArray
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, INDEX_CENTRE
 from robomme_interference_data.draw import even_sample
-from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
+from robomme_interference_data.embeddings import (
+    EmbeddingIndex,
+    encoder_id,
+    index_folder,
+    normalised,
+)
 from robomme_interference_data.errors import InvalidOptionError, StaleIndexError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.encoders import make_encoder, published_threshold
@@ -53,6 +59,7 @@ class Selector:
         threshold: Cosine of adjacent frames below which a history is cut; None for the one
             published for the encoder, or, where there is none, for `adaptive_threshold`.
         method: One of `select.METHODS` that chooses a segment.
+        camera: Camera whose frames it compares.
         device: Where to compute; None for a GPU if there is one.
 
     Raises:
@@ -67,6 +74,7 @@ class Selector:
         *,
         threshold: float | None = None,
         method: str = "max",
+        camera: str = "front",
         device: str | None = None,
     ):
         if method == "top32":
@@ -75,17 +83,40 @@ class Selector:
                 f"Choose one of {', '.join(SEGMENT_METHODS)}.",
             )
         self.rule = Rule(method, threshold).settled(published_threshold(encoder))
+        self.camera = camera.removeprefix(CAMERA_PREFIX)
         self._encoder = make_encoder(encoder, device=device)
 
     @property
     def name(self) -> str:
-        """Encoder and rule, such as `thumbnail/max/adaptive` or `siglip/max/0.923`."""
-        return f"{PurePath(index_folder(self._encoder.name)).name}/{self.rule}"
+        """Encoder, camera if it is not the front one, and rule, such as `siglip/max/0.923`."""
+        return f"{PurePath(index_folder(self._encoder.name, self.camera)).name}/{self.rule}"
 
-    @property
-    def camera(self) -> str:
-        """Camera whose frames it compares."""
-        return "front"
+    def identity(self, buffer: Buffer) -> dict[str, Any]:
+        """Return what its choices depend on besides the buffers, as plain values.
+
+        Two selectors of one identity choose alike from the same split.
+
+        Args:
+            buffer: Any buffer of the split whose index it looks up.
+
+        Returns:
+            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the embeddings
+            (weights, settings, preprocessing, centre); `camera`; `method`; `cut`, a cosine or
+            `adaptive`; and `threshold`, the cosine that it comes to.
+
+        Raises:
+            MissingIndexError, StaleIndexError, FormatError: As for `select`.
+        """
+        index = buffer.query_index(self._encoder.name, self.camera)
+        self._check(index)
+        return {
+            "encoder": encoder_id(self._encoder.name),
+            "fingerprint": index.fingerprint,
+            "camera": self.camera,
+            "method": self.rule.method,
+            "cut": self.rule.cut,
+            "threshold": self.rule.threshold(index.typical_cosine),
+        }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Selection:
         """Choose the span of a buffer that goes with an image.
@@ -99,7 +130,7 @@ class Selector:
             StaleIndexError: They were made of other data, or with another version of the encoder.
             InvalidOptionError: The buffer is empty, or the image has another shape.
         """
-        index = buffer.query_index(self._encoder.name)
+        index = buffer.query_index(self._encoder.name, self.camera)
         self._check(index)
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise InvalidOptionError(
@@ -107,29 +138,27 @@ class Selector:
             )
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = normalised(features, index.centre)[0]
-        return select(buffer, self._encoder.name, self.rule, query)
+        return select(buffer, self._encoder.name, self.rule, query, camera=self.camera)
 
     def _check(self, index: EmbeddingIndex) -> None:
-        """Check that the index was made with this very encoder and camera."""
+        """Check that the index was made with this very encoder."""
         centre = index.header["files"].get(INDEX_CENTRE, {}).get("sha256")
         if index.fingerprint != fingerprint_digest(self._encoder.fingerprint, centre):
             raise StaleIndexError(
                 f"the embeddings of {self._encoder.name!r} beside the data were made with another "
-                "version of the encoder: its weights, preprocessing or code differ",
+                "version of the encoder: its weights, settings, preprocessing or code differ",
                 "Make them again: robomme-interference index --data SPLIT --encoder "
-                f"{self._encoder.name}",
-            )
-        if index.camera != CAMERA_PREFIX + self.camera:
-            raise StaleIndexError(
-                f"the embeddings of {self._encoder.name!r} beside the data are of camera "
-                f"{index.camera.removeprefix(CAMERA_PREFIX)!r}; expected {self.camera!r}",
-                f"Make them again: robomme-interference index --data SPLIT --encoder "
                 f"{self._encoder.name} --camera {self.camera}",
             )
 
 
 def select(
-    buffer: Buffer, encoder: str, rule: Rule, query: NDArray[np.floating] | None = None
+    buffer: Buffer,
+    encoder: str,
+    rule: Rule,
+    query: NDArray[np.floating] | None = None,
+    *,
+    camera: str = "front",
 ) -> Selection:
     """Choose the span of a buffer by embeddings that are there; no encoder is needed.
 
@@ -138,15 +167,16 @@ def select(
         encoder: Name of the encoder whose index is looked up.
         rule: How to choose, its cut settled.
         query: Embedding of the live observation, `(D,)`; None for the stored first one.
+        camera: Camera whose index is looked up.
 
     Raises:
         MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
         InvalidOptionError: The buffer is empty, or the rule chooses single frames.
     """
     choice = choose(
-        buffer.embeddings(encoder),
-        buffer.query_embedding(encoder) if query is None else query,
-        threshold=rule.threshold(buffer.query_index(encoder).typical_cosine),
+        buffer.embeddings(encoder, camera),
+        buffer.query_embedding(encoder, camera) if query is None else query,
+        threshold=rule.threshold(buffer.query_index(encoder, camera).typical_cosine),
         method=rule.method,
         lesson=true_lesson(buffer) if rule.method == "oracle" else None,
         lot=lot_of(buffer.episode_id, buffer.k),

@@ -181,25 +181,27 @@ class Buffer:
         dataset = self._datasets[query.dataset]
         return dataset.read_vectors(query.episode_index, STATE, query.frame, query.frame + 1)[0]
 
-    def embeddings(self, encoder: str) -> NDArray[np.float16]:
+    def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
         """Look up the embeddings of all frames; none is decoded.
 
         Args:
             encoder: Name of the encoder, such as `thumbnail`, whose index lies in the datasets.
+            camera: Name of the camera, with or without `observation.images.`.
 
         Returns:
             `(T, D) float16`, each of length 1, in the buffer's order.
 
         Raises:
-            MissingIndexError: A dataset has no embeddings of this encoder.
-            StaleIndexError: They were made of other data, or differently in the two datasets.
+            MissingIndexError: A dataset has no embeddings of this encoder and camera.
+            StaleIndexError: They were made of other data, with another encoder, or differently in
+                the two datasets.
             FormatError: They are of an unknown version, or damaged.
         """
         parts = []
-        query = self.query_index(encoder)
+        query = self.query_index(encoder, camera)
         for entry in self.manifest.sessions:
-            index = self._datasets[entry.dataset].index(encoder)
-            if (index.fingerprint, index.camera) != (query.fingerprint, query.camera):
+            index = self._datasets[entry.dataset].index(encoder, camera)
+            if index.made != query.made:
                 raise StaleIndexError(
                     f"the embeddings of encoder {encoder!r} were made differently in "
                     f"{self._datasets[self.manifest.query.dataset].files.describe()} and in "
@@ -213,18 +215,18 @@ class Buffer:
             return parts[0]
         return np.concatenate(parts) if parts else np.empty((0, query.size), np.float16)
 
-    def query_embedding(self, encoder: str) -> NDArray[np.float16]:
+    def query_embedding(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
         """Look up the embedding of the first live observation, `(D,) float16`; see `embeddings`.
 
         For grading without a simulator: in a rollout, what the robot sees is embedded then.
         """
         query = self.manifest.query
-        index = self.query_index(encoder)
+        index = self.query_index(encoder, camera)
         return index.span(query.episode_index, query.frame, query.frame + 1)[0]
 
-    def query_index(self, encoder: str) -> EmbeddingIndex:
+    def query_index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:
         """Return the index of the query's dataset; see `embeddings` for the errors."""
-        return self._datasets[self.manifest.query.dataset].index(encoder)
+        return self._datasets[self.manifest.query.dataset].index(encoder, camera)
 
     def stream(
         self,

@@ -71,6 +71,9 @@ INDEX_EMBEDDINGS = "embeddings.npy"
 INDEX_ROWS = "rows.parquet"
 INDEX_CENTRE = "centre.npy"
 
+PAPER_ENCODER = "google/siglip-so400m-patch14-384"
+"""Model that embeds frames in the paper; its index is `index/siglip`."""
+
 # --- paths inside a split ----------------------------------------------------------------------
 
 DEMONSTRATIONS = "demonstrations"

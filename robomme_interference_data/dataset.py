@@ -67,7 +67,7 @@ class Dataset:
     def __init__(self, files: Files):
         self.files = files
         self._rows: dict[int, dict[str, Any]] = {}
-        self._indexes: dict[str, EmbeddingIndex] = {}
+        self._indexes: dict[tuple[str, str], EmbeddingIndex] = {}
         self.info = read_info(files)
         self.identity = read_identity(files)
 
@@ -148,20 +148,22 @@ class Dataset:
             )
         return int(found)
 
-    def index(self, encoder: str) -> EmbeddingIndex:
+    def index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:
         """Return the embeddings of the stored frames, opened once.
 
         Args:
             encoder: Name of the encoder, such as `thumbnail`.
+            camera: Name of the camera, with or without `observation.images.`.
 
         Raises:
-            MissingIndexError: The dataset has no embeddings of this encoder.
-            StaleIndexError: They were made of other data.
+            MissingIndexError: The dataset has no embeddings of this encoder and camera.
+            StaleIndexError: They were made of other data, or with another encoder.
             FormatError: They are of an unknown version, or damaged.
         """
-        if encoder not in self._indexes:
-            self._indexes[encoder] = EmbeddingIndex(self.files, self.revision, encoder)
-        return self._indexes[encoder]
+        key = encoder, camera
+        if key not in self._indexes:
+            self._indexes[key] = EmbeddingIndex(self.files, self.revision, encoder, camera)
+        return self._indexes[key]
 
     def digests(self, episode_index: int, start: int, stop: int) -> dict[str, str] | None:
         """Return the recorded feature digests of a span; None if none are recorded for it."""

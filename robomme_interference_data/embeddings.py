@@ -6,7 +6,7 @@ pyarrow only. `docs/format.md` lists its files.
 
 import re
 from functools import cached_property
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data import parquet
 from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
     FORMAT_VERSION,
@@ -23,6 +24,7 @@ from robomme_interference_data.constants import (
     INDEX_EMBEDDINGS,
     INDEX_HEADER,
     INDEX_ROWS,
+    PAPER_ENCODER,
 )
 from robomme_interference_data.errors import (
     FormatError,
@@ -31,27 +33,56 @@ from robomme_interference_data.errors import (
     StaleIndexError,
     UnknownNameError,
 )
-from robomme_interference_data.files import Files, check_names, read_json
+from robomme_interference_data.files import Files, LocalFiles, check_names, read_json, sha256_file
 
-__all__ = ["EmbeddingIndex", "index_folder", "normalised"]
+__all__ = ["EmbeddingIndex", "encoder_id", "index_folder", "normalised"]
 
-_HEADER_KEYS = ("encoder", "camera", "revision", "frames", "size", "typical_cosine", "files")
+_BLOCK = 4096
+"""Embeddings that are looked through at a time."""
+
+_HEADER_KEYS = (
+    *("encoder", "computed", "camera", "revision", "pool"),
+    *("frames", "size", "typical_cosine", "files"),
+)
 
 
-def index_folder(encoder: str) -> str:
-    """Return where the index of an encoder lies inside a dataset.
+def encoder_id(encoder: str) -> str:
+    """Return what an encoder is called wherever its model lies, without a revision.
 
     Args:
-        encoder: Name of the encoder: `thumbnail`, `siglip`, or `siglip:` and an id or path of a
-            model, of which the last part, without a revision, becomes part of the folder's name.
+        encoder: Name of the encoder: `thumbnail`, `siglip`, or `siglip:` and the id of a model,
+            with `@revision` or without, or its folder.
 
     Returns:
-        `index/thumbnail`, `index/siglip`, `index/siglip-siglip2-base-patch16-224`, …
+        `thumbnail`; `siglip` for the paper's model; `siglip:google/siglip2-base-patch16-224`;
+        `siglip:NAME` for a folder of that name.
     """
     kind, _, model = encoder.partition(":")
-    last = PurePath(model.partition("@")[0]).name
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{kind}-{last}" if last else kind)
-    return f"{INDEX_DIR}/{name}"
+    if not model:
+        return kind
+    if Path(model).is_dir():
+        return f"{kind}:{Path(model).resolve().name}"
+    model = model.partition("@")[0]
+    return kind if model == PAPER_ENCODER else f"{kind}:{model}"
+
+
+def index_folder(encoder: str, camera: str = "front") -> str:
+    """Return where the index of an encoder and a camera lies inside a dataset.
+
+    Args:
+        encoder: Name of the encoder, see `encoder_id`; the last part of a model's id becomes part
+            of the folder's name.
+        camera: Camera, with or without `observation.images.`.
+
+    Returns:
+        `index/thumbnail`, `index/siglip`, `index/siglip-siglip2-base-patch16-224`,
+        `index/thumbnail@wrist`, …
+    """
+    kind, colon, model = encoder_id(encoder).partition(":")
+    name = f"{kind}-{PurePath(model).name}" if colon else kind
+    camera = camera.removeprefix(CAMERA_PREFIX)
+    parts = [name] if camera == "front" else [name, camera]
+    return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
 
 
 def normalised(
@@ -79,27 +110,34 @@ class EmbeddingIndex:
     Args:
         files: The dataset's files.
         revision: The dataset's identity, `Dataset.revision`.
-        encoder: Name of the encoder, see `index_folder`.
+        encoder: Name of the encoder, see `encoder_id`.
+        camera: Camera, with or without `observation.images.`.
 
     Raises:
-        MissingIndexError: The dataset has no index of this encoder.
-        StaleIndexError: The index was made of other data.
+        MissingIndexError: The dataset has no index of this encoder and camera.
+        StaleIndexError: The index was made of other data, or with another encoder.
         FormatError: It is of an unknown version, or damaged.
     """
 
-    def __init__(self, files: Files, revision: str, encoder: str):
+    def __init__(self, files: Files, revision: str, encoder: str, camera: str = "front"):
         self._files = files
-        self._folder = index_folder(encoder)
+        self._folder = index_folder(encoder, camera)
+        camera = camera.removeprefix(CAMERA_PREFIX)
+        of = f"encoder {encoder!r}" + ("" if camera == "front" else f" and camera {camera!r}")
+        option = "" if camera == "front" else f" --camera {camera}"
         self._remedy = (
-            f"Type: robomme-interference index --data {_data_of(self._root)} --encoder {encoder}"
+            f"Type: robomme-interference index --data {_data_of(files)} --encoder {encoder}{option}"
         )
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
             raise MissingIndexError(
-                f"{self._root} has no embeddings of encoder {encoder!r}", self._remedy
+                f"{self._root} has no embeddings of {of}", self._remedy
             ) from None
-        self.header = read_json(path)
+        try:
+            self.header = read_json(path)
+        except FormatError as error:
+            raise self._damaged(error.message) from None
         if self.header.get("format_version") != FORMAT_VERSION:
             raise FormatError(
                 f"{path} has format version {self.header.get('format_version')!r}; this package "
@@ -107,10 +145,20 @@ class EmbeddingIndex:
                 "Install the version of robomme-interference-data that wrote it, or make it "
                 f"again. {self._remedy}",
             )
-        check_names(path, self.header, _HEADER_KEYS)
+        try:
+            check_names(path, self.header, _HEADER_KEYS)
+        except FormatError as error:
+            raise self._damaged(error.message) from None
+        made = self.header["encoder"]["name"], self.camera.removeprefix(CAMERA_PREFIX)
+        if made != (encoder_id(encoder), camera):
+            raise StaleIndexError(
+                f"the embeddings in {self._root}/{self._folder} are of encoder {made[0]!r} and "
+                f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
+                f"Give the encoder as {made[0]!r}, or make them anew. {self._remedy}",
+            )
         if self.header["revision"] != revision:
             raise StaleIndexError(
-                f"the embeddings of encoder {encoder!r} in {self._root} were made of data with "
+                f"the embeddings of {of} in {self._root} were made of data with "
                 f"revision {str(self.header['revision'])[:12]}…; the data now has {revision[:12]}…",
                 f"Make them again. {self._remedy}",
             )
@@ -130,13 +178,23 @@ class EmbeddingIndex:
         return str(self.header["encoder"]["sha256"])
 
     @property
+    def made(self) -> tuple[str, str, str]:
+        """What embeddings that are compared with each other share: encoder, camera and pool."""
+        return self.fingerprint, self.camera, self.pool
+
+    @property
+    def pool(self) -> str:
+        """Revision of the distractor units that `centre` and `typical_cosine` are of."""
+        return str(self.header["pool"])
+
+    @property
     def size(self) -> int:
         """Values in an embedding."""
         return int(self.header["size"])
 
     @property
     def typical_cosine(self) -> float:
-        """Median cosine of two frames of the dataset: what the encoder finds in any two."""
+        """Median cosine of two frames of different distractor units of the pool."""
         return float(self.header["typical_cosine"])
 
     @cached_property
@@ -149,18 +207,37 @@ class EmbeddingIndex:
 
     @cached_property
     def embeddings(self) -> NDArray[np.float16]:
-        """All embeddings, `(frames, size) float16`, each of length 1; a read-only memory map."""
-        return self._array(INDEX_EMBEDDINGS, (int(self.header["frames"]), self.size), np.float16)
+        """All embeddings, `(frames, size) float16`, each of length 1; a read-only memory map.
+
+        Their file is compared with its SHA-256 first, once.
+        """
+        shape = int(self.header["frames"]), self.size
+        found = self._array(INDEX_EMBEDDINGS, shape, np.float16)
+        for first in range(0, len(found), _BLOCK):
+            if not np.isfinite(found[first : first + _BLOCK]).all():
+                raise self._damaged(f"{self._root}/{self._folder} holds what is no finite number")
+        return found
+
+    def check(self) -> None:
+        """Read all of it, and compare every file with its SHA-256.
+
+        Raises:
+            FormatError: A file is missing or damaged.
+        """
+        _ = self.embeddings, self.centre, self._first_rows
 
     @cached_property
     def _first_rows(self) -> dict[int, tuple[int, int]]:
         """For each episode, the row of its first frame and the number of its frames."""
-        path = self._files.path(f"{self._folder}/{INDEX_ROWS}")
-        with parquet.reading(path), pq.ParquetFile(path) as file:
-            names = ("episode_index", "frame", "row")
-            check_names(path, file.schema_arrow.names, names)
-            table = file.read(columns=list(names))
-            episodes, frames, rows = (table[name].to_numpy() for name in names)
+        path = self._verified(INDEX_ROWS)
+        names = ("episode_index", "frame", "row")
+        try:
+            with parquet.reading(path), pq.ParquetFile(path) as file:
+                check_names(path, file.schema_arrow.names, names)
+                table = file.read(columns=list(names))
+                episodes, frames, rows = (table[name].to_numpy() for name in names)
+        except FormatError as error:
+            raise self._damaged(error.message) from None
         firsts = np.flatnonzero(np.diff(episodes, prepend=-1))
         counts = np.diff(firsts, append=len(episodes))
         expected = np.arange(len(episodes)) - np.repeat(firsts, counts)
@@ -171,9 +248,8 @@ class EmbeddingIndex:
             and np.array_equal(rows, np.arange(len(rows)))
         )
         if not whole:
-            raise FormatError(
-                f"{path} does not list the frames of the episodes, one after the other",
-                f"It is damaged: make it again. {self._remedy}",
+            raise self._damaged(
+                f"{path} does not list the frames of the episodes, one after the other"
             )
         starts = zip(episodes[firsts], firsts, counts, strict=True)
         return {int(episode): (int(first), int(count)) for episode, first, count in starts}
@@ -186,7 +262,7 @@ class EmbeddingIndex:
 
         Raises:
             UnknownNameError: The index does not hold these frames.
-            MissingFileError, FormatError: A file of the index is missing or damaged.
+            FormatError: A file of the index is missing or damaged.
         """
         first, count = self._first_rows.get(episode_index, (0, 0))
         if not 0 <= start <= stop <= count:
@@ -198,23 +274,36 @@ class EmbeddingIndex:
         return self.embeddings[first + start : first + stop]
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        path = self._files.path(f"{self._folder}/{name}")
+        path = self._verified(name)
         try:
             array = np.load(path, mmap_mode="r")
         except (OSError, ValueError, EOFError) as error:
-            raise FormatError(
-                f"{path} cannot be read: {error}", f"It is damaged: make it again. {self._remedy}"
-            ) from None
+            raise self._damaged(f"{path} cannot be read: {error}") from None
         if array.shape != shape or array.dtype != dtype:
-            raise FormatError(
+            raise self._damaged(
                 f"{path} holds {array.dtype} of shape {array.shape}; expected {np.dtype(dtype)} "
-                f"of shape {shape}",
-                f"It is damaged: make it again. {self._remedy}",
+                f"of shape {shape}"
             )
         return array
 
+    def _verified(self, name: str) -> Path:
+        """Return the path of a file after its SHA-256 was compared with the header's."""
+        try:
+            path = self._files.path(f"{self._folder}/{name}")
+        except MissingFileError as error:
+            raise self._damaged(error.message) from None
+        recorded = self.header["files"].get(name, {}).get("sha256")
+        if sha256_file(path) != recorded:
+            raise self._damaged(f"{path} does not have the SHA-256 of {INDEX_HEADER}")
+        return path
 
-def _data_of(root: str) -> str:
-    """Return the split that a dataset belongs to, as both are indexed together; else itself."""
-    path = PurePath(root)
-    return str(path.parent) if path.name in (DEMONSTRATIONS, DISTRACTORS) else root
+    def _damaged(self, message: str) -> FormatError:
+        return FormatError(message, f"The index is damaged: make it again. {self._remedy}")
+
+
+def _data_of(files: Files) -> str:
+    """Return the folder to index: the split of a dataset, as both are indexed together."""
+    if not isinstance(files, LocalFiles):
+        return f"FOLDER, once the data of {files.describe()} is there"
+    root = files.root
+    return str(root.parent if root.name in (DEMONSTRATIONS, DISTRACTORS) else root)

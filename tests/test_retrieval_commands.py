@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -141,7 +142,7 @@ def test_the_table_by_family_and_k(run: Run) -> None:
     code, out, err = run("retrieval-score", "--split", indexed())
     assert code == 0 and "buffers/s" in err
     title, _, heads, rule, *rest = out.splitlines()
-    assert title == "Retrieval on indexed, encoder thumbnail, rule max/adaptive"
+    assert title == "Retrieval on indexed, encoder thumbnail, camera front, rule max/adaptive"
     assert heads.split()[:3] == ["family", "k", "queries"] and set(rule) == {"-", " "}
     rows = [line.split()[:3] for line in rest[: rest.index("")]]
     queries = dict.fromkeys(factories.FAMILIES, "2") | {"all": "8"}
@@ -170,6 +171,8 @@ def test_rules_side_by_side(run: Run, tmp_path: Path) -> None:
     assert {row["coverage"] for row in whole} == {"1.000000"}
     for row in whole:
         assert float(row["false_sessions"]) == int(row["k"])
+        assert (row["found_cuts"], row["false_cuts"]) == ("0", "0")
+        assert int(row["true_cuts"]) == int(row["k"]) * int(row["queries"])
     with (tmp_path / "rows.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * 8 * 3
@@ -189,6 +192,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path) -> Non
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     found = json.loads(runs[0][1])
     assert (found["split"], found["encoder"], found["buffers"]) == ("indexed", "thumbnail", 24)
+    assert found["camera"] == "front"
     assert found["rules"] == ["max/adaptive"] and found["pass_mark"] == 0.9
     assert found["revision"] == load_split(indexed()).revision
     cell = next(c for c in found["cells"] if (c["family"], c["k"]) == ("all", 0))
@@ -235,10 +239,14 @@ def test_why(run: Run, tmp_path: Path) -> None:
     words = ("retrieve", EPISODE, "--k", 3, "--split", indexed(), "--out", out_file)
     code, out, err = run(*words, "--rule", "oracle")
     assert code == 0 and f"{out_file} written" in err
-    first, chosen, why, lesson = out.splitlines()
-    assert first.startswith(f"{EPISODE} at k=3, rule oracle/adaptive: 116 history frames, cut into")
+    first, chosen, why, closest, lesson = out.splitlines()
+    assert first.startswith(
+        f"{EPISODE} at k=3, front camera, rule oracle/adaptive: 116 history frames, cut into"
+    )
     assert chosen == f"Chosen: frames 0 to 19, of lesson {EPISODE}"
-    assert why.startswith("Why: frame ") and "the closest one outside is frame " in why
+    assert why == "Why: it is the true lesson, which this rule is told"
+    assert closest.startswith("What the robot sees now is closest to frame ")
+    assert "the closest one outside is frame " in closest
     assert lesson == (
         "The lesson is frames 0 to 19: purity 100.0%, coverage 100.0%, 0 false sessions"
     )
@@ -246,6 +254,29 @@ def test_why(run: Run, tmp_path: Path) -> None:
     once = out_file.read_bytes()
     run(*words, "--rule", "oracle")
     assert out_file.read_bytes() == once
+
+
+@pytest.mark.parametrize(
+    ("rule", "reason"),
+    [
+        ("max/-1", "no segment long enough has a frame of a higher cosine"),
+        ("mean/-1", "no segment long enough has a higher mean cosine"),
+        ("last/-1", "it is the last segment that is long enough"),
+        ("random/-1", "it was drawn by lot among the segments that are long enough"),
+    ],
+)
+def test_why_is_the_reason_of_the_rule(rule: str, reason: str, run: Run) -> None:
+    words = ("retrieve", EPISODE, "--k", 1, "--split", indexed(), "--rule", rule)
+    code, out, _ = run(*words)
+    why = out.splitlines()[2]
+    assert code == 0 and why.startswith(f"Why: {reason}")
+    found = json.loads(run(*words, "--json")[1])
+    if rule in ("last/-1", "random/-1"):
+        assert found["score"] is None and why == f"Why: {reason}"
+    else:
+        assert why.endswith(f", {found['score']:.3f}")
+    if rule == "max/-1":  # one segment: its score is that of the closest frame
+        assert found["score"] == found["cosine"]
 
 
 def test_why_as_json_is_what_the_score_says(run: Run, tmp_path: Path) -> None:
@@ -288,6 +319,9 @@ def test_calibration(run: Run, tmp_path: Path) -> None:
     assert [point["threshold"] for point in found["sweep"][::3]] == [
         round(0.8 + n / 100, 2) for n in range(20)
     ]
-    # Eight lessons, each followed by three sessions at most; nested cuts count once.
-    assert len(found["lowest"]) == 8 and len(found["cuts"]) == 8 * 3
+    # Units return in many buffers, and cuts under k = 1 and 3: each counts once.
+    rows = [m for m in load_split(indexed()).manifests() if m.k == 3]
+    pairs = {(a.source, b.source) for m in rows for a, b in pairwise(m.sessions)}
+    assert len(found["cuts"]) == len(pairs) <= 8 * 3
+    assert len(found["lowest"]) == len({s.source for m in rows for s in m.sessions}) < 8 * 4
     assert {one["family"] for one in found["held_out"]} == set(factories.FAMILIES)

@@ -7,13 +7,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.intervals import wilson
-from robomme_interference_data.retrieval.calibrate import calibrate, fit, steps
+from robomme_interference_data.retrieval.calibrate import (
+    calibrate,
+    fit,
+    lowest_inside,
+    steps,
+    true_cuts,
+)
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
-from robomme_interference_data.retrieval.encoders.names import DEFAULT_MODEL
-from robomme_interference_data.retrieval.grade import ALL, Cell, Grade, Measured, cells, grade
+from robomme_interference_data.retrieval.grade import (
+    ALL,
+    Cell,
+    Grade,
+    Measured,
+    TrueSession,
+    cells,
+    grade,
+)
 from robomme_interference_data.retrieval.report import cell_table, shown_table, verdict
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import METHODS, Rule, parse_rules
@@ -30,15 +44,24 @@ def made(
     sessions: tuple[Span, ...] = SESSIONS,
     inside: float = 1.0,
     typical: float = 0.0,
+    units: tuple[str, ...] = (),
 ) -> Measured:
-    """A buffer whose adjacent cosines are `inside` but before `cuts`, and 0 with the query."""
+    """A buffer whose adjacent cosines are `inside` but before `cuts`, and 0 with the query.
+
+    The sessions behind the lesson are those `units`, or else its own.
+    """
     frames = sessions[-1][1]
     adjacent, alike = np.full(frames - 1, inside, np.float32), np.zeros(frames, np.float32)
     for place, value in cuts.items():
         adjacent[place - 1] = value
     for place, value in high.items():
         alike[place] = value
-    return Measured(EpisodeId.parse(episode), k, sessions, sessions[0], adjacent, alike, typical)
+    names = [episode, *(units or (f"Other/train/{episode} {n}" for n in range(len(sessions) - 1)))]
+    true = tuple(
+        TrueSession(span, name.partition("/")[0], name)
+        for span, name in zip(sessions, names, strict=True)
+    )
+    return Measured(EpisodeId.parse(episode), k, true, sessions[0], adjacent, alike, typical)
 
 
 # --- rules -----------------------------------------------------------------------------------
@@ -46,7 +69,7 @@ def made(
 
 @given(
     st.sampled_from(sorted(METHODS)),
-    st.one_of(st.none(), st.just("adaptive"), st.integers(-1000, 1000).map(lambda n: n / 1000)),
+    st.one_of(st.none(), st.just("adaptive"), st.floats(-1, 1)),
 )
 def test_rules_are_read_as_they_are_written(method: str, cut: float | None) -> None:
     rule = Rule(method, cut)
@@ -57,6 +80,8 @@ def test_the_cut_is_the_encoders_own_unless_given() -> None:
     assert str(Rule().settled(0.923)) == "max/0.923"
     assert str(Rule().settled(None)) == "max/adaptive"
     assert str(Rule("mean", 0.5).settled(0.923)) == "mean/0.5"
+    assert str(Rule("max", 0.9234567)) == "max/0.9234567"  # not the same as max/0.923457
+    assert str(Rule("max", -1)) == "max/-1"
     assert Rule("max", 0.923).threshold(0.1) == 0.923
     assert Rule("max", "adaptive").threshold(0.5) == 0.75
     with pytest.raises(InvalidOptionError, match="not settled"):
@@ -86,8 +111,11 @@ def test_rules_that_are_none(text: str, error: type[Exception], said: str) -> No
 
 
 def test_names_of_encoders() -> None:
-    assert encoder_name(f"siglip:{DEFAULT_MODEL}") == encoder_name("siglip") == "siglip"
-    assert published_threshold(f"siglip:{DEFAULT_MODEL}") == 0.923
+    assert encoder_name(f"siglip:{PAPER_ENCODER}") == encoder_name("siglip") == "siglip"
+    assert published_threshold(f"siglip:{PAPER_ENCODER}") == 0.923
+    # At a revision it is the same model, and the revision is kept for loading it.
+    assert published_threshold(f"siglip:{PAPER_ENCODER}@main") == 0.923
+    assert encoder_name(f"siglip:{PAPER_ENCODER}@main") == f"siglip:{PAPER_ENCODER}@main"
     assert published_threshold("siglip:google/siglip2-base-patch16-224") is None
     assert published_threshold("thumbnail") is None
 
@@ -113,6 +141,9 @@ def test_a_grade_by_hand() -> None:
         purity=2 / 5,
         coverage=2 / 6,
         false_sessions=1,
+        true_cuts=2,  # before 6 and before 11; found are those before 4, 9 and 11
+        found_cuts=1,
+        false_cuts=2,
     )
     assert found.hit
     last = grade(one, Rule("last", 0.5))
@@ -160,6 +191,10 @@ def test_cells_by_hand() -> None:
     assert (everything.hit.low, everything.hit.high) == wilson(2, 3)
     assert everything.false_sessions.value == pytest.approx((0 + 1 + 2) / 3)
     assert not both.passed
+    # MoveCube's two queries have two borders each; `good` finds the one before 6, `poor` one and
+    # two false ones; `alone` has none to find.
+    assert (both.true_cuts, both.found_cuts, both.false_cuts) == (4, 2, 2)
+    assert (single.true_cuts, single.found_cuts, single.false_cuts) == (0, 0, 0)
     assert verdict(found).endswith("pass: max/0.5: 1 of 3")
 
 
@@ -168,7 +203,7 @@ def test_the_pass_mark() -> None:
 
     def cell(purity: float, coverage: float) -> Cell:
         values = [Interval(value, 0, 1) for value in (1, purity, coverage, 0)]
-        return Cell("max", "MoveCube", 7, 50, *values)
+        return Cell("max", "MoveCube", 7, 50, *values, 0, 0, 0)
 
     assert cell(0.9, 0.9).passed and cell(1, 0.95).passed
     assert not cell(0.89, 1).passed and not cell(1, 0.8999).passed
@@ -181,14 +216,17 @@ def test_tables() -> None:
     # The closest frame is in the lesson twice; the third time it is in the other nine.
     assert lines[0] == "Title"
     assert lines[2].split() == [
-        *("family", "k", "queries", "hit", "purity", "coverage", "false", "sessions", "pass")
+        *("family", "k", "queries", "hit", "purity", "coverage", "false", "sessions"),
+        *("cuts", "found", "false", "cuts", "pass"),
     ]
     assert lines[4].startswith("MoveCube  k2        3  66.7% (20.8 to 93.9)  66.7% (0.0 to 100.0)")
-    assert lines[4].endswith("0.67  no")
+    # Of three times two borders the one before 6 is found each time.
+    assert lines[4].split()[-6:] == ["0.67", "3", "of", "6", "0", "no"]
     assert lines[5].startswith("all       k2        3")
     record = cell_table(found, "Title").records()[0]
     assert record["family"] == "MoveCube" and record["purity"] == pytest.approx(2 / 3)
     assert record["pass"] is False
+    assert (record["true_cuts"], record["found_cuts"], record["false_cuts"]) == (6, 3, 0)
     two = [grade(one, rule) for rule in (Rule("max", 0.5), Rule("last", 0.5)) for one in measured]
     lines = shown_table(list(cells(two)), "Title").text().splitlines()
     assert [line.split()[0] for line in lines[4:6]] == ["max/0.5", "last/0.5"]
@@ -198,10 +236,13 @@ def test_tables() -> None:
 
 
 def three() -> list[Measured]:
-    """Cuts of 0, 0.4 and 0.2 (each family's own), lessons with 0.9, 0.7 and 0.8 at lowest."""
+    """Cuts of 0, 0.4 and 0.2 (each family's own), lessons with 0.9, 0.7 and 0.8 at lowest.
+
+    Units of one frame: nothing is inside them.
+    """
     made_of = (("MoveCube", 0.0, 0.9), ("InsertPeg", 0.4, 0.7), ("RouteStick", 0.2, 0.8))
     return [
-        made(f"{family}/test/0", k, cuts={6: cut, 3: low}, high={1: 1}, sessions=((0, 6), (6, 11)))
+        made(f"{family}/test/0", k, cuts={6: cut, 3: low}, high={1: 1}, sessions=((0, 6), (6, 7)))
         for family, cut, low in made_of
         for k in (1, 2)  # nested: each cut returns
     ]
@@ -220,19 +261,39 @@ def test_the_released_rule_by_hand() -> None:
     assert (held_out["InsertPeg"].purity, held_out["InsertPeg"].coverage) == (1, 1)
     sweep = {(point.threshold, point.k): point for point in found.sweep}
     assert len(sweep) == 6
-    # At 0.3 InsertPeg is not cut: 6 of 11 frames are lesson. At 0.95 lessons fall into 3 and 3.
-    assert sweep[0.3, 1].purity == pytest.approx((1 + 1 + 6 / 11) / 3)
+    # At 0.3 InsertPeg is not cut: 6 of 7 frames are lesson. At 0.95 lessons fall into 3 and 3.
+    assert sweep[0.3, 1].purity == pytest.approx((1 + 1 + 6 / 7) / 3)
     assert (sweep[0.549, 2].purity, sweep[0.549, 2].coverage) == (1, 1)
-    # Both halves are too short to be chosen, but the other session is not.
-    assert (sweep[0.95, 2].purity, sweep[0.95, 2].coverage) == (0, 0)
+    # All three parts are too short, so all may be chosen: the first half is.
+    assert (sweep[0.95, 2].purity, sweep[0.95, 2].coverage) == (1, 0.5)
+
+
+def test_every_session_counts_and_each_once() -> None:
+    # MoveCube's lesson, then units A and B; InsertPeg's lesson, then the same A and B.
+    units = ("RouteStick/train/0", "PatternLock/train/0")
+    one = made(cuts={3: 0.9, 6: 0.1, 8: 0.5, 11: 0.2, 13: 0.6}, high={}, units=units)
+    other = made(
+        "InsertPeg/test/0", cuts={3: 0.8, 6: 0.3, 8: 0.5, 11: 0.2, 13: 0.6}, high={}, units=units
+    )
+    assert lowest_inside([one, other]) == pytest.approx([0.5, 0.6, 0.8, 0.9])
+    assert true_cuts([one, other]) == pytest.approx([0.1, 0.2, 0.3])  # A to B once
+    # Without RouteStick, A's 0.5 goes, and every cut: A is on one side of each.
+    assert lowest_inside([one, other], without="RouteStick") == pytest.approx([0.6, 0.8, 0.9])
+    assert true_cuts([one, other], without="RouteStick") == []
+    # Without PatternLock, B's 0.6 goes, and the cut from A to B.
+    assert true_cuts([one, other], without="PatternLock") == pytest.approx([0.1, 0.3])
+    # Without MoveCube: its query goes as a whole. 99th percentile of 0.2, 0.3: 0.299; 1st of 0.5,
+    # 0.6, 0.8: 0.502.
+    fitted = fit([one, other], without="MoveCube")
+    assert fitted == pytest.approx(((0.299 + 0.502) / 2, 0.299, 0.502), abs=1e-6)
 
 
 def test_nothing_to_fit() -> None:
     alone = made(k=0, cuts={}, high={}, sessions=((0, 6),))
     with pytest.raises(InvalidOptionError, match="1 buffers without any cut between sessions"):
         fit([alone])
-    short = made(cuts={}, high={}, sessions=((0, 1), (1, 6)))
-    with pytest.raises(InvalidOptionError, match="without any lesson of two frames"):
+    short = made(cuts={}, high={}, sessions=((0, 1), (1, 2)))
+    with pytest.raises(InvalidOptionError, match="without any session of two frames"):
         fit([short])
     assert calibrate(three()[:2], [0.5]).held_out == ()  # one family
 

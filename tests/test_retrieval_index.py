@@ -1,8 +1,9 @@
 """Encoders, the index beside the data, and the selector of rollouts."""
 
+import io
 import json
 import shutil
-from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,19 @@ import factories
 import numpy as np
 import pytest
 
-from robomme_interference_data import Dataset, load_buffer, load_split
-from robomme_interference_data.embeddings import index_folder, normalised
+from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.build_dataset.sample import write_sample
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.embeddings import encoder_id, index_folder, normalised
 from robomme_interference_data.errors import (
+    BuildError,
     FormatError,
     InvalidOptionError,
     MissingFileError,
     MissingIndexError,
-    MissingWeightsError,
     StaleIndexError,
     UnknownNameError,
 )
-from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.retrieval.commands import datasets_in
 from robomme_interference_data.retrieval.encoders import make_encoder
@@ -91,10 +93,127 @@ def test_normalising() -> None:
         ("siglip", "index/siglip"),
         ("siglip:google/siglip2-base@abc", "index/siglip-siglip2-base"),
         ("siglip:models/my model", "index/siglip-my-model"),
+        ("siglip:google/siglip-so400m-patch14-384", "index/siglip"),
+        ("siglip:google/siglip-so400m-patch14-384@main", "index/siglip"),
     ],
 )
 def test_folders(encoder: str, folder: str) -> None:
-    assert index_folder(encoder) == folder
+    assert index_folder(encoder) == index_folder(encoder, "observation.images.front") == folder
+    assert index_folder(encoder, "wrist") == f"{folder}@wrist"
+
+
+def test_a_model_in_a_folder_is_called_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    for model in (".", "../tiny", str(folder)):
+        assert encoder_id(f"siglip:{model}") == "siglip:tiny"
+        assert index_folder(f"siglip:{model}") == "index/siglip-tiny"
+    assert index_folder("siglip:/") == "index/siglip-"  # not the paper's model
+
+
+def test_two_models_of_one_name_are_told_apart(split: Path) -> None:
+    encoder = Thumbnail()
+    encoder.name = "siglip:one/tiny"
+    build_index(datasets_in(split), encoder, QUIET)
+    buffer = load_buffer(EPISODE, 1, split)
+    assert len(buffer.embeddings("siglip:one/tiny@v2")) == 20 + 32
+    with pytest.raises(StaleIndexError, match="of encoder 'siglip:one/tiny'") as caught:
+        buffer.embeddings("siglip:two/tiny")
+    assert "index --data" in str(caught.value.hint)
+
+
+def test_each_camera_has_an_index_of_its_own(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    assert make_index(split, camera="wrist") == [4 * (21 + 37), 7 * 32]
+    both = files_of(split)
+    assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
+    buffer = load_buffer(EPISODE, 1, split)
+    centre = buffer.query_index("thumbnail", "wrist").centre
+    expected = normalised(Thumbnail().prepare(buffer.frames("wrist")), centre)
+    assert np.array_equal(buffer.embeddings("thumbnail", "wrist"), expected)
+    selector = Selector("thumbnail", camera="wrist")
+    assert (selector.name, selector.camera) == ("thumbnail@wrist/max/adaptive", "wrist")
+    chosen = selector.select(buffer, buffer.query_frame("wrist"))
+    stored = select(buffer, "thumbnail", selector.rule, camera="wrist")
+    assert (chosen.start, chosen.stop) == (stored.start, stored.stop)
+    for path in split.glob("*/index/thumbnail@wrist"):
+        shutil.rmtree(path)
+    with pytest.raises(MissingIndexError, match="camera 'wrist'") as caught:
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail", "wrist")
+    assert str(caught.value.hint).endswith("--encoder thumbnail --camera wrist")
+
+
+def test_contents_are_checked(split: Path) -> None:
+    make_index(split)
+    folder = split / "demonstrations" / "index" / "thumbnail"
+    assert not list(verify_split(split, decode=False))
+    whole = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def refused(name: str, content: bytes, said: str) -> None:
+        (folder / name).write_bytes(content)
+        with pytest.raises(FormatError, match=said) as caught:
+            load_buffer(EPISODE, 1, split).query_index("thumbnail").check()
+        assert f"index --data {split} --encoder thumbnail" in str(caught.value.hint)
+        (found,) = verify_split(split, decode=False)
+        assert found.where == "demonstrations/index/thumbnail" and said in found.what
+        (folder / name).write_bytes(whole[name])
+
+    rows = np.load(folder / "embeddings.npy")
+    turned, holed = io.BytesIO(), io.BytesIO()
+    np.save(turned, rows[::-1])
+    rows[3] = np.nan
+    np.save(holed, rows)
+    for name, content in (
+        ("embeddings.npy", turned.getvalue()),
+        ("centre.npy", whole["centre.npy"][:-1] + b"x"),
+        ("rows.parquet", whole["rows.parquet"] + b"x"),
+    ):
+        refused(name, content, f"{name} does not have the SHA-256")
+    # As made by something else: the hash is right, the content is not.
+    header = json.loads(whole["index.json"])
+    header["files"]["embeddings.npy"]["sha256"] = sha256(holed.getvalue()).hexdigest()
+    whole["embeddings.npy"] = holed.getvalue()
+    (folder / "embeddings.npy").write_bytes(holed.getvalue())
+    refused("index.json", json.dumps(header).encode(), "no finite number")
+    (folder / "index.json").write_bytes(whole["index.json"])
+    (folder / "rows.parquet").unlink()
+    with pytest.raises(FormatError, match=r"rows\.parquet is missing") as caught:
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+    assert f"index --data {split} --encoder thumbnail" in str(caught.value.hint)
+
+
+def test_verify_names_an_index_that_does_not_belong(split: Path) -> None:
+    make_index(split)
+    path = split / "demonstrations" / "index" / "thumbnail" / "index.json"
+    header = json.loads(path.read_text())
+    for change, said in (
+        ({"pool": "0" * 64}, "other distractors"),
+        ({"camera": "observation.images.wrist"}, "camera observation.images.wrist"),
+        ({"encoder": None}, "does not say of which encoder"),
+    ):
+        path.write_text(json.dumps(header | change))
+        (found,) = verify_split(split, decode=False)
+        assert found.where == "demonstrations/index/thumbnail" and said in found.what
+
+
+def test_what_identifies_a_selector(split: Path) -> None:
+    make_index(split)
+    buffer = load_buffer(EPISODE, 1, split)
+    index = buffer.query_index("thumbnail")
+    assert Selector("thumbnail").identity(buffer) == {
+        "encoder": "thumbnail",
+        "fingerprint": index.fingerprint,
+        "camera": "front",
+        "method": "max",
+        "cut": "adaptive",
+        "threshold": (1 + index.typical_cosine) / 2,
+    }
+    fixed = Selector("thumbnail", method="mean", threshold=0.5).identity(buffer)
+    assert (fixed["method"], fixed["cut"], fixed["threshold"]) == ("mean", 0.5, 0.5)
 
 
 def test_a_buffers_embeddings_are_those_of_its_frames(split: Path) -> None:
@@ -125,12 +244,22 @@ def test_an_interrupted_run_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch
     once = files_of(split)
     for path in split.glob("*/index"):
         shutil.rmtree(path)
+    interrupted(split, monkeypatch)
+    with pytest.raises(MissingIndexError):
+        load_buffer(EPISODE, 0, split).embeddings("thumbnail")
+    # Three units of 32 frames were done.
+    assert make_index(split) == [4 * (21 + 37), 4 * 32]
+    assert files_of(split) == once
+
+
+def interrupted(split: Path, monkeypatch: pytest.MonkeyPatch, after: int = 3) -> None:
+    """Begin an index, and break off after some batches."""
     calls = 0
 
     def features(_: Thumbnail, prepared: Any) -> Any:
         nonlocal calls
         calls += 1
-        if calls > 3:
+        if calls > after:
             raise KeyboardInterrupt
         return prepared
 
@@ -138,11 +267,61 @@ def test_an_interrupted_run_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch
         patch.setattr(Thumbnail, "features", features)
         with pytest.raises(KeyboardInterrupt):
             make_index(split)
-    with pytest.raises(MissingIndexError):
-        load_buffer(EPISODE, 0, split).embeddings("thumbnail")
-    # Three demonstrations, of 21, 37 and 21 frames, were done.
-    assert make_index(split) == [4 * (21 + 37) - 79, 7 * 32]
+
+
+def test_parts_of_another_batch_or_device_are_refused(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(split, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(Thumbnail, "batch", 8)
+        with pytest.raises(BuildError, match="computed with numpy, 64 images") as caught:
+            make_index(split)
+        assert "--batch 64" in str(caught.value.hint) and "--force" in str(caught.value.hint)
+        # All 7 units, though three were done.
+        assert make_index(split, force=True) == [4 * (21 + 37), 7 * 32]
+    header = json.loads((split / "distractors/index/thumbnail/index.json").read_text())
+    assert header["computed"] == {"in": "numpy", "batch": 8}
+
+
+def test_each_dataset_is_made_by_itself(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    for kind, embedded in (("distractors", [0, 7 * 32]), ("demonstrations", [4 * (21 + 37), 0])):
+        shutil.rmtree(split / kind / "index")
+        assert make_index(split) == embedded
+        assert files_of(split) == once
+
+
+def test_an_index_of_another_device_is_kept(split: Path) -> None:
+    make_index(split)
+    for path in split.glob("*/index/thumbnail/index.json"):
+        header = json.loads(path.read_text())
+        header["computed"] = {"in": "cuda, bfloat16", "batch": 32}
+        path.write_text(json.dumps(header))
+    reports = build_index(datasets_in(split), make_encoder("thumbnail"), QUIET)
+    assert [r.embedded for r in reports] == [0, 0]
+    assert {(r.computed_in, r.batch) for r in reports} == {("cuda, bfloat16", 32)}
+    assert make_index(split, force=True) == [4 * (21 + 37), 7 * 32]
+
+
+def test_what_a_killed_run_left_is_swept(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    left = split / "distractors" / "index" / "thumbnail" / ".embeddings.npy.a1b2.partial"
+    left.write_bytes(b"half")
+    assert make_index(split) == [0, 0]
     assert files_of(split) == once
+
+
+def test_what_is_not_finite_is_not_stored(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def features(_: Thumbnail, prepared: Any) -> Any:
+        prepared[-1, 5] = np.inf
+        return prepared
+
+    monkeypatch.setattr(Thumbnail, "features", features)
+    with pytest.raises(BuildError, match=r"not finite for frames up to 31 of VideoRepick/train/0"):
+        make_index(split)
 
 
 def test_a_damaged_index_is_made_again(split: Path) -> None:
@@ -170,22 +349,61 @@ def test_what_cannot_be_used_is_refused(split: Path) -> None:
     refused(StaleIndexError, "revision 0000", revision="0" * 64)
     refused(FormatError, "format version 2", format_version=2)
     refused(FormatError, "expected float16 of shape", size=7)
+    lacking = {name: value for name, value in whole.items() if name != "pool"}
+    header.write_text(json.dumps(lacking))
+    with pytest.raises(FormatError, match="lacks pool") as caught:
+        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+    assert f"index --data {split} --encoder thumbnail" in str(caught.value.hint)
     other = whole["encoder"] | {"sha256": "0" * 64}
     refused(StaleIndexError, "made differently", encoder=other)
     with pytest.raises(StaleIndexError, match="another version of the encoder"):
         Selector("thumbnail").select(load_buffer(EPISODE, 0, split), buffer.query_frame())
-    refused(StaleIndexError, "made differently", camera="observation.images.wrist")
+    refused(StaleIndexError, "camera 'wrist'", camera="observation.images.wrist")
+    refused(StaleIndexError, "made differently", pool="0" * 64)
     header.write_text(json.dumps(whole))
     (header.parent / "rows.parquet").write_bytes(b"PAR1")
     refused(FormatError, "rows.parquet")
 
 
-def test_the_datasets_of_a_split_must_be_centred_together(split: Path) -> None:
+def test_retrieval_does_not_depend_on_other_queries(split: Path, tmp_path: Path) -> None:
     make_index(split)
+    # The same but for the queries: one of each family instead of two.
+    sample = tmp_path / "sample"
+    for _ in write_sample(
+        sample, families=factories.FAMILIES, train=2, test=1, size=64, demonstration=20
+    ):
+        pass
+    fewer = factories.build_split(sample, tmp_path / "fewer")
+    assert make_index(fewer) == [4 * 21, 7 * 32]
+    one, other = (load_buffer(EPISODE, 0, folder) for folder in (split, fewer))
+    assert np.array_equal(one.embeddings("thumbnail"), other.embeddings("thumbnail"))
+    indexes = [buffer.query_index("thumbnail") for buffer in (one, other)]
+    assert indexes[0].typical_cosine == indexes[1].typical_cosine
+    assert indexes[0].made == indexes[1].made
+
+
+def test_the_centre_is_the_mean_of_the_units(split: Path) -> None:
+    make_index(split)
+    units = load_split(split).datasets["distractors"]
+    features = []
+    for episode in range(7):
+        images = np.empty((32, 64, 64, 3), np.uint8)
+        units.read_frames(episode, "observation.images.front", 0, images)
+        features.append(Thumbnail().prepare(images))
+    index = load_buffer(EPISODE, 0, split).query_index("thumbnail")
+    expected = np.concatenate(features).mean(axis=0, dtype=np.float64)
+    assert index.centre == pytest.approx(expected, abs=1e-6)
+    assert index.pool == units.revision
+
+
+def test_units_are_indexed_alone_but_no_demonstrations(split: Path) -> None:
+    make_index(split)
+    once = files_of(split)
+    shutil.rmtree(split / "distractors" / "index")
     build_index([split / "distractors"], make_encoder("thumbnail"), QUIET)
-    load_buffer(EPISODE, 0, split).embeddings("thumbnail")  # demonstrations only
-    with pytest.raises(StaleIndexError, match="both at once"):
-        load_buffer(EPISODE, 1, split).embeddings("thumbnail")
+    assert files_of(split) == once
+    with pytest.raises(InvalidOptionError, match="demonstrations; expected distractor units"):
+        build_index([split / "demonstrations"], make_encoder("thumbnail"), QUIET)
 
 
 def test_the_selector(split: Path) -> None:
@@ -234,92 +452,3 @@ def test_what_is_no_data_is_refused(tmp_path: Path) -> None:
         datasets_in(tmp_path)
     with pytest.raises(UnknownNameError, match="camera 'side'"):
         build_index([factories.split() / "distractors"], Thumbnail(), QUIET, camera="side")
-
-
-@cache
-def siglip(folder: Path) -> str:
-    """Save a small SigLIP of random weights; returns the encoder's name."""
-    torch = pytest.importorskip("torch")
-    transformers = pytest.importorskip("transformers")
-    tower = {"hidden_size": 32, "intermediate_size": 64, "num_attention_heads": 2}
-    config = transformers.SiglipConfig(
-        vision_config=tower | {"num_hidden_layers": 2, "image_size": 32, "patch_size": 8},
-        text_config=tower | {"num_hidden_layers": 1, "vocab_size": 64, "projection_size": 32},
-    )
-    torch.manual_seed(0)
-    transformers.SiglipModel(config).save_pretrained(folder)
-    settings = {"image_processor_type": "SiglipImageProcessor", "size": {"height": 32, "width": 32}}
-    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
-    return f"siglip:{folder}"
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return siglip(tmp_path_factory.mktemp("models") / "tiny")
-
-
-def test_siglip_is_transformers_own_pipeline(model: str) -> None:
-    import torch
-    from transformers import AutoImageProcessor, SiglipModel
-
-    folder = model.partition(":")[2]
-    images = np.random.default_rng(0).integers(0, 256, (9, 48, 64, 3), np.uint8)
-    encoder = make_encoder(model, device="cpu")
-    found = encoder.features(encoder.prepare(images))
-    whole = SiglipModel.from_pretrained(folder).eval()
-    processor = AutoImageProcessor.from_pretrained(folder, backend="pil")
-    with torch.no_grad():
-        inputs = processor(images=list(images), return_tensors="pt")
-        expected = whole.get_image_features(**inputs).pooler_output.numpy()
-    assert found.shape == (9, 32) and found.dtype == np.float32
-    assert found == pytest.approx(expected, abs=1e-5)
-    # Alone or together, within a unit of float16 (2⁻¹¹ below 1).
-    alone = np.concatenate([encoder.features(encoder.prepare(image[None])) for image in images])
-    apart = normalised(found).astype(np.float32) - normalised(alone)
-    assert np.abs(apart).max() <= 2**-11
-    assert encoder.computed_in == "cpu, float32"
-    assert encoder.fingerprint == make_encoder(model, device="cpu").fingerprint
-    assert encoder.fingerprint["preprocessing"]["size"] == {"height": 32, "width": 32}
-
-
-def test_siglip_makes_an_index(split: Path, model: str) -> None:
-    build_index([split / "demonstrations"], make_encoder(model, device="cpu"), QUIET)
-    index = Dataset(LocalFiles(split / "demonstrations")).index(model)
-    assert index.embeddings.shape == (232, 32) and index.centre is None
-    lengths = np.linalg.norm(index.embeddings.astype(np.float32), axis=1)
-    assert lengths == pytest.approx(np.ones(232), abs=2e-3)
-    buffer = load_buffer(EPISODE, 0, split)
-    selector = Selector(model, device="cpu")
-    assert selector.name == "siglip-tiny/max/adaptive"
-    live = selector.select(buffer, buffer.query_frame()).choice.query_cosines
-    stored = select(buffer, model, selector.rule).choice.query_cosines
-    assert live == pytest.approx(stored, abs=2e-3)
-
-
-def test_other_weights_are_another_encoder(model: str, tmp_path: Path) -> None:
-    import torch
-    from transformers import SiglipVisionModel
-
-    folder = Path(model.partition(":")[2])
-    changed = shutil.copytree(folder, tmp_path / "tiny")
-    vision = SiglipVisionModel.from_pretrained(changed)
-    with torch.no_grad():
-        next(vision.parameters()).add_(0.01)
-    vision.save_pretrained(changed)
-    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
-    assert one.fingerprint["weights_sha256"] != other.fingerprint["weights_sha256"]
-
-
-def test_weights_that_are_not_there(tmp_path: Path) -> None:
-    pytest.importorskip("transformers")
-    with pytest.raises(MissingWeightsError) as caught:
-        make_encoder("siglip")
-    assert "google/siglip-so400m-patch14-384" in caught.value.message
-    assert "huggingface" in caught.value.message
-    assert caught.value.hint is not None
-    assert "hf download google/siglip-so400m-patch14-384" in caught.value.hint
-    with pytest.raises(FormatError, match="cannot be loaded"):
-        make_encoder(f"siglip:{tmp_path}")
-    (tmp_path / "config.json").write_text('{"model_type": "bert"}')
-    with pytest.raises(FormatError, match="type 'bert'"):
-        make_encoder(f"siglip:{tmp_path}")

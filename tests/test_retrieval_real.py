@@ -12,12 +12,12 @@ from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.segment import adaptive_threshold, typical_cosine
 from robomme_interference_data.retrieval.select import choose
 
-Episodes = dict[str, NDArray[np.float16]]
+Features = dict[str, NDArray[np.float32]]
 
 
 @pytest.fixture(scope="module")
-def episodes(shared_data: Path) -> Episodes:
-    """Embeddings of the nine episodes by family; the last of each is the first live observation."""
+def episodes(shared_data: Path) -> Features:
+    """Features of the nine episodes by family; the last of each is the first live observation."""
     features = {}
     for path in sorted((shared_data / "lessons").glob("*_front.mkv")):
         parts = []
@@ -26,24 +26,41 @@ def episodes(shared_data: Path) -> Episodes:
                 parts.append(Thumbnail().prepare(frame.to_ndarray(format="rgb24")[None]))
         features[path.name.partition("_")[0]] = np.concatenate(parts)
     assert len(features) == 9
-    centre = np.concatenate(list(features.values())).mean(axis=0, dtype=np.float64)
-    return {name: normalised(rows, centre.astype(np.float32)) for name, rows in features.items()}
+    return features
 
 
-def test_the_right_lessons_nearest_frame_is_nearest(episodes: Episodes) -> None:
-    for family, rows in episodes.items():
-        query = rows[-1].astype(np.float32)
-        nearest = {n: float((r[:-1].astype(np.float32) @ query).max()) for n, r in episodes.items()}
+def unit(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a distractor unit keeps of a lesson."""
+    return features[:-1][:256:8]
+
+
+def centre_of(pool: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """The mean of a pool, each episode weighing the same."""
+    return np.mean([one.mean(axis=0, dtype=np.float64) for one in pool], axis=0).astype(np.float32)
+
+
+def test_the_right_lessons_nearest_frame_is_nearest(episodes: Features) -> None:
+    for family, own in episodes.items():
+        centre = centre_of([unit(other) for name, other in episodes.items() if name != family])
+        query = normalised(own[-1:], centre)[0].astype(np.float32)
+        nearest = {
+            name: float((normalised(other[:-1], centre).astype(np.float32) @ query).max())
+            for name, other in episodes.items()
+        }
         assert max(nearest, key=lambda name: nearest[name]) == family, nearest
 
 
-def test_the_lesson_is_chosen_among_eight_sessions(episodes: Episodes) -> None:
-    # Without true boundaries: the cut is halfway between any two frames and equal ones.
-    typical = typical_cosine(np.concatenate(list(episodes.values())))
+def test_the_lesson_is_chosen_among_eight_sessions(episodes: Features) -> None:
+    # Without true boundaries: the cut is halfway between unrelated frames and equal ones. Centre
+    # and cut come from the other families' units.
     purities, coverages = [], []
-    for family, rows in episodes.items():
-        lesson = rows[:-1]
-        units = [other[:-1][:256:8] for name, other in episodes.items() if name != family][:7]
+    for family, own in episodes.items():
+        pool = [unit(other) for name, other in episodes.items() if name != family]
+        centre = centre_of(pool)
+        units = [normalised(one, centre) for one in pool]
+        typical = typical_cosine(units)
+        rows = normalised(own, centre)
+        lesson, units = rows[:-1], units[:7]
         history = np.concatenate([lesson, *units])
         start, stop = choose(history, rows[-1], threshold=adaptive_threshold(typical)).span
         shared = max(0, min(stop, len(lesson)) - start)

@@ -51,14 +51,24 @@ def test_segments_are_all_frames_in_order(values: list[float], threshold: float)
 
 
 def test_the_adaptive_threshold() -> None:
-    # Pairs of X X Y Y: two of cosine 1, four of 0; their median is 0, halfway to 1 is 0.5.
-    assert typical_cosine(np.stack([X, X, Y, Y])) == 0
     assert adaptive_threshold(0) == 0.5
     # What would give the paper's threshold.
     assert adaptive_threshold(0.846) == pytest.approx(0.923)
-    assert typical_cosine(X[None]) == 0
     with pytest.raises(InvalidOptionError):
         adaptive_threshold(1.5)
+
+
+def test_what_unrelated_frames_share() -> None:
+    # Frames of one episode are not compared: X with X and Y with Y would give a median of 1.
+    assert typical_cosine([np.stack([X] * 9), np.stack([Y] * 9)]) == 0
+    # Pairs of episodes: X and MIXED 0.6, X and Y 0, MIXED and Y 0.8. Their median is 0.6, however
+    # long an episode is.
+    for length in (1, 5, 5000):
+        episodes = [X[None], np.stack([Y] * length), MIXED[None]]
+        assert typical_cosine(episodes) == pytest.approx(0.6, abs=1e-3)
+    # Of 3,000 episodes 1,024 are compared, a frame each: the middle of 1, Y of X Y X.
+    assert typical_cosine([X[None], *[np.stack([X, Y, X])] * 2999]) == 1
+    assert typical_cosine([HISTORY]) == 0
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,13 @@ from rollout_doubles import Cheat, World
 
 from robomme_interference_data import load_split
 from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.errors import PolicyError, RolloutError, SimulatorCrashError
-from robomme_interference_data.evaluate import rollout
+from robomme_interference_data.errors import (
+    HistoryTooLongError,
+    PolicyError,
+    RolloutError,
+    SimulatorCrashError,
+)
+from robomme_interference_data.evaluate import rollout, systems
 from robomme_interference_data.evaluate.agreement import check_lesson
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
@@ -22,6 +27,7 @@ from robomme_interference_data.evaluate.policies.builtin import make_builtin
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.retrieval.selector import Selection
 from robomme_interference_data.simulators.base import Observation, Status
 
 EPISODE = EpisodeId("PatternLock", "test", 1)  # a lesson of 36 frames
@@ -53,6 +59,30 @@ def roll(
         policy=policy,
         split=load_split(settings.split),
     )
+
+
+class First:
+    """A retrieval step that chooses the first so many frames."""
+
+    name, camera = "first", "front"
+
+    def __init__(self, frames: int):
+        self.frames = frames
+
+    def select(self, buffer: Buffer, image: np.ndarray) -> Selection:
+        return Selection(0, self.frames, None, 1.0, 0.0, 0.0)  # type: ignore[arg-type]
+
+
+def test_what_retrieval_chose_keeps_the_position_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    # 4096 positions less 4060 steps leave 36 frames, of a buffer of 36 + 3 · 32.
+    monkeypatch.setattr(systems, "MAX_STEPS", 4060)
+    settings = config(system="retrieval-framesamp-modul")
+    parts: Any = {"simulator": World(), "split": load_split(settings.split)}
+    item = WorkItem("k3", EPISODE)
+    row = run_rollout(settings, item, policy=Cheat(), selector=First(36), **parts)  # type: ignore[arg-type]
+    assert row.history_frames == 36
+    with pytest.raises(HistoryTooLongError, match="37 history frames and 4060 steps"):
+        run_rollout(settings, item, policy=Cheat(), selector=First(37), **parts)  # type: ignore[arg-type]
 
 
 def test_with_the_lesson_the_cheat_succeeds_at_once() -> None:

@@ -17,6 +17,10 @@ from robomme_interference_data.errors import FormatError, RunFolderError
 from robomme_interference_data.evaluate import merge_runs, run_evaluation, runner
 from robomme_interference_data.evaluate.log import check_tables, read_log
 from robomme_interference_data.evaluate.score.read import find_sources
+from robomme_interference_data.progress import BuildProgress
+from robomme_interference_data.retrieval.commands import datasets_in
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.retrieval.index import build_index
 
 ONE: dict[str, Any] = {"families": ["MoveCube"], "episodes": "0", "conditions": ["no-history"]}
 
@@ -184,6 +188,28 @@ def test_another_version_of_the_suite_is_another_run(
     version[WORLD] = "2"
     with pytest.raises(RunFolderError, match="simulator_version is '1' there, '2' here"):
         run(tmp_path / "run", **ONE)
+
+
+def test_another_encoder_behind_the_same_name_is_another_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = factories.copy_of_split(tmp_path / "split")
+
+    def again() -> dict[str, Any]:
+        build_index(datasets_in(split), Thumbnail(), BuildProgress(quiet=True))
+        out = tmp_path / "run"
+        run_evaluation(
+            CHEAT, split, out, simulator=WORLD, system="mine", retrieval="thumbnail", **ONE
+        )
+        return header(out)["identity"]["retrieval_index"]
+
+    told = again()
+    assert told.pop("fingerprint") and -1 < told.pop("threshold") < 1
+    assert told == {"encoder": "thumbnail", "camera": "front", "method": "max", "cut": "adaptive"}
+    other = Thumbnail().fingerprint | {"version": 99}
+    monkeypatch.setattr(Thumbnail, "fingerprint", property(lambda _: other))
+    with pytest.raises(RunFolderError, match=r"retrieval_index.fingerprint is '\w+' there, '\w+'"):
+        again()
 
 
 # --- a folder that has lost a file ---------------------------------------------------------------

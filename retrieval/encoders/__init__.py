@@ -1,9 +1,9 @@
 """Image encoders by name."""
 
+from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.encoders.base import Encoder
 from robomme_interference_data.retrieval.encoders.names import (
-    DEFAULT_MODEL,
     KINDS,
     encoder_name,
     published_threshold,
@@ -35,4 +35,4 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
         return Thumbnail()
     from robomme_interference_data.retrieval.encoders.siglip import Siglip
 
-    return Siglip(model or DEFAULT_MODEL, device=device, batch=batch)
+    return Siglip(model or PAPER_ENCODER, device=device, batch=batch)

@@ -1,13 +1,12 @@
 """Names of encoders, and what is known of them without their weights."""
 
+from robomme_interference_data.constants import PAPER_ENCODER
+from robomme_interference_data.embeddings import encoder_id
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 
-__all__ = ["DEFAULT_MODEL", "KINDS", "encoder_name", "published_threshold"]
+__all__ = ["KINDS", "encoder_name", "published_threshold"]
 
 KINDS = ("siglip", "thumbnail")
-
-DEFAULT_MODEL = "google/siglip-so400m-patch14-384"
-"""The paper's model."""
 
 _PUBLISHED = {"siglip": 0.923}
 """Encoder to the paper's cut (section "Adding Retrieval"), which was made for it alone."""
@@ -35,9 +34,12 @@ def encoder_name(name: str) -> str:
             f"encoder {name!r} names no model",
             "Type siglip for the paper's model, or siglip:ID with an id or a folder.",
         )
-    return "siglip" if model == DEFAULT_MODEL else name
+    return "siglip" if model == PAPER_ENCODER else name
 
 
 def published_threshold(name: str) -> float | None:
-    """Return the cut that was published for an encoder, or None."""
-    return _PUBLISHED.get(encoder_name(name))
+    """Return the cut that was published for an encoder, at whatever revision, or None.
+
+    A folder is not known to hold the published weights, whatever its name: None.
+    """
+    return _PUBLISHED.get(encoder_id(encoder_name(name)))

@@ -13,17 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
     MissingExtraError,
     MissingWeightsError,
 )
-from robomme_interference_data.retrieval.encoders.names import DEFAULT_MODEL, encoder_name
+from robomme_interference_data.retrieval.encoders.names import encoder_name
 
 __all__ = ["Siglip"]
 
 _FILES = ("*.json", "*.safetensors")
+
+_VERSION = 1
+"""Of what is done here: which output is taken, and how images reach the processor."""
+
+_NOT_COMPUTING = ("_name_or_path", "architectures", "dtype", "transformers_version")
+"""Settings of a vision tower that say where it came from, not what it computes."""
 
 
 class Siglip:
@@ -37,16 +44,17 @@ class Siglip:
     Raises:
         MissingExtraError: torch, transformers or Pillow is not installed.
         MissingWeightsError: The model is not on this machine.
-        FormatError: It is no SigLIP model.
+        FormatError: It is no SigLIP model, or not a whole one.
         InvalidOptionError: There is no such device.
     """
 
     centred = False
 
     def __init__(
-        self, model: str = DEFAULT_MODEL, *, device: str | None = None, batch: int | None = None
+        self, model: str = PAPER_ENCODER, *, device: str | None = None, batch: int | None = None
     ):
         torch, transformers = _libraries()
+        self._transformers_version = str(transformers.__version__)
         self.name = encoder_name(f"siglip:{model}")
         self._torch = torch
         folder, self._revision = _locate(model)
@@ -69,13 +77,17 @@ class Siglip:
     @property
     def fingerprint(self) -> dict[str, Any]:
         """What determines the features, up to the precision in which they are computed."""
+        tower = json.loads(self._vision.config.to_json_string())
         settings = json.loads(self._processor.to_json_string())
         return {
             "name": "siglip",
+            "version": _VERSION,
+            "transformers": self._transformers_version,
             "model": self._model,
             "revision": self._revision,
             "weights_sha256": self._weights_sha256,
-            "preprocessing": settings,
+            "tower": {key: tower[key] for key in tower if key not in _NOT_COMPUTING},
+            "preprocessing": {"class": type(self._processor).__name__, **settings},
         }
 
     @property
@@ -159,6 +171,8 @@ def _locate(model: str) -> tuple[Path, str | None]:
 
 def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
     """Return the vision tower, in float32 and for inference, and its image processor."""
+    from safetensors import SafetensorError
+
     try:
         kind = transformers.AutoConfig.from_pretrained(folder).model_type
         classes = {
@@ -170,16 +184,25 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
         if kind not in classes:
             raise FormatError(
                 f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
-                f"For example: --encoder siglip:{DEFAULT_MODEL}",
+                f"For example: --encoder siglip:{PAPER_ENCODER}",
             )
-        vision = classes[kind].from_pretrained(folder, dtype="float32", local_files_only=True)
+        vision, loading = classes[kind].from_pretrained(
+            folder, dtype="float32", local_files_only=True, output_loading_info=True
+        )
+        # transformers would make up what the file lacks, at random.
+        if missing := sorted(loading["missing_keys"]):
+            raise FormatError(
+                f"{folder} lacks {len(missing)} of the {len(vision.state_dict())} tensors of the "
+                f"vision tower of {model}, such as {missing[0]}",
+                "The folder is not a whole model: download or save it again.",
+            )
         # Pillow resizes the same everywhere; the other backend only where torchvision is.
         processor = transformers.AutoImageProcessor.from_pretrained(
             folder, backend="pil", local_files_only=True
         )
-    except (OSError, ValueError) as error:
-        if isinstance(error, FormatError):
-            raise
+    except FormatError:
+        raise
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         reason = str(error).partition("\n")[0]
         raise FormatError(
             f"{model} cannot be loaded from {folder}: {reason}",

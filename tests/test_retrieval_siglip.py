@@ -1,0 +1,180 @@
+"""SigLIP through transformers: small models of random weights, saved and loaded by path."""
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import factories
+import numpy as np
+import pytest
+
+from robomme_interference_data import Dataset, load_buffer
+from robomme_interference_data.embeddings import normalised
+from robomme_interference_data.errors import FormatError, MissingWeightsError
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.progress import BuildProgress
+from robomme_interference_data.retrieval.commands import datasets_in
+from robomme_interference_data.retrieval.encoders import make_encoder
+from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.retrieval.selector import Selector, select
+
+QUIET = BuildProgress(quiet=True)
+EPISODE = "VideoRepick/test/0"
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    return factories.copy_of_split(tmp_path / "split")
+
+
+@cache
+def siglip(folder: Path) -> str:
+    """Save a small SigLIP of random weights; returns the encoder's name."""
+    torch = pytest.importorskip("torch")
+    transformers = pytest.importorskip("transformers")
+    tower = {"hidden_size": 32, "intermediate_size": 64, "num_attention_heads": 2}
+    config = transformers.SiglipConfig(
+        vision_config=tower | {"num_hidden_layers": 2, "image_size": 32, "patch_size": 8},
+        text_config=tower | {"num_hidden_layers": 1, "vocab_size": 64, "projection_size": 32},
+    )
+    torch.manual_seed(0)
+    transformers.SiglipModel(config).save_pretrained(folder)
+    settings = {"image_processor_type": "SiglipImageProcessor", "size": {"height": 32, "width": 32}}
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    return f"siglip:{folder}"
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return siglip(tmp_path_factory.mktemp("models") / "tiny")
+
+
+def test_siglip_is_transformers_own_pipeline(model: str) -> None:
+    import torch
+    from transformers import AutoImageProcessor, SiglipModel
+
+    folder = model.partition(":")[2]
+    images = np.random.default_rng(0).integers(0, 256, (9, 48, 64, 3), np.uint8)
+    encoder = make_encoder(model, device="cpu")
+    found = encoder.features(encoder.prepare(images))
+    whole = SiglipModel.from_pretrained(folder).eval()
+    processor = AutoImageProcessor.from_pretrained(folder, backend="pil")
+    with torch.no_grad():
+        inputs = processor(images=list(images), return_tensors="pt")
+        expected = whole.get_image_features(**inputs).pooler_output.numpy()
+    assert found.shape == (9, 32) and found.dtype == np.float32
+    assert found == pytest.approx(expected, abs=1e-5)
+    # Alone or together, within a unit of float16 (2⁻¹¹ below 1).
+    alone = np.concatenate([encoder.features(encoder.prepare(image[None])) for image in images])
+    apart = normalised(found).astype(np.float32) - normalised(alone)
+    assert np.abs(apart).max() <= 2**-11
+    assert encoder.computed_in == "cpu, float32"
+    assert encoder.fingerprint == make_encoder(model, device="cpu").fingerprint
+    assert encoder.fingerprint["preprocessing"]["size"] == {"height": 32, "width": 32}
+
+
+def test_siglip_makes_an_index(split: Path, model: str) -> None:
+    build_index(datasets_in(split), make_encoder(model, device="cpu"), QUIET)
+    index = Dataset(LocalFiles(split / "demonstrations")).index(model)
+    assert index.embeddings.shape == (232, 32) and index.centre is None
+    lengths = np.linalg.norm(index.embeddings.astype(np.float32), axis=1)
+    assert lengths == pytest.approx(np.ones(232), abs=2e-3)
+    buffer = load_buffer(EPISODE, 0, split)
+    selector = Selector(model, device="cpu")
+    assert selector.name == "siglip-tiny/max/adaptive"
+    live = selector.select(buffer, buffer.query_frame()).choice.query_cosines
+    stored = select(buffer, model, selector.rule).choice.query_cosines
+    assert live == pytest.approx(stored, abs=2e-3)
+
+
+def test_other_weights_are_another_encoder(model: str, tmp_path: Path) -> None:
+    import torch
+    from transformers import SiglipVisionModel
+
+    folder = Path(model.partition(":")[2])
+    changed = shutil.copytree(folder, tmp_path / "tiny")
+    vision = SiglipVisionModel.from_pretrained(changed)
+    with torch.no_grad():
+        next(vision.parameters()).add_(0.01)
+    vision.save_pretrained(changed)
+    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
+    assert one.fingerprint["weights_sha256"] != other.fingerprint["weights_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("num_attention_heads", 4), ("hidden_act", "relu"), ("layer_norm_eps", 0.5)],
+)
+def test_other_settings_are_another_encoder(
+    setting: str, value: object, model: str, tmp_path: Path
+) -> None:
+    folder = Path(model.partition(":")[2])
+    changed = shutil.copytree(folder, tmp_path / "tiny")
+    config = json.loads((changed / "config.json").read_text())
+    config["vision_config"][setting] = value
+    (changed / "config.json").write_text(json.dumps(config))
+    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
+    differing = {key for key in one.fingerprint if one.fingerprint[key] != other.fingerprint[key]}
+    assert differing == {"tower"} and other.fingerprint["tower"][setting] == value
+    # They are told apart because they see differently.
+    image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
+    rows = [encoder.features(encoder.prepare(image)) for encoder in (one, other)]
+    assert not np.array_equal(*rows)
+
+
+def test_the_fingerprint_names_the_code(model: str) -> None:
+    import transformers
+
+    found = make_encoder(model, device="cpu").fingerprint
+    assert found["transformers"] == transformers.__version__
+    assert found["preprocessing"]["class"] == "SiglipImageProcessorPil"
+
+
+def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    folder = shutil.copytree(model.partition(":")[2], tmp_path / "part")
+    path = folder / "model.safetensors"
+    tensors = load_file(path)
+    # Of the second layer: two norms, four projections and two of the MLP, weight and bias each.
+    part = {
+        name: value for name, value in tensors.items() if "vision_model.encoder.layers.1" in name
+    }
+    assert len(part) == 16
+    kept = {name: value for name, value in tensors.items() if name not in part}
+    save_file(kept, path, metadata={"format": "pt"})
+    with pytest.raises(FormatError, match=r"lacks 16 of the .* such as .*layers\.1") as caught:
+        make_encoder(f"siglip:{folder}", device="cpu")
+    assert "download or save it again" in str(caught.value.hint)
+    text = {name: value for name, value in tensors.items() if name.startswith("text")}
+    save_file(text, path, metadata={"format": "pt"})
+    with pytest.raises(FormatError, match="lacks"):
+        make_encoder(f"siglip:{folder}", device="cpu")
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(FormatError, match="cannot be loaded"):
+        make_encoder(f"siglip:{folder}", device="cpu")
+
+
+def test_weights_of_another_shape_are_refused(model: str, tmp_path: Path) -> None:
+    folder = shutil.copytree(model.partition(":")[2], tmp_path / "other")
+    config = json.loads((folder / "config.json").read_text())
+    config["vision_config"]["intermediate_size"] = 48
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(FormatError, match="cannot be loaded"):
+        make_encoder(f"siglip:{folder}", device="cpu")
+
+
+def test_weights_that_are_not_there(tmp_path: Path) -> None:
+    pytest.importorskip("transformers")
+    with pytest.raises(MissingWeightsError) as caught:
+        make_encoder("siglip")
+    assert "google/siglip-so400m-patch14-384" in caught.value.message
+    assert "huggingface" in caught.value.message
+    assert caught.value.hint is not None
+    assert "hf download google/siglip-so400m-patch14-384" in caught.value.hint
+    with pytest.raises(FormatError, match="cannot be loaded"):
+        make_encoder(f"siglip:{tmp_path}")
+    (tmp_path / "config.json").write_text('{"model_type": "bert"}')
+    with pytest.raises(FormatError, match="type 'bert'"):
+        make_encoder(f"siglip:{tmp_path}")
