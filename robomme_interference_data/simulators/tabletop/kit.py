@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.tabletop.motion import Point
 
-__all__ = ["COLOURS", "CUBE", "Body", "Colour", "Kit", "Place"]
+__all__ = ["COLOURS", "CUBE", "SIDE", "Body", "Colour", "Kit", "Place"]
 
 Colour = tuple[float, float, float]
 
@@ -30,6 +30,9 @@ COLOURS: dict[str, Colour] = {
 
 CUBE = 0.04
 """Edge of a cube."""
+
+SIDE = 0.036
+"""Half the width of a container."""
 
 _LOW = -0.5  # z where things wait that are not to be seen, inside the table's block
 
@@ -71,6 +74,16 @@ class Body:
     def point(self, x: float, y: float, z: float) -> NDArray[np.float64]:
         """Where a point of the body, given in its own axes, is on the table: `(3,) float64`."""
         return np.asarray((self._entity.pose * sapien.Pose([x, y, z])).p, dtype=np.float64)
+
+    @property
+    def touched(self) -> bool:
+        """Whether a part of the arm presses on the body."""
+        arm = sapien.physx.PhysxArticulationLinkComponent
+        for contact in self._entity.scene.physx_system.get_contacts():
+            if self._rigid in contact.bodies and any(isinstance(b, arm) for b in contact.bodies):
+                if any(np.any(point.impulse) for point in contact.points):
+                    return True
+        return False
 
     def put(self, place: Place) -> None:
         """Set the body somewhere, at rest."""
@@ -149,7 +162,7 @@ class Kit:
 
     def container(self, xy: Point, colour: Colour) -> Body:
         """An opaque box without bottom, 7 cm wide and high, with a knob to grasp it by."""
-        outer, wall, height = 0.036, 0.003, 0.065
+        outer, wall, height = SIDE, 0.003, 0.065
         dark = (colour[0] * 0.45, colour[1] * 0.45, colour[2] * 0.45)
         side, mid = outer - wall, height / 2
         boxes = [

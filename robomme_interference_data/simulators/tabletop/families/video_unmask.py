@@ -1,20 +1,21 @@
 """VideoUnmask: remember which container hides a cube."""
 
 from collections.abc import Sequence
-from itertools import permutations
+from itertools import permutations, product
 
 from numpy.random import RandomState
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
-from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit, Place
+from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import along, row
 
 __all__ = ["VideoUnmask"]
 
 HIGH = 0.60  # m, above what the cameras see
-LIFTED = 0.05  # m
+LIFTED = 0.05  # m, of the right container
+PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
 
 
 class VideoUnmask(Family):
@@ -75,11 +76,15 @@ class VideoUnmask(Family):
             yield from arm.move((knob[0], knob[1], 0.25))
 
     def judge(self, arm: Arm, answer: Sequence[int]) -> Status:
+        done = answer[: self.found]
         for number, shell in enumerate(self.shells):
-            if shell.p[2] > LIFTED and number not in answer[: self.found]:
-                if number != answer[self.found]:
-                    return Status.FAIL
-                self.found += 1
-                if self.found == len(answer):
-                    return Status.SUCCESS
-        return Status.ONGOING
+            if number not in (*done, answer[self.found]) and rim(shell) > PEEKED:
+                return Status.FAIL
+        if self.shells[answer[self.found]].p[2] > LIFTED:
+            self.found += 1
+        return Status.SUCCESS if self.found == len(answer) else Status.ONGOING
+
+
+def rim(shell: Body) -> float:
+    """Height of the highest corner of a container's open side, in m: a tipped one counts too."""
+    return max(float(shell.point(x, y, 0)[2]) for x, y in product((-SIDE, SIDE), repeat=2))
