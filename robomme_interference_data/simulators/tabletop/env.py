@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FAMILIES, FPS
 from robomme_interference_data.errors import UnknownNameError, nearest
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation, Status
-from robomme_interference_data.simulators.tabletop.episodes import DIFFICULTIES, difficulty_of
+from robomme_interference_data.simulators.tabletop.episodes import (
+    DIFFICULTIES,
+    difficulty_of,
+    guess_of,
+    turn_of,
+)
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
@@ -30,10 +35,6 @@ __all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 FRONT_EYE = (0.54, 0.0, 0.60)  # m
 FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
 FRONT_VIEW = math.radians(43)
-
-# The answer and the guess have random streams of their own: a scene is the same whatever they are.
-_ANSWER_STREAM = 1_000_003
-_GUESS_STREAM = 2_000_003
 
 
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
@@ -124,9 +125,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             )
         self.episode: Family = family_class(self.family)(difficulty, RandomState(number))
         answers = self.episode.answers
-        drawn = RandomState(number + _ANSWER_STREAM).randint(len(answers))
-        self._answer = answers[options.get("answer", drawn)]
-        self._guess = answers[RandomState(number + _GUESS_STREAM).randint(len(answers))]
+        self._answer = answers[options.get("answer", turn_of(number, len(answers)))]
+        self._guess = answers[guess_of(number, len(answers))]
         observed, info = super().reset(seed=number, options=options)
         if self._demonstrating:
             info["demonstration"] = self._demonstrate()
