@@ -9,7 +9,7 @@ from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import along, row
+from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
 
 __all__ = ["VideoUnmask"]
 
@@ -35,6 +35,7 @@ class VideoUnmask(Family):
         self.asked = colours[: 2 if self.level == 2 else 1]
         self.colours = colours
         self.spots = row(rng, count, -0.04, 0.105, zigzag=0.02)
+        self.order = shuffled(rng, count)
         self.answers = list(permutations(range(count), len(self.asked)))
         self.found = 0
 
@@ -49,9 +50,13 @@ class VideoUnmask(Family):
             text += f", put it down, then pick up the container that hides the {colour} cube"
         return (text,)
 
+    def covered(self, answer: Sequence[int]) -> list[int]:
+        """The containers that hide a cube, in the order of `colours`: those asked for, others."""
+        rest = [number for number in self.order if number not in answer]
+        return [*answer, *rest][: len(self.colours)]
+
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
-        empty = [number for number in range(len(self.shells)) if number not in answer]
-        self.under = dict(zip((*answer, *empty), self.cubes, strict=False))
+        self.under = dict(zip(self.covered(answer), self.cubes, strict=True))
         for number, cube in self.under.items():
             cube.home = Place((*self.spots[number], CUBE / 2))
             cube.restore()
