@@ -84,7 +84,7 @@ def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(
     def lift_slowly() -> Script:
         knob = scene.shells[wrong].point(0, 0, scene.shells[wrong].size)
         yield from env.arm.pick(knob, lift=0.0)
-        yield from env.arm.move(knob + (0, 0, 0.05), speed=0.03)
+        yield from env.arm.move(knob + np.array([0, 0, 0.05]), speed=0.03)
 
     assert play(env, lift_slowly(), look) is Status.FAIL
     assert len(heights) > 2
@@ -122,7 +122,7 @@ def push_with_open_fingers(arm: Arm, scene: MoveCube) -> Script:
 def drag_slowly(arm: Arm, scene: MoveCube) -> Script:
     """Grasp the cube and drag it, less than 1 mm in a step."""
     yield from arm.pick(scene.cube.p, scene.turn, lift=0.0)
-    yield from arm.move(scene.target.p + (0, 0, CUBE / 2), speed=0.016)
+    yield from arm.move(scene.target.p + np.array([0, 0, CUBE / 2]), speed=0.016)
 
 
 def test_a_push_may_be_as_slow_as_it_likes(env: TabletopEnv) -> None:
@@ -154,6 +154,6 @@ def test_a_cube_may_be_let_go_above_the_target_or_grasped_off_its_middle(env: Ta
 
     def place() -> Script:
         yield from env.arm.pick(scene.cube.p + aside, scene.turn)
-        yield from env.arm.put(scene.target.p + (0, 0, CUBE / 2 + 0.012))
+        yield from env.arm.put(scene.target.p + np.array([0, 0, CUBE / 2 + 0.012]))
 
     assert play(env, place()) is Status.SUCCESS

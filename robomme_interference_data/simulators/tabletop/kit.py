@@ -80,8 +80,10 @@ class Body:
         """Whether a part of the arm presses on the body."""
         arm = sapien.physx.PhysxArticulationLinkComponent
         for contact in self._entity.scene.physx_system.get_contacts():
-            if self._rigid in contact.bodies and any(isinstance(b, arm) for b in contact.bodies):
-                if any(np.any(point.impulse) for point in contact.points):
+            bodies = contact.bodies
+            if self._rigid in bodies and any(isinstance(body, arm) for body in bodies):
+                pressed = any(np.any(point.impulse) for point in contact.points)
+                if pressed:
                     return True
         return False
 
@@ -221,7 +223,7 @@ class Kit:
         return self._finish(builder, Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand")
 
     def post(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
-        """An upright post that does not give way."""
+        """An upright post to look at: it stops nothing, so its family judges who runs into it."""
         builder = self._builder()
         self._disc(builder, radius, height, colour)
         return self._finish(builder, Place((xy[0], xy[1], 0)), "post", radius, "by hand")

@@ -10,7 +10,7 @@ from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import is_near
+from robomme_interference_data.simulators.tabletop.stage import is_near, off_line
 
 __all__ = ["MoveCube"]
 
@@ -102,8 +102,8 @@ class MoveCube(Family):
         """How the cube is being moved now: as an answer says, or "open", by open fingers."""
         ends = ((0.0, 0.0), (HANDLE, 0.0), (HANDLE, CROSS))
         end, corner, tip = (self.hook.point(x, y, 0) for x, y in ends)
-        beside = min(_distance(self.cube.p, end, corner), _distance(self.cube.p, corner, tip))
-        if beside < 0.045 and _distance(arm.tip, end, corner) < 0.03:
+        beside = min(off_line(self.cube.p, end, corner), off_line(self.cube.p, corner, tip))
+        if beside < 0.045 and off_line(arm.tip, end, corner) < 0.03:
             return "hook"
         if math.dist(self.cube.p, arm.tip) < 0.01 and (
             abs(arm.opening - CUBE / 2) < 0.003 or arm.opening < self.opening - 0.001
@@ -112,10 +112,3 @@ class MoveCube(Family):
         if self.manner == "grasp" and not self.cube.touched:
             return "grasp"  # let go, it still falls
         return "push" if arm.opening < 0.01 else "open"
-
-
-def _distance(point: Vector, one: Vector, other: Vector) -> float:
-    """Distance of a point from the straight line between two points, in m."""
-    way = other - one
-    part = float(np.clip((point - one) @ way / (way @ way), 0, 1))
-    return float(np.linalg.norm(point - one - part * way))
