@@ -32,9 +32,10 @@ from robomme_interference_data.simulators.tabletop.shading import SHADER
 
 __all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 
-FRONT_EYE = (0.54, 0.0, 0.60)  # m
-FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
-FRONT_VIEW = math.radians(43)
+# The table up to x = 0.14 m, and at its home pose the whole arm but for the top of its shoulder.
+FRONT_EYE = (0.80, 0.0, 0.64)  # m
+FRONT_TARGET = (-0.30, 0.0, 0.21)  # m
+FRONT_VIEW = math.radians(46)
 
 
 class TabletopEnv(BaseEnv):  # type: ignore[misc]

@@ -124,7 +124,7 @@ class Kit:
     # --- the room ----------------------------------------------------------------------------
 
     def room(self, table: Colour, floor: Colour) -> None:
-        """A table with the arm on it, and a floor behind it and before it."""
+        """A table with the arm on it, a floor behind it and before it, and a wall at the back."""
         self._body(
             [((0, 0, -0.45), (0.55, 0.75, 0.45), table)],
             Place((-0.25, 0, 0)),
@@ -133,7 +133,11 @@ class Kit:
         )
         # No floor under the table: hidden pixels would cost as much as those that are seen.
         self._body(
-            [((-4.8, 0, -0.05), (4, 8, 0.05), floor), ((4.3, 0, -0.05), (4, 8, 0.05), floor)],
+            [
+                ((-4.8, 0, -0.05), (4, 8, 0.05), floor),
+                ((4.3, 0, -0.05), (4, 8, 0.05), floor),
+                ((-5, 0, 3), (0.05, 8, 3), (floor[0] * 0.8, floor[1] * 0.8, floor[2] * 0.8)),
+            ],
             Place((0, 0, -0.9)),
             "floor",
             moves="never",

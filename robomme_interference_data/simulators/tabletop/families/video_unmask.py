@@ -13,7 +13,7 @@ from robomme_interference_data.simulators.tabletop.stage import along, row, shuf
 
 __all__ = ["VideoUnmask"]
 
-HIGH = 0.60  # m, above what the cameras see
+HIGH = 0.72  # m, above what the cameras see
 LIFTED = 0.05  # m, of the right container
 PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
 
@@ -70,7 +70,7 @@ class VideoUnmask(Family):
             for shell, place in zip(self.shells, places, strict=True):
                 shell.put(place)
             yield
-        yield from arm.wait(45)
+        yield from arm.wait(50)
 
     def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
         for number in answer:
