@@ -29,8 +29,9 @@ class MoveCube(Family):
 
     def draw(self, rng: RandomState) -> None:
         wide = self.spread[self.level]
-        self.cube_at = np.array([0.045, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
-        self.target_at = np.array([-0.11, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
+        # The way leads across the front camera's view, so that no hand hides the cube on it.
+        self.cube_at = np.array([-0.05, 0.10]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
+        self.target_at = np.array([-0.05, -0.055]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
         way = self.target_at - self.cube_at
         self.way = np.append(way / np.linalg.norm(way), 0.0)
         self.turn = math.atan2(-way[1], -way[0])  # of a gripper whose x points back along the way
@@ -41,14 +42,14 @@ class MoveCube(Family):
     def build(self, kit: Kit) -> None:
         self.cube = kit.cube(self.cube_at, "orange", self.turn)
         self.target = kit.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
-        self.hook = kit.hook((-0.20, -0.20), (0.25, 0.55, 0.50), HANDLE, CROSS)
+        self.hook = kit.hook((-0.20, -0.23), (0.25, 0.55, 0.50), HANDLE, CROSS)
         self.last = self.cube.p
 
     def goals(self) -> tuple[str, ...]:
         return ("move the cube to the target in the same manner as in the video",)
 
     def demonstrate(self, arm: Arm, answer: str) -> Script:
-        yield from arm.wait(10)
+        yield from arm.wait(20)
         yield from self.solve(arm, answer)
         if answer == "hook":
             yield from arm.grip(close=False)  # leaves it on the table
