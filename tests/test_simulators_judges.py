@@ -157,3 +157,51 @@ def test_a_cube_may_be_let_go_above_the_target_or_grasped_off_its_middle(env: Ta
         yield from env.arm.put(scene.target.p + np.array([0, 0, CUBE / 2 + 0.012]))
 
     assert play(env, place()) is Status.SUCCESS
+
+
+# --- the stick: it touches what it comes down to, and is in a post where it seems to be ------------
+
+
+def start_with_stick(env: TabletopEnv, family: str) -> Any:
+    start(env, f"{family}/test/0", 0)
+    return env.episode
+
+
+@pytest.mark.parametrize(("height", "touches"), [(0.030, False), (0.015, False), (0.013, True)])
+def test_a_button_is_touched_within_4_mm_of_its_top(
+    env: TabletopEnv, height: float, touches: bool
+) -> None:
+    """Its top is at 0.010 m; a wrong button, so that touching it fails."""
+    scene = start_with_stick(env, "PatternLock")
+    spot = scene.spots[env._answer[1]]
+    script = env.arm.move((*spot, height))
+    status = play(env, script)
+    assert status is (Status.FAIL if touches else Status.ONGOING)
+    assert env.arm.tip[2] > height - 0.001
+
+
+def test_the_oracle_brings_the_stick_down_to_what_it_touches(env: TabletopEnv) -> None:
+    """1 mm above buttons of 10 mm and targets of 3 mm."""
+    for family, height in (("PatternLock", 0.010), ("RouteStick", 0.003)):
+        scene = start_with_stick(env, family)
+        lowest = [1.0]
+
+        def note(lowest: list[float] = lowest) -> None:
+            lowest.append(float(env.arm.tip[2]))
+
+        assert play(env, scene.solve(env.arm, env._answer), note) is Status.SUCCESS
+        assert min(lowest) == pytest.approx(height + 0.001, abs=0.0006)
+
+
+@pytest.mark.parametrize(("aside", "status"), [(0.0, "fail"), (0.012, "fail"), (0.03, "ongoing")])
+def test_a_stick_put_down_into_a_post_fails(env: TabletopEnv, aside: float, status: str) -> None:
+    """A post's radius is 10 mm, the stick's 6 mm; so too before the first target is reached."""
+    scene = start_with_stick(env, "RouteStick")
+    x, y = scene.posts[1]
+
+    def come_down() -> Script:
+        yield from env.arm.move((x + aside, y, 0.13))
+        yield from env.arm.move((x + aside, y, 0.02))
+        yield from env.arm.wait(3)
+
+    assert play(env, come_down()) == status
