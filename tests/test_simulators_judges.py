@@ -159,7 +159,7 @@ def test_a_cube_may_be_let_go_above_the_target_or_grasped_off_its_middle(env: Ta
     assert play(env, place()) is Status.SUCCESS
 
 
-# --- the stick: it touches what it comes down to, and is in a post where it seems to be ------------
+# --- the stick: it touches what it comes down to, and fails in a post -----------------------------
 
 
 def start_with_stick(env: TabletopEnv, family: str) -> Any:

@@ -368,7 +368,7 @@ def test_without_a_vulkan_device_there_is_one_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "shortest", ["VideoUnmask/train/25", "MoveCube/train/13", "PatternLock/train/60"]
+    "shortest", ["VideoUnmask/train/58", "MoveCube/train/68", "PatternLock/train/0"]
 )
 def test_the_shortest_episodes_are_long_enough_for_a_distractor_unit(
     blind: TabletopSimulator, shortest: str

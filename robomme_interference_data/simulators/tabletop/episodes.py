@@ -25,8 +25,6 @@ _FAMILY_SPAN = 3000
 _SPLIT_SPAN = 900  # a multiple of 3, see difficulty_of
 _SPLIT_START = {"train": 0, "val": _SPLIT_SPAN, "test": 2 * _SPLIT_SPAN}
 
-_GUESS_STREAM = 2_000_003
-
 
 def seed_of(episode: EpisodeId) -> int:
     """Return the seed of an episode; no two episodes share one.
@@ -54,19 +52,24 @@ def turn_of(seed: int, count: int) -> int:
     In each group of episodes of a family, split and difficulty each answer occurs equally often,
     to within one. It does so once in every `count` episodes of the group, in a new order.
     """
-    family, number = divmod(seed, _FAMILY_SPAN)
-    split, number = divmod(number, _SPLIT_SPAN)
-    number, difficulty = divmod(number, len(DIFFICULTIES))
-    block, place = divmod(number, count)
-    return int(RandomState([family, split, difficulty, block]).permutation(count)[place])
+    return _turn(seed, count, 0)
 
 
 def guess_of(seed: int, count: int) -> int:
     """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
 
-    Its random stream is its own, apart from those of the scene and of the answer.
+    Guesses take turns as answers do, in orders of their own.
     """
-    return int(RandomState([seed, _GUESS_STREAM]).randint(count))
+    return _turn(seed, count, 1)
+
+
+def _turn(seed: int, count: int, stream: int) -> int:
+    family, number = divmod(seed, _FAMILY_SPAN)
+    split, number = divmod(number, _SPLIT_SPAN)
+    number, difficulty = divmod(number, len(DIFFICULTIES))
+    block, place = divmod(number, count)
+    order = RandomState([family, split, difficulty, block, stream]).permutation(count)
+    return int(order[place])
 
 
 def difficulty_of(seed: int) -> str:

@@ -133,7 +133,7 @@ def touched(arm: Arm, spots: Sequence[Spot], radius: float, height: float) -> in
 def off_line(point: Vector, one: Vector, other: Vector) -> float:
     """Distance of a point from the straight line between two points, in m."""
     way = other - one
-    part = float(np.clip((point - one) @ way / max(way @ way, 1e-12), 0, 1))
+    part = float(np.clip((point - one) @ way / max(float(way @ way), 1e-12), 0, 1))
     return float(np.linalg.norm(point - one - part * way))
 
 
