@@ -10,7 +10,7 @@ from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 
 __all__ = ["SUITE_VERSION", "register_environments"]
 
-SUITE_VERSION = 1
+SUITE_VERSION = 2
 """Version of the episodes; raised with every change to scenes, motions, goals or judgements.
 
 Datasets and runs of another version do not fit this one: see `docs/simulators.md`.

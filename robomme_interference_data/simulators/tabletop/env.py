@@ -22,7 +22,12 @@ from robomme_interference_data.errors import (
     nearest,
 )
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation, Status
-from robomme_interference_data.simulators.tabletop.episodes import DIFFICULTIES, difficulty_of
+from robomme_interference_data.simulators.tabletop.episodes import (
+    DIFFICULTIES,
+    difficulty_of,
+    guess_of,
+    turn_of,
+)
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
@@ -32,13 +37,10 @@ from robomme_interference_data.simulators.tabletop.shading import SHADER
 
 __all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 
-FRONT_EYE = (0.54, 0.0, 0.60)  # m
-FRONT_TARGET = (-0.18, 0.0, 0.11)  # m
-FRONT_VIEW = math.radians(43)
-
-# The answer and the guess have random streams of their own: a scene is the same whatever they are.
-_ANSWER_STREAM = 1_000_003
-_GUESS_STREAM = 2_000_003
+# The table up to x = 0.14 m, and at its home pose the whole arm but for the top of its shoulder.
+FRONT_EYE = (0.80, 0.0, 0.64)  # m
+FRONT_TARGET = (-0.30, 0.0, 0.21)  # m
+FRONT_VIEW = math.radians(46)
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "num_envs": (1,),
@@ -156,11 +158,10 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             )
         episode: Family = family_class(self.family)(difficulty, RandomState(number))
         answers = episode.answers
-        drawn = RandomState((number + _ANSWER_STREAM) % 2**32).randint(len(answers))
-        answer = _index(options.get("answer", drawn), -len(answers), len(answers), "answer")
+        turn = turn_of(number, len(answers))
+        answer = _index(options.get("answer", turn), -len(answers), len(answers), "answer")
         self.episode, self._answer = episode, answers[answer]
-        guessed = RandomState((number + _GUESS_STREAM) % 2**32).randint(len(answers))
-        self._guess = answers[guessed]
+        self._guess = answers[guess_of(number, len(answers))]
         observed, info = super().reset(seed=number, options=options)
         if self._demonstrating:
             info["demonstration"] = self._demonstrate()

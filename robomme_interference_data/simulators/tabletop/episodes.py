@@ -1,10 +1,20 @@
 """Which episodes the suite has, and the seed and difficulty of each: pure, without a simulator."""
 
+from numpy.random import RandomState
+
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import UnknownNameError, nearest
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["DIFFICULTIES", "EPISODES", "difficulty_of", "episode_ids", "seed_of"]
+__all__ = [
+    "DIFFICULTIES",
+    "EPISODES",
+    "difficulty_of",
+    "episode_ids",
+    "guess_of",
+    "seed_of",
+    "turn_of",
+]
 
 DIFFICULTIES = ("easy", "medium", "hard")
 
@@ -12,7 +22,8 @@ EPISODES = {"train": 100, "val": 50, "test": 50}
 """Episodes per family in each split."""
 
 _FAMILY_SPAN = 3000
-_SPLIT_START = {"train": 0, "val": 900, "test": 1800}  # multiples of 3, see difficulty_of
+_SPLIT_SPAN = 900  # a multiple of 3, see difficulty_of
+_SPLIT_START = {"train": 0, "val": _SPLIT_SPAN, "test": 2 * _SPLIT_SPAN}
 
 
 def seed_of(episode: EpisodeId) -> int:
@@ -33,6 +44,32 @@ def seed_of(episode: EpisodeId) -> int:
         )
     family = _FAMILY_SPAN * (1 + FAMILIES.index(episode.family))
     return family + _SPLIT_START[episode.split] + episode.index
+
+
+def turn_of(seed: int, count: int) -> int:
+    """Return which of `count` answers the episode of a seed has, from 0: they take turns.
+
+    In each group of episodes of a family, split and difficulty each answer occurs equally often,
+    to within one. It does so once in every `count` episodes of the group, in a new order.
+    """
+    return _turn(seed, count, 0)
+
+
+def guess_of(seed: int, count: int) -> int:
+    """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
+
+    Guesses take turns as answers do, in orders of their own.
+    """
+    return _turn(seed, count, 1)
+
+
+def _turn(seed: int, count: int, stream: int) -> int:
+    family, number = divmod(seed, _FAMILY_SPAN)
+    split, number = divmod(number, _SPLIT_SPAN)
+    number, difficulty = divmod(number, len(DIFFICULTIES))
+    block, place = divmod(number, count)
+    order = RandomState([family, split, difficulty, block, stream]).permutation(count)
+    return int(order[place])
 
 
 def difficulty_of(seed: int) -> str:

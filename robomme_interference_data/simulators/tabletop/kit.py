@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.tabletop.motion import Point
 
-__all__ = ["COLOURS", "CUBE", "Body", "Colour", "Kit", "Place"]
+__all__ = ["COLOURS", "CUBE", "SIDE", "Body", "Colour", "Kit", "Place"]
 
 Colour = tuple[float, float, float]
 
@@ -30,6 +30,9 @@ COLOURS: dict[str, Colour] = {
 
 CUBE = 0.04
 """Edge of a cube."""
+
+SIDE = 0.036
+"""Half the width of a container."""
 
 _LOW = -0.5  # z where things wait that are not to be seen, inside the table's block
 
@@ -72,6 +75,18 @@ class Body:
         """Where a point of the body, given in its own axes, is on the table: `(3,) float64`."""
         return np.asarray((self._entity.pose * sapien.Pose([x, y, z])).p, dtype=np.float64)
 
+    @property
+    def touched(self) -> bool:
+        """Whether a part of the arm presses on the body."""
+        arm = sapien.physx.PhysxArticulationLinkComponent
+        for contact in self._entity.scene.physx_system.get_contacts():
+            bodies = contact.bodies
+            if self._rigid in bodies and any(isinstance(body, arm) for body in bodies):
+                pressed = any(np.any(point.impulse) for point in contact.points)
+                if pressed:
+                    return True
+        return False
+
     def put(self, place: Place) -> None:
         """Set the body somewhere, at rest."""
         self._entity.set_pose(place.pose)
@@ -109,7 +124,7 @@ class Kit:
     # --- the room ----------------------------------------------------------------------------
 
     def room(self, table: Colour, floor: Colour) -> None:
-        """A table with the arm on it, and a floor behind it and before it."""
+        """A table with the arm on it, a floor behind it and before it, and a wall at the back."""
         self._body(
             [((0, 0, -0.45), (0.55, 0.75, 0.45), table)],
             Place((-0.25, 0, 0)),
@@ -118,7 +133,11 @@ class Kit:
         )
         # No floor under the table: hidden pixels would cost as much as those that are seen.
         self._body(
-            [((-4.8, 0, -0.05), (4, 8, 0.05), floor), ((4.3, 0, -0.05), (4, 8, 0.05), floor)],
+            [
+                ((-4.8, 0, -0.05), (4, 8, 0.05), floor),
+                ((4.3, 0, -0.05), (4, 8, 0.05), floor),
+                ((-5, 0, 3), (0.05, 8, 3), (floor[0] * 0.8, floor[1] * 0.8, floor[2] * 0.8)),
+            ],
             Place((0, 0, -0.9)),
             "floor",
             moves="never",
@@ -149,7 +168,7 @@ class Kit:
 
     def container(self, xy: Point, colour: Colour) -> Body:
         """An opaque box without bottom, 7 cm wide and high, with a knob to grasp it by."""
-        outer, wall, height = 0.036, 0.003, 0.065
+        outer, wall, height = SIDE, 0.003, 0.065
         dark = (colour[0] * 0.45, colour[1] * 0.45, colour[2] * 0.45)
         side, mid = outer - wall, height / 2
         boxes = [
@@ -208,7 +227,7 @@ class Kit:
         return self._finish(builder, Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand")
 
     def post(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
-        """An upright post that does not give way."""
+        """An upright post to look at: it stops nothing, so its family judges who runs into it."""
         builder = self._builder()
         self._disc(builder, radius, height, colour)
         return self._finish(builder, Place((xy[0], xy[1], 0)), "post", radius, "by hand")

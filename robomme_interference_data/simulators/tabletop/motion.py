@@ -18,7 +18,7 @@ from robomme_interference_data.errors import MotionError
 if TYPE_CHECKING:
     from robomme_interference_data.simulators.tabletop.kit import Body
 
-__all__ = ["BASE", "HOME", "REST_QPOS", "Arm", "Point", "Script"]
+__all__ = ["BASE", "HOME", "REST_QPOS", "ROD", "Arm", "Point", "Script"]
 
 Script = Iterator[None]
 
@@ -33,6 +33,9 @@ HOME = (-0.30, 0.0, 0.26)
 
 REST_QPOS = (0.0, math.pi / 8, 0.0, -math.pi * 5 / 8, 0.0, math.pi * 3 / 4, math.pi / 4)
 """Joint positions from which the search for the home pose starts, in rad."""
+
+ROD = 0.006
+"""Radius of the stick that the gripper holds in some families, in m."""
 
 SPEED = 0.25  # m/s, at the middle of a move
 SLOW = 0.12  # m/s, close to objects

@@ -17,6 +17,7 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import PandaWristCam
 from mani_skill.sensors.camera import CameraConfig
 
+from robomme_interference_data.simulators.tabletop.motion import ROD
 from robomme_interference_data.simulators.tabletop.shading import SHADER
 
 __all__ = ["PANDA", "draw_low_polygon"]
@@ -88,7 +89,7 @@ def draw_low_polygon(articulation: Any, stick: float) -> None:
         body.attach(shape)
         if stick and part == "hand":
             rod = sapien.render.RenderShapeCylinder(
-                0.006, (stick + 0.04) / 2, _material((0.30, 0.18, 0.08))
+                ROD, (stick + 0.04) / 2, _material((0.30, 0.18, 0.08))
             )
             middle = 0.1034 + stick - (stick + 0.04) / 2
             rod.set_local_pose(sapien.Pose([0, 0, middle], [math.sqrt(0.5), 0, math.sqrt(0.5), 0]))

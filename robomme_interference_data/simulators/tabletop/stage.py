@@ -2,16 +2,37 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.random import RandomState
+from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.tabletop.kit import Body, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 
-__all__ = ["along", "is_near", "push_down", "row", "shuffled", "swap", "touched"]
+__all__ = [
+    "ABOVE",
+    "along",
+    "exchanges",
+    "is_near",
+    "lanes",
+    "off_line",
+    "push_down",
+    "row",
+    "shuffled",
+    "swap",
+    "touched",
+]
 
 Spot = tuple[float, float]
+Vector = NDArray[np.float64]
+
+STEPS = 30  # time steps of an exchange
+ABOVE = 0.001
+"""How far above a thing the stick's tip stops that is to touch it, in m."""
+
+TOUCH = 0.004  # m above a thing, below which the stick's tip touches it
 
 
 def row(
@@ -31,37 +52,68 @@ def shuffled(rng: RandomState, count: int) -> list[int]:
     return [int(number) for number in rng.permutation(count)]
 
 
-def along(body: Body, to: Place, steps: int, bend: float = 0.0) -> list[Place]:
-    """The places of a body on its way somewhere: straight, or bent by `bend` m to its left."""
-    start, end = body.p, np.array(to.p)
-    way = end - start
-    left = np.array([-way[1], way[0], 0.0]) / max(float(np.linalg.norm(way[:2])), 1e-9)
+def exchanges(rng: RandomState, count: int) -> list[tuple[int, int]]:
+    """Pairs of numbers below `count` that change places one after the other: none returns.
+
+    Of three, one pair does and the third stays. Of four or more every one ends elsewhere: two
+    and two, and with an odd count three in a ring.
+    """
+    order = shuffled(rng, count)
+    pairs = list(zip(order[0:-1:2], order[1::2], strict=False))
+    if count % 2 and count > 3:
+        pairs.append((order[-3], order[-1]))
+    return pairs
+
+
+def along(body: Body, to: Place, steps: int) -> list[Place]:
+    """The places of a body on its straight way somewhere."""
+    start, way = body.p, np.array(to.p) - body.p
     places = []
     for step in range(1, steps + 1):
-        part = step / steps
-        part = part * part * (3 - 2 * part)
-        x, y, z = start + part * way + bend * math.sin(math.pi * part) * left
+        x, y, z = start + eased(step / steps) * way
         places.append(Place((float(x), float(y), float(z)), body.home.yaw))
     return places
 
 
-def swap(one: Sequence[Body], other: Sequence[Body], bend: float = 0.07, steps: int = 20) -> Script:
-    """Two groups of bodies change places on bent ways; each group stays as it is.
+def eased(part: float) -> float:
+    """A part of the time, 0 to 1, as a part of the way: slower at both ends."""
+    return part * part * (3 - 2 * part)
+
+
+def lanes(spots: Sequence[Spot], pair: tuple[int, int], gap: float) -> list[list[Spot]]:
+    """The ways of two of the things at `spots` that change places, a spot per time step.
+
+    They meet nobody: one goes along a lane `gap` m beyond all spots, the other along one as far
+    before them, and both come and go straight across.
+    """
+    (x0, y0), (x1, y1) = (spots[number] for number in pair)
+    far, near = max(x for x, _ in spots) + gap, min(x for x, _ in spots) - gap
+    ways = []
+    for corners in (
+        [(x0, y0), (far, y0), (far, y1), (x1, y1)],
+        [(x1, y1), (near, y1), (near, y0), (x0, y0)],
+    ):
+        done = np.cumsum([0.0, *(math.dist(a, b) for a, b in pairwise(corners))])
+        at = [eased(step / STEPS) * done[-1] for step in range(1, STEPS + 1)]
+        xs, ys = (np.interp(at, done, axis) for axis in np.transpose(corners))
+        ways.append([(float(x), float(y)) for x, y in zip(xs, ys, strict=True)])
+    return ways
+
+
+def swap(groups: Sequence[Sequence[Body]], pair: tuple[int, int], gap: float) -> Script:
+    """Two of several groups of bodies change places, see `lanes`; each stays as it is.
 
     The bodies must be held, and their homes are where they end up.
     """
-    ways = []
-    for group, goal in ((one, other), (other, one)):
-        x, y, _ = goal[0].p
-        for body in group:
-            ways.append((body, along(body, Place((x, y, body.p[2])), steps, bend)))
-    for step in range(steps):
-        for body, places in ways:
-            body.put(places[step])
+    spots = [(float(group[0].p[0]), float(group[0].p[1])) for group in groups]
+    for now in zip(*lanes(spots, pair, gap), strict=True):
+        for number, (x, y) in zip(pair, now, strict=True):
+            for body in groups[number]:
+                body.put(Place((x, y, float(body.p[2])), body.home.yaw))
         yield
-    for body, places in ways:
-        x, y, _ = places[-1].p
-        body.home = Place((x, y, body.home.p[2]), body.home.yaw)
+    for number, (x, y) in zip(pair, now, strict=True):
+        for body in groups[number]:
+            body.home = Place((x, y, body.home.p[2]), body.home.yaw)
 
 
 def is_near(body: Body, other: Body, distance: float) -> bool:
@@ -69,13 +121,20 @@ def is_near(body: Body, other: Body, distance: float) -> bool:
     return math.dist(body.p[:2], other.p[:2]) < distance
 
 
-def touched(arm: Arm, spots: Sequence[Spot], radius: float, low: float = 0.03) -> int | None:
-    """Return which of the flat things at `spots` the stick's tip is on, or None."""
+def touched(arm: Arm, spots: Sequence[Spot], radius: float, height: float) -> int | None:
+    """Return which of the flat things at `spots`, `height` m high, the stick's tip is on."""
     x, y, z = arm.tip
     for number, spot in enumerate(spots):
-        if z < low and math.dist((x, y), spot) < radius:
+        if z < height + TOUCH and math.dist((x, y), spot) < radius:
             return number
     return None
+
+
+def off_line(point: Vector, one: Vector, other: Vector) -> float:
+    """Distance of a point from the straight line between two points, in m."""
+    way = other - one
+    part = float(np.clip((point - one) @ way / max(float(way @ way), 1e-12), 0, 1))
+    return float(np.linalg.norm(point - one - part * way))
 
 
 def push_down(button: Body, arm: Arm) -> bool:

@@ -10,13 +10,14 @@ from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import is_near
+from robomme_interference_data.simulators.tabletop.stage import is_near, off_line
 
 __all__ = ["MoveCube"]
 
 Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
+STILL, SLACK = 1e-5, 0.002  # m: a cube at rest in a step; its way in wrong manners, in all
 BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
 
 
@@ -28,25 +29,27 @@ class MoveCube(Family):
 
     def draw(self, rng: RandomState) -> None:
         wide = self.spread[self.level]
-        self.cube_at = np.array([0.045, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
-        self.target_at = np.array([-0.11, 0.02]) + rng.uniform(-1, 1, 2) * (0.02, wide)
+        # The way leads across the front camera's view, so that no hand hides the cube on it.
+        self.cube_at = np.array([-0.05, 0.10]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
+        self.target_at = np.array([-0.05, -0.055]) + rng.uniform(-1, 1, 2) * (wide, 0.02)
         way = self.target_at - self.cube_at
         self.way = np.append(way / np.linalg.norm(way), 0.0)
         self.turn = math.atan2(-way[1], -way[0])  # of a gripper whose x points back along the way
         self.answers = ["push", "grasp", "hook"]
-        self.seen: set[str] = set()
+        self.moved: dict[str, float] = {}  # m, the cube's way in each manner
+        self.manner, self.opening = "", 0.04
 
     def build(self, kit: Kit) -> None:
         self.cube = kit.cube(self.cube_at, "orange", self.turn)
         self.target = kit.target(self.target_at, (0.20, 0.45, 0.75), 0.04)
-        self.hook = kit.hook((-0.20, -0.20), (0.25, 0.55, 0.50), HANDLE, CROSS)
+        self.hook = kit.hook((-0.20, -0.23), (0.25, 0.55, 0.50), HANDLE, CROSS)
         self.last = self.cube.p
 
     def goals(self) -> tuple[str, ...]:
         return ("move the cube to the target in the same manner as in the video",)
 
     def demonstrate(self, arm: Arm, answer: str) -> Script:
-        yield from arm.wait(10)
+        yield from arm.wait(20)
         yield from self.solve(arm, answer)
         if answer == "hook":
             yield from arm.grip(close=False)  # leaves it on the table
@@ -85,26 +88,28 @@ class MoveCube(Family):
 
     def judge(self, arm: Arm, answer: str) -> Status:
         now = self.cube.p
-        if np.linalg.norm(now - self.last) > 0.002:
-            self.seen.add(self.manner(arm))
-        self.last = now
-        if self.seen - {answer}:
+        step = float(np.linalg.norm(now - self.last))
+        if step > STILL:
+            self.manner = self.name_manner(arm)
+            self.moved[self.manner] = self.moved.get(self.manner, 0.0) + step
+        self.last, self.opening = now, arm.opening
+        if sum(way for manner, way in self.moved.items() if manner != answer) > SLACK:
             return Status.FAIL
         released = answer != "grasp" or (arm.opening > 0.025 and now[2] < CUBE)
         there = is_near(self.cube, self.target, 0.03)
-        return Status.SUCCESS if there and released and self.seen else Status.ONGOING
+        return Status.SUCCESS if there and released and answer in self.moved else Status.ONGOING
 
-    def manner(self, arm: Arm) -> str:
-        """How the cube is being moved now."""
+    def name_manner(self, arm: Arm) -> str:
+        """How the cube is being moved now: as an answer says, or "open", by open fingers."""
         ends = ((0.0, 0.0), (HANDLE, 0.0), (HANDLE, CROSS))
         end, corner, tip = (self.hook.point(x, y, 0) for x, y in ends)
-        if min(_distance(self.cube.p, end, corner), _distance(self.cube.p, corner, tip)) < 0.045:
+        beside = min(off_line(self.cube.p, end, corner), off_line(self.cube.p, corner, tip))
+        if beside < 0.045 and off_line(arm.tip, end, corner) < 0.03:
             return "hook"
-        return "grasp" if arm.opening > 0.01 else "push"
-
-
-def _distance(point: Vector, one: Vector, other: Vector) -> float:
-    """Distance of a point from the straight line between two points, in m."""
-    way = other - one
-    part = float(np.clip((point - one) @ way / (way @ way), 0, 1))
-    return float(np.linalg.norm(point - one - part * way))
+        if math.dist(self.cube.p, arm.tip) < 0.01 and (
+            abs(arm.opening - CUBE / 2) < 0.003 or arm.opening < self.opening - 0.001
+        ):
+            return "grasp"  # the fingers hold it, or are closing on it
+        if self.manner == "grasp" and not self.cube.touched:
+            return "grasp"  # let go, it still falls
+        return "push" if arm.opening < 0.01 else "open"

@@ -9,12 +9,12 @@ from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import touched
+from robomme_interference_data.simulators.tabletop.stage import ABOVE, touched
 
 __all__ = ["PatternLock"]
 
 SIDE, SPACING, RADIUS = 4, 0.075, 0.02  # buttons in a row; m; m
-LOW, HIGH = 0.020, 0.10  # m, the stick's tip on the buttons and above them
+TALL, HIGH = 0.010, 0.10  # m, a button, and the stick's tip above the buttons
 
 
 class PatternLock(Family):
@@ -41,8 +41,8 @@ class PatternLock(Family):
 
     def build(self, kit: Kit) -> None:
         kit.panel(self.middle, (0.16, 0.16), (0.08, 0.14, 0.15))
-        self.buttons = [kit.post(spot, (0.85, 0.85, 0.80), RADIUS, 0.010) for spot in self.spots]
-        self.lamp = kit.lamp((1.0, 0.55, 0.10), RADIUS, 0.012)
+        self.buttons = [kit.post(spot, (0.85, 0.85, 0.80), RADIUS, TALL) for spot in self.spots]
+        self.lamp = kit.lamp((1.0, 0.55, 0.10), RADIUS, TALL + ABOVE / 2)
 
     def goals(self) -> tuple[str, ...]:
         return ("retrace the pattern with the stick, button by button in the same order",)
@@ -55,12 +55,12 @@ class PatternLock(Family):
     def solve(self, arm: Arm, answer: tuple[int, ...]) -> Script:
         yield from arm.move((*self.spots[answer[0]], HIGH))
         for number in answer:
-            yield from arm.move((*self.spots[number], LOW), speed=0.15)
+            yield from arm.move((*self.spots[number], TALL + ABOVE), speed=0.15)
             yield from arm.wait(8)
         yield from arm.move((*self.spots[answer[-1]], HIGH))
 
     def react(self, arm: Arm) -> None:
-        self.now = touched(arm, self.spots, RADIUS)
+        self.now = touched(arm, self.spots, RADIUS, TALL)
         Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
 
     def judge(self, arm: Arm, answer: tuple[int, ...]) -> Status:

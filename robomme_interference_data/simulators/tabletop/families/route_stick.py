@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
-from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import touched
+from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line, touched
 
 __all__ = ["RouteStick"]
 
@@ -19,7 +19,8 @@ Route = tuple[tuple[int, ...], tuple[int, ...]]
 COUNT, SPACING = 5, 0.105  # targets; m from one to the next, with a post in the middle
 RADIUS, POST, TALL = 0.024, 0.010, 0.07  # m
 ASIDE = 0.06  # m, how far from a post the stick goes round it
-LOW, HIGH = 0.020, 0.13  # m, the stick's tip on the table and above the posts
+FLAT = 0.003  # m, the height of a target
+LOW, HIGH = FLAT + ABOVE, 0.13  # m, the stick's tip on the targets and above the posts
 
 
 class RouteStick(Family):
@@ -47,7 +48,7 @@ class RouteStick(Family):
             kit.target(spot, (0.95, 0.92, 0.85), RADIUS)
         for spot in self.posts:
             kit.post(spot, (0.12, 0.12, 0.14), POST, TALL)
-        self.lamp = kit.lamp((0.35, 0.90, 0.45), RADIUS, 0.005)
+        self.lamp = kit.lamp((0.35, 0.90, 0.45), RADIUS, FLAT + ABOVE / 2)
 
     def goals(self) -> tuple[str, ...]:
         return ("follow the same path round the posts with the stick as in the video",)
@@ -70,12 +71,13 @@ class RouteStick(Family):
         yield from arm.move((*self.spots[targets[-1]], HIGH))
 
     def react(self, arm: Arm) -> None:
-        self.now = touched(arm, self.spots, RADIUS)
+        self.now = touched(arm, self.spots, RADIUS, FLAT)
         Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
 
     def judge(self, arm: Arm, answer: Route) -> Status:
         targets, sides = answer
-        self.follow(arm)
+        if self.follow(arm):
+            return Status.FAIL
         if self.now is not None and (not self.reached or self.now != self.reached[-1]):
             self.reached.append(self.now)
             if len(self.passed) != len(self.reached) - 1:
@@ -86,17 +88,22 @@ class RouteStick(Family):
             return Status.FAIL
         return Status.SUCCESS if len(self.reached) == len(targets) else Status.ONGOING
 
-    def follow(self, arm: Arm) -> None:
-        """Note on which side the tip has passed a post since the last step; 0 is into the post."""
-        before, tip = self.before, arm.tip
+    def follow(self, arm: Arm) -> bool:
+        """Note on which side the tip has passed a post in this step; tell whether it hit one."""
+        tip = arm.tip
+        before = tip if self.before is None else self.before
         self.before = tip
-        if before is None or tip[2] > TALL or not self.reached:
-            return
-        for x, y in self.posts:
-            if (before[1] - y) * (tip[1] - y) < 0:
+        if tip[2] > TALL:
+            return False
+        for post in self.posts:
+            if off_line(np.array(post), before[:2], tip[:2]) < POST + ROD:
+                return True
+            x, y = post
+            if self.reached and (before[1] - y) * (tip[1] - y) < 0:
                 part = (y - before[1]) / (tip[1] - before[1])
                 off = before[0] + part * (tip[0] - before[0]) - x
-                self.passed.append(0 if abs(off) < POST else 1 if off > 0 else -1)
+                self.passed.append(1 if off > 0 else -1)
+        return False
 
 
 def routes(turns: int) -> list[Route]:

@@ -7,6 +7,7 @@ from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import (
+    exchanges,
     is_near,
     push_down,
     row,
@@ -22,13 +23,14 @@ RADIUS = 0.035  # m, of a target
 class PlaceFamily(Family):
     """Cubes, targets that look alike, and a goal to place one cube on the right target.
 
-    When hard, two pairs of targets change places after the demonstration.
+    When hard, the targets change places after the demonstration, in pairs, until each is elsewhere.
     """
 
     pace = 1.6
     targets_at = (3, 4, 5)
     colours_at = (1, 2, 3)
-    row_of_targets = 0.04  # m, their x
+    row_of_targets = 0.01  # m, their x
+    gap = 0.075  # m, from the targets to the lanes beside them
     bow = 0.0  # m, how far the outer targets lie nearer to the arm
     paint = (0.80, 0.30, 0.55)
 
@@ -38,9 +40,9 @@ class PlaceFamily(Family):
         self.colours = names[:colours]  # the first one is asked for
         flat = row(rng, count, self.row_of_targets, 0.1)
         self.target_spots = [(x - self.bow * (y / 0.2) ** 2, y) for x, y in flat]
-        self.cube_spots = row(rng, colours, -0.17, 0.12)
+        self.cube_spots = row(rng, colours, -0.18, 0.12)
         self.order = shuffled(rng, count)
-        self.swaps = [shuffled(rng, count)[:2] for _ in range(2)] if self.level == 2 else []
+        self.swaps = exchanges(rng, count) if self.level == 2 else []
         self.answers = list(range(count))
 
     def build(self, kit: Kit) -> None:
@@ -59,8 +61,8 @@ class PlaceFamily(Family):
         for cube in self.cubes:
             cube.restore()
         yield from arm.wait(15)
-        for one, other in self.swaps:
-            yield from swap([self.targets[one]], [self.targets[other]])
+        for pair in self.swaps:
+            yield from swap([[target] for target in self.targets], pair, self.gap)
             yield from arm.wait(5)
 
     def solve(self, arm: Arm, answer: int) -> Script:
@@ -80,6 +82,7 @@ class VideoPlaceButton(PlaceFamily):
     """The arm places cubes on targets, presses a button, and places them again."""
 
     table = (0.72, 0.78, 0.70)
+    button_at = (-0.20, 0.22)
 
     def draw(self, rng: RandomState) -> None:
         super().draw(rng)
@@ -87,7 +90,7 @@ class VideoPlaceButton(PlaceFamily):
 
     def build(self, kit: Kit) -> None:
         super().build(kit)
-        self.button = kit.button((-0.08, 0.20))
+        self.button = kit.button(self.button_at)
 
     def goals(self) -> tuple[str, ...]:
         return (

@@ -17,8 +17,8 @@ class VideoPlaceOrder(PlaceFamily):
     table = (0.30, 0.36, 0.52)
     paint = (0.95, 0.72, 0.15)
     colours_at = (1, 2, 2)
-    row_of_targets = 0.06
-    bow = 0.10
+    row_of_targets = 0.03
+    bow = 0.04
 
     def draw(self, rng: RandomState) -> None:
         super().draw(rng)
@@ -26,7 +26,7 @@ class VideoPlaceOrder(PlaceFamily):
 
     def build(self, kit: Kit) -> None:
         super().build(kit)
-        kit.panel((-0.17, 0), (0.05, 0.15), (0.20, 0.24, 0.36))
+        kit.panel((-0.18, 0), (0.045, 0.15), (0.20, 0.24, 0.36))
 
     def goals(self) -> tuple[str, ...]:
         return (

@@ -6,23 +6,25 @@ from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import push_down, row, shuffled, swap
+from robomme_interference_data.simulators.tabletop.stage import exchanges, push_down, row, swap
 
 __all__ = ["VideoRepick"]
 
 LIFTED = 0.06  # m, height of the cube's middle
-TIMES = ("once", "twice", "three times")
+TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 
 
 class VideoRepick(Family):
     """The arm picks one of several cubes; pick the same one again, n times, then press the button.
 
-    Easy: three cubes, each of its own colour. Medium: five of the same colour. Hard: two pairs of
-    them change places after the demonstration.
+    Easy: three cubes, each of its own colour. Medium: five of the same colour. Hard: they change
+    places after the demonstration, in pairs, until each lies elsewhere.
     """
 
     table = (0.26, 0.30, 0.34)
     cubes_at = (3, 5, 5)
+    gap = 0.055  # m, from the row to the lanes beside it
+    button_at = (0.06, 0.0)
 
     def draw(self, rng: RandomState) -> None:
         count = self.cubes_at[self.level]
@@ -30,20 +32,17 @@ class VideoRepick(Family):
         names = [str(name) for name in rng.permutation(["red", "green", "blue", "yellow"])]
         self.colours = names[:count] if self.level == 0 else [names[0]] * count
         self.times = int(rng.randint(1, 4))
-        self.swaps = [shuffled(rng, count)[:2] for _ in range(2)] if self.level == 2 else []
+        self.swaps = exchanges(rng, count) if self.level == 2 else []
         self.answers = list(range(count))
         self.lifts, self.raised = 0, False
 
     def build(self, kit: Kit) -> None:
         self.cubes = [kit.cube(s, c) for s, c in zip(self.spots, self.colours, strict=True)]
-        self.button = kit.button((0.06, 0.0))
+        self.button = kit.button(self.button_at)
 
     def goals(self) -> tuple[str, ...]:
         times = TIMES[self.times - 1]
-        return (
-            f"pick up the cube that was picked up in the video {times}, putting it down in between,"
-            " then press the button",
-        )
+        return (f"pick up the same cube as in the video, {times}, then press the button",)
 
     def demonstrate(self, arm: Arm, answer: int) -> Script:
         yield from arm.wait(5)
@@ -52,8 +51,8 @@ class VideoRepick(Family):
         for cube in self.cubes:
             cube.restore()
             cube.hold(True)
-        for one, other in self.swaps:
-            yield from swap([self.cubes[one]], [self.cubes[other]])
+        for pair in self.swaps:
+            yield from swap([[cube] for cube in self.cubes], pair, self.gap)
             yield from arm.wait(5)
 
     def lift(self, arm: Arm, number: int) -> Script:

@@ -1,20 +1,21 @@
 """VideoUnmask: remember which container hides a cube."""
 
 from collections.abc import Sequence
-from itertools import permutations
+from itertools import permutations, product
 
 from numpy.random import RandomState
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.tabletop.family import Family
-from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit, Place
+from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import along, row
+from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
 
 __all__ = ["VideoUnmask"]
 
-HIGH = 0.60  # m, above what the cameras see
-LIFTED = 0.05  # m
+HIGH = 0.72  # m, above what the cameras see
+LIFTED = 0.05  # m, of the right container
+PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
 
 
 class VideoUnmask(Family):
@@ -34,6 +35,7 @@ class VideoUnmask(Family):
         self.asked = colours[: 2 if self.level == 2 else 1]
         self.colours = colours
         self.spots = row(rng, count, -0.04, 0.105, zigzag=0.02)
+        self.order = shuffled(rng, count)
         self.answers = list(permutations(range(count), len(self.asked)))
         self.found = 0
 
@@ -48,9 +50,13 @@ class VideoUnmask(Family):
             text += f", put it down, then pick up the container that hides the {colour} cube"
         return (text,)
 
+    def covered(self, answer: Sequence[int]) -> list[int]:
+        """The containers that hide a cube, in the order of `colours`: those asked for, others."""
+        rest = [number for number in self.order if number not in answer]
+        return [*answer, *rest][: len(self.colours)]
+
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
-        empty = [number for number in range(len(self.shells)) if number not in answer]
-        self.under = dict(zip((*answer, *empty), self.cubes, strict=False))
+        self.under = dict(zip(self.covered(answer), self.cubes, strict=True))
         for number, cube in self.under.items():
             cube.home = Place((*self.spots[number], CUBE / 2))
             cube.restore()
@@ -64,7 +70,7 @@ class VideoUnmask(Family):
             for shell, place in zip(self.shells, places, strict=True):
                 shell.put(place)
             yield
-        yield from arm.wait(45)
+        yield from arm.wait(50)
 
     def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
         for number in answer:
@@ -75,11 +81,15 @@ class VideoUnmask(Family):
             yield from arm.move((knob[0], knob[1], 0.25))
 
     def judge(self, arm: Arm, answer: Sequence[int]) -> Status:
+        done = answer[: self.found]
         for number, shell in enumerate(self.shells):
-            if shell.p[2] > LIFTED and number not in answer[: self.found]:
-                if number != answer[self.found]:
-                    return Status.FAIL
-                self.found += 1
-                if self.found == len(answer):
-                    return Status.SUCCESS
-        return Status.ONGOING
+            if number not in (*done, answer[self.found]) and rim(shell) > PEEKED:
+                return Status.FAIL
+        if self.shells[answer[self.found]].p[2] > LIFTED:
+            self.found += 1
+        return Status.SUCCESS if self.found == len(answer) else Status.ONGOING
+
+
+def rim(shell: Body) -> float:
+    """Height of the highest corner of a container's open side, in m: a tipped one counts too."""
+    return max(float(shell.point(x, y, 0)[2]) for x, y in product((-SIDE, SIDE), repeat=2))

@@ -7,24 +7,28 @@ from numpy.random import RandomState
 from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
 from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import swap
+from robomme_interference_data.simulators.tabletop.stage import exchanges, swap
 
 __all__ = ["VideoUnmaskSwap"]
 
 
 class VideoUnmaskSwap(VideoUnmask):
-    """As VideoUnmask, then containers change places in pairs, once, twice or three times."""
+    """As VideoUnmask, then containers change places in pairs, once, twice or three times.
+
+    Of three containers one stays, whatever it hides; of four and five each ends elsewhere.
+    """
+
+    gap = 0.078  # m, from the row to the lanes beside it
 
     def draw(self, rng: RandomState) -> None:
         super().draw(rng)
-        self.swaps = [
-            tuple(rng.permutation(len(self.spots))[:2].tolist()) for _ in range(self.level + 1)
-        ]
+        self.swaps = exchanges(rng, len(self.spots))
 
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
         yield from super().demonstrate(arm, answer)
-        for one, other in self.swaps:
-            yield from swap(self.group(one), self.group(other))
+        groups = [self.group(number) for number in range(len(self.shells))]
+        for pair in self.swaps:
+            yield from swap(groups, pair, self.gap)
             yield from arm.wait(5)
         yield from arm.wait(10)
 

@@ -1,0 +1,207 @@
+"""The embedded suite's judges, against what a script without knowledge of them would try."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import NoRendererError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators import Status, make_simulator
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+from robomme_interference_data.simulators.tabletop.env import TabletopEnv
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
+from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
+from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
+from robomme_interference_data.simulators.tabletop.kit import CUBE
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[TabletopEnv]:
+    try:
+        made = make_simulator("tabletop")
+    except NoRendererError as error:
+        pytest.skip(str(error))
+    assert isinstance(made, TabletopSimulator)
+    with made:
+        made._env.drawing = False
+        yield made._env
+
+
+def start(env: TabletopEnv, episode: str, answer: int) -> None:
+    """Begin an episode, not drawn, with an answer of our choice."""
+    about = EpisodeId.parse(episode)
+    env.family = about.family
+    env.reset(seed=seed_of(about), options={"answer": answer})
+    env.arm.reset()
+
+
+def play(env: TabletopEnv, script: Script, seen: Callable[[], None] = lambda: None) -> Status:
+    """Step a script until it is through or the episode has ended."""
+    for _ in script:
+        env._step_action(env.arm.action.copy())
+        if env.status is not Status.ONGOING:
+            break
+        seen()
+    return env.status
+
+
+# --- VideoUnmask: nothing is seen under a wrong container --------------------------------------
+
+
+def pixels_of(colour: str, image: NDArray[np.uint8]) -> int:
+    """Number of pixels in which one channel leads the others by far."""
+    channel = ("red", "green", "blue").index(colour)
+    others = np.delete(image.astype(int), channel, axis=2).max(axis=2)
+    return int((image[..., channel].astype(int) - others > 50).sum())
+
+
+@pytest.mark.parametrize("family", ["VideoUnmask", "VideoUnmaskSwap"])
+def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(
+    env: TabletopEnv, family: str
+) -> None:
+    start(env, f"{family}/test/0", 0)
+    scene: Any = env.episode
+    assert isinstance(scene, VideoUnmask)
+    wrong = next(number for number in scene.under if number != env._answer[0])
+    colour = scene.colours[scene.cubes.index(scene.under[wrong])]
+    heights, pixels = [], []
+
+    def look() -> None:
+        if scene.shells[wrong].p[2] > 0.004:  # lifted at all
+            env.drawing = True
+            images = env.observe().images
+            env.drawing = False
+            pixels.append([pixels_of(colour, images[name]) for name in ("front", "wrist")])
+            heights.append(scene.shells[wrong].p[2])
+
+    def lift_slowly() -> Script:
+        knob = scene.shells[wrong].point(0, 0, scene.shells[wrong].size)
+        yield from env.arm.pick(knob, lift=0.0)
+        yield from env.arm.move(knob + np.array([0, 0, 0.05]), speed=0.03)
+
+    assert play(env, lift_slowly(), look) is Status.FAIL
+    assert len(heights) > 2
+    assert max(heights) <= 0.010
+    assert not np.any(pixels)
+    env.drawing = True
+    scene.shells[wrong].put(scene.under[wrong].home)  # at 0.02 m, where the cube comes into sight
+    assert pixels_of(colour, env.observe().images["front"]) > 0
+    env.drawing = False
+
+
+# --- MoveCube: the manner is judged over the whole way -----------------------------------------
+
+PUSH, GRASP = 0, 1
+
+
+def push(arm: Arm, scene: MoveCube, speed: float) -> Script:
+    """Push the cube to the target with the closed gripper."""
+    behind = scene.cube.p - 0.055 * scene.way
+    yield from arm.move((behind[0], behind[1], 0.12), scene.turn)
+    yield from arm.grip(close=True)
+    yield from arm.move(behind)
+    yield from arm.move(scene.target.p - 0.031 * scene.way + (0, 0, CUBE / 2), speed=speed)
+    yield from arm.wait(10)
+
+
+def push_with_open_fingers(arm: Arm, scene: MoveCube) -> Script:
+    """Push the cube with the outer side of one of the open fingers."""
+    behind = scene.cube.p - 0.11 * scene.way
+    yield from arm.move((behind[0], behind[1], 0.12), scene.turn - np.pi / 2)
+    yield from arm.move((behind[0], behind[1], 0.03))
+    yield from arm.move(scene.target.p - 0.07 * scene.way + (0, 0, 0.03))
+
+
+def drag_slowly(arm: Arm, scene: MoveCube) -> Script:
+    """Grasp the cube and drag it, less than 1 mm in a step."""
+    yield from arm.pick(scene.cube.p, scene.turn, lift=0.0)
+    yield from arm.move(scene.target.p + np.array([0, 0, CUBE / 2]), speed=0.016)
+
+
+def test_a_push_may_be_as_slow_as_it_likes(env: TabletopEnv) -> None:
+    start(env, "MoveCube/test/0", PUSH)
+    scene: Any = env.episode
+    assert play(env, push(env.arm, scene, 0.025)) is Status.SUCCESS  # 1.5 mm a step at most
+
+
+@pytest.mark.parametrize("answer", [PUSH, GRASP])
+def test_a_push_with_open_fingers_is_no_manner_of_the_three(env: TabletopEnv, answer: int) -> None:
+    start(env, "MoveCube/test/0", answer)
+    scene: Any = env.episode
+    assert play(env, push_with_open_fingers(env.arm, scene)) is Status.FAIL
+
+
+def test_a_wrong_manner_fails_within_millimetres_however_slow(env: TabletopEnv) -> None:
+    start(env, "MoveCube/test/0", PUSH)
+    scene: Any = env.episode
+    cube = scene.cube.p
+    assert play(env, drag_slowly(env.arm, scene)) is Status.FAIL
+    assert np.linalg.norm(scene.cube.p - cube) < 0.004
+
+
+def test_a_cube_may_be_let_go_above_the_target_or_grasped_off_its_middle(env: TabletopEnv) -> None:
+    """Its fall, and its slide as the fingers close on it, belong to the grasp."""
+    start(env, "MoveCube/test/0", GRASP)
+    scene: Any = env.episode
+    aside = 0.006 * np.array([-np.sin(scene.turn), np.cos(scene.turn), 0.0])
+
+    def place() -> Script:
+        yield from env.arm.pick(scene.cube.p + aside, scene.turn)
+        yield from env.arm.put(scene.target.p + np.array([0, 0, CUBE / 2 + 0.012]))
+
+    assert play(env, place()) is Status.SUCCESS
+
+
+# --- the stick: it touches what it comes down to, and fails in a post -----------------------------
+
+
+def start_with_stick(env: TabletopEnv, family: str) -> Any:
+    start(env, f"{family}/test/0", 0)
+    return env.episode
+
+
+@pytest.mark.parametrize(("height", "touches"), [(0.030, False), (0.015, False), (0.013, True)])
+def test_a_button_is_touched_within_4_mm_of_its_top(
+    env: TabletopEnv, height: float, touches: bool
+) -> None:
+    """Its top is at 0.010 m; a wrong button, so that touching it fails."""
+    scene = start_with_stick(env, "PatternLock")
+    spot = scene.spots[env._answer[1]]
+    script = env.arm.move((*spot, height))
+    status = play(env, script)
+    assert status is (Status.FAIL if touches else Status.ONGOING)
+    assert env.arm.tip[2] > height - 0.001
+
+
+def test_the_oracle_brings_the_stick_down_to_what_it_touches(env: TabletopEnv) -> None:
+    """1 mm above buttons of 10 mm and targets of 3 mm."""
+    for family, height in (("PatternLock", 0.010), ("RouteStick", 0.003)):
+        scene = start_with_stick(env, family)
+        lowest = [1.0]
+
+        def note(lowest: list[float] = lowest) -> None:
+            lowest.append(float(env.arm.tip[2]))
+
+        assert play(env, scene.solve(env.arm, env._answer), note) is Status.SUCCESS
+        assert min(lowest) == pytest.approx(height + 0.001, abs=0.0006)
+
+
+@pytest.mark.parametrize(("aside", "status"), [(0.0, "fail"), (0.012, "fail"), (0.03, "ongoing")])
+def test_a_stick_put_down_into_a_post_fails(env: TabletopEnv, aside: float, status: str) -> None:
+    """A post's radius is 10 mm, the stick's 6 mm; so too before the first target is reached."""
+    scene = start_with_stick(env, "RouteStick")
+    x, y = scene.posts[1]
+
+    def come_down() -> Script:
+        yield from env.arm.move((x + aside, y, 0.13))
+        yield from env.arm.move((x + aside, y, 0.02))
+        yield from env.arm.wait(3)
+
+    assert play(env, come_down()) == status
