@@ -172,7 +172,7 @@ def demonstrations(split: str) -> dict[bytes, NDArray[np.float32]]:
         images = [buffer.frames(camera) for camera in buffer.cameras]
         known |= dict.fromkeys(pieces([buffer.states, images], set()), answer)
         views = [buffer.query_frame(camera) for camera in buffer.cameras]
-        shown |= set(pieces([buffer.states[-1], views], set()))
+        shown |= set(pieces([buffer.query_state(), views], set()))
     return {piece: answer for piece, answer in known.items() if piece not in shown}
 
 
