@@ -35,6 +35,7 @@ from robomme_interference_data.files import LocalFiles, atomic_path, read_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.base import CAMERAS, EpisodeInfo, Simulator, Status
 from robomme_interference_data.simulators.registry import own_simulator
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 from robomme_interference_data.workers import run_tasks
 
@@ -45,6 +46,7 @@ __all__ = [
     "check_unbuilt",
     "list_episodes",
     "record_episodes",
+    "recorded_from",
 ]
 
 _PARTS = "parts"
@@ -76,7 +78,17 @@ class RecordedSource(FramesSource):
 
     def __init__(self, folder: Path, simulator: str):
         super().__init__(folder)
-        self.provenance = {"kind": simulator}
+        self.provenance = recorded_from(simulator)
+
+
+def recorded_from(simulator: str) -> dict[str, Any]:
+    """Return what a dataset records of a simulator that its episodes were played on.
+
+    Of the tabletop that is its suite's version too: the same episode of another is another one.
+    """
+    if simulator == "tabletop":
+        return {"kind": simulator, "suite_version": SUITE_VERSION}
+    return {"kind": simulator}
 
 
 def check_playable(simulator: str, kind: str) -> None:
@@ -207,7 +219,7 @@ def record_episodes(
         pq.write_table(table, partial_table)
 
 
-def check_unbuilt(out: Path, kind: str, episodes: Sequence[EpisodeId]) -> bool:
+def check_unbuilt(out: Path, kind: str, episodes: Sequence[EpisodeId], simulator: str) -> bool:
     """Tell whether a dataset has yet to be built, before any episode is played for it.
 
     Returns:
@@ -220,6 +232,12 @@ def check_unbuilt(out: Path, kind: str, episodes: Sequence[EpisodeId]) -> bool:
         return True
     if (out / IDENTITY_PATH).is_file():
         dataset = Dataset(LocalFiles(out))
+        played = recorded_from(simulator)
+        if dataset.kind == kind and played not in dataset.identity["sources"]:
+            raise BuildError(
+                f"{out} exists and was built from {dataset.identity['sources']}, not from {played}",
+                "Choose another --out, or remove the folder first.",
+            )
         stored = set(dataset.episodes["episode_id"].to_pylist())
         skipped = {item["episode_id"] for item in read_json(out / REPORT_PATH)["skipped"]}
         if dataset.kind == kind and stored | skipped == set(map(str, episodes)):

@@ -21,6 +21,7 @@ from robomme_interference_data.build_dataset.record import (
     check_unbuilt,
     list_episodes,
     record_episodes,
+    recorded_from,
 )
 from robomme_interference_data.build_dataset.sources import Source, open_source
 from robomme_interference_data.constants import DEFAULT_K, DISTRACTORS
@@ -124,11 +125,12 @@ def _record(
     robomme_python: str | None,
 ) -> Source | None:
     """Play the wanted episodes of a simulator; None if the dataset of them is there already."""
-    options: dict[str, Any] = {"cameras": cameras_to_draw(settings.cameras)}
-    # What is recorded with other cameras is not taken for these.
-    folder = recordings / "-".join((simulator, *options["cameras"]))
+    drawn = cameras_to_draw(settings.cameras)
+    options: dict[str, Any] = {"cameras": drawn}
+    # What is recorded with other cameras, or of another suite, is not taken for these.
+    folder = recordings / "-".join((*map(str, recorded_from(simulator).values()), *drawn))
     episodes = list_episodes(simulator, wanted.families, wanted.split, wanted.numbers)
-    if not check_unbuilt(out, kind, episodes):
+    if not check_unbuilt(out, kind, episodes, simulator):
         return None
     if simulator == "robomme":
         options["python"] = robomme_python

@@ -101,6 +101,20 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def tabletop() -> Iterator[Any]:
+    """The embedded simulator in this process, a `TabletopSimulator`."""
+    from robomme_interference_data.errors import NoRendererError
+    from robomme_interference_data.simulators import make_simulator
+
+    try:
+        made = make_simulator("tabletop")
+    except NoRendererError as error:
+        pytest.skip(str(error))
+    with made:  # type: ignore[attr-defined]
+        yield made
+
+
 @pytest.fixture(scope="session")
 def bare_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of an environment with numpy < 2 and nothing else."""

@@ -22,6 +22,7 @@ from robomme_interference_data.cli import app
 from robomme_interference_data.errors import BuildError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
 DOUBLE = "simulator_doubles:make"  # a lesson of 5 frames, then success after 3 steps
 ONCE = "simulator_doubles:make_once"
@@ -40,7 +41,8 @@ def test_lesson_and_live_part(tmp_path: Path) -> None:
     done = list(record_episodes(DOUBLE, [episode(9), episode(0)], tmp_path, live=True, workers=2))
     assert sorted(done) == [episode(0), episode(9)]
     source = RecordedSource(tmp_path, "tabletop")
-    assert source.provenance == {"kind": "tabletop"}
+    assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
+    assert RecordedSource(tmp_path, "robomme").provenance == {"kind": "robomme"}
     first, second = source.episodes()
     assert (first.id, second.id) == (episode(0), episode(9))
     # 5 frames of the lesson, then one before each of the 3 steps; none after the end
@@ -159,14 +161,17 @@ def test_check_unbuilt(tmp_path: Path) -> None:
     units = factories.split() / "distractors"
     ids = [record.id for record in Dataset(LocalFiles(units)).records()]
     skipped = EpisodeId("VideoRepick", "train", 1)  # too short, in the build report
-    assert check_unbuilt(tmp_path / "new", "distractors", ids)
-    assert not check_unbuilt(units, "distractors", [*ids, skipped])
+    assert check_unbuilt(tmp_path / "new", "distractors", ids, "frames")
+    # The sample is of the source "frames", which has a kind and no version, as RoboMME has.
+    assert not check_unbuilt(units, "distractors", [*ids, skipped], "frames")
+    with pytest.raises(BuildError, match="'frames'.*not from .*'suite_version'"):
+        check_unbuilt(units, "distractors", [*ids, skipped], "tabletop")
     for kind, wanted in (("distractors", ids), ("demonstrations", [*ids, skipped])):
         with pytest.raises(BuildError, match="holds something else"):
-            check_unbuilt(units, kind, wanted)
+            check_unbuilt(units, kind, wanted, "frames")
     (tmp_path / "other").write_text("not a dataset")
     with pytest.raises(BuildError, match="Choose another --out"):
-        check_unbuilt(tmp_path / "other", "distractors", ids)
+        check_unbuilt(tmp_path / "other", "distractors", ids, "frames")
 
 
 def test_fewer_cameras_of_the_tabletop_simulator_are_the_same_bits(tmp_path: Path) -> None:

@@ -1,15 +1,14 @@
 """The embedded suite's judges, against what a script without knowledge of them would try."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators import Status, make_simulator
+from robomme_interference_data.simulators import Status
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
@@ -23,15 +22,9 @@ from robomme_interference_data.simulators.tabletop.simulator import TabletopSimu
 
 
 @pytest.fixture(scope="module")
-def env() -> Iterator[TabletopEnv]:
-    try:
-        made = make_simulator("tabletop")
-    except NoRendererError as error:
-        pytest.skip(str(error))
-    assert isinstance(made, TabletopSimulator)
-    with made:
-        made._env.drawing = False
-        yield made._env
+def env(tabletop: TabletopSimulator) -> TabletopEnv:
+    tabletop._env.drawing = False
+    return tabletop._env
 
 
 def start(env: TabletopEnv, episode: str, answer: int) -> None:

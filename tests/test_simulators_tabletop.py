@@ -14,12 +14,11 @@ from robomme_interference_data.errors import (
     InvalidIdError,
     InvalidOptionError,
     MotionError,
-    NoRendererError,
     SimulatorCrashError,
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators import Demonstration, Observation, Status, make_simulator
+from robomme_interference_data.simulators import Demonstration, Observation, Status
 from robomme_interference_data.simulators.worker import RemoteSimulator
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
@@ -32,14 +31,8 @@ SHORT = "VideoUnmask/test/0"
 
 
 @pytest.fixture(scope="module")
-def simulator() -> Iterator[TabletopSimulator]:
-    try:
-        made = make_simulator("tabletop")
-    except NoRendererError as error:
-        pytest.skip(str(error))
-    assert isinstance(made, TabletopSimulator)
-    with made:
-        yield made
+def simulator(tabletop: TabletopSimulator) -> TabletopSimulator:
+    return tabletop
 
 
 @pytest.fixture

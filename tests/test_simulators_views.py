@@ -1,7 +1,6 @@
 """What the embedded suite's cameras see: the whole arm, and nothing that goes out of sight."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators import make_simulator
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
@@ -36,14 +33,8 @@ SIZE = 256
 
 
 @pytest.fixture(scope="module")
-def env() -> Iterator[TabletopEnv]:
-    try:
-        made = make_simulator("tabletop")
-    except NoRendererError as error:
-        pytest.skip(str(error))
-    assert isinstance(made, TabletopSimulator)
-    with made:
-        yield made._env
+def env(tabletop: TabletopSimulator) -> TabletopEnv:
+    return tabletop._env
 
 
 def seen_at(point: tuple[float, ...] | NDArray[np.float64]) -> tuple[float, float, float]:
