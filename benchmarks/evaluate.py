@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from timing import Times, interleave, machine, positive, table
+from timing import interleave, machine, positive, table
 
 from robomme_interference_data import DecodedCache, Split, load_split
 from robomme_interference_data.evaluate import run_evaluation
@@ -99,10 +99,7 @@ def main() -> None:
             "A rollout of the oracle's actions, front and wrist drawn at every step, one process; "
             f"medians of {options.rounds} rounds; ratios are against the bare loop, aim at k0 "
             "≤ 1.05.",
-            (
-                *("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 --cache"),
-                *(">k0 but decoding", ">frames"),
-            ),
+            ("<episode", ">steps", ">bare s", ">no-history", ">k0", ">k0 --cache", ">frames"),
             rows,
         ),
         end="\n\n",
@@ -147,7 +144,6 @@ def overhead(
         episode_split=episode.split,
         model_seed=0,
         retrieval=None,
-        retrieval_threshold=None,
         robomme_python=None,
         check_lesson=False,
         videos=False,
@@ -156,7 +152,6 @@ def overhead(
         history_chunk=64,
         max_errors=1,
     )
-    decoding: list[float] = []
 
     def bare() -> None:
         simulator.reset(str(episode), demonstration=False)
@@ -164,16 +159,15 @@ def overhead(
             _, status = simulator.step(action)
         assert status is Status.SUCCESS
 
-    def harness(condition: str, data: Split) -> float:
+    def harness(condition: str, data: Split) -> None:
         item = WorkItem(condition, episode)
         row = run_rollout(config, item, simulator=simulator, policy=policy, split=data)
         assert row.success and row.steps == len(actions)
-        return row.history_s or 0.0
 
     ways = {
         BARE: bare,
         WITHOUT: lambda: harness(WITHOUT, split),
-        K0: lambda: decoding.append(harness(K0, split)),
+        K0: lambda: harness(K0, split),
         CACHED: lambda: harness(K0, cached),
     }
     times = interleave(ways, rounds)
@@ -184,15 +178,8 @@ def overhead(
         f"{times.ratio(WITHOUT, BARE):.3f}",
         f"{times.ratio(K0, BARE):.3f}",
         f"{times.ratio(CACHED, BARE):.3f}",
-        f"{less(times, decoding[1:]).ratio(K0, BARE):.3f}",  # the first one was the warm-up
         str(len(split.load(episode, 0))),
     ]
-
-
-def less(times: Times, decoding: Sequence[float]) -> Times:
-    """Take the seconds of decoding the history off those of k0."""
-    rest = [all_ - part for all_, part in zip(times.seconds[K0], decoding, strict=True)]
-    return Times({**times.seconds, K0: rest})
 
 
 def oracle_actions(episode: EpisodeId, simulator: TabletopSimulator) -> NDArray[np.float32]:

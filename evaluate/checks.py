@@ -25,6 +25,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     make_policy,
     parse_policy,
 )
+from robomme_interference_data.evaluate.retrieval import check_retrieval, make_selector
 from robomme_interference_data.evaluate.rows import NO_HISTORY
 from robomme_interference_data.evaluate.systems import (
     SYSTEMS,
@@ -34,7 +35,7 @@ from robomme_interference_data.evaluate.systems import (
     name_system,
 )
 from robomme_interference_data.evaluate.videos import check_videos
-from robomme_interference_data.evaluate.worker import make_selector, simulator_options
+from robomme_interference_data.evaluate.worker import simulator_options
 from robomme_interference_data.ids import condition_name
 from robomme_interference_data.loader import Split
 from robomme_interference_data.progress import MESSAGES
@@ -52,7 +53,6 @@ __all__ = [
     "check_settings",
     "check_simulator",
     "describe_policy",
-    "retrieval_identity",
 ]
 
 
@@ -145,16 +145,7 @@ def check_settings(config: RunConfig, split: Split, policy: PolicyTraits) -> Non
         )
     system = name_system(config.system)
     _check_label(config, system)
-    if config.retrieval is not None and system.paper and not system.retrieval:
-        raise InvalidOptionError(
-            f"system {system.name} has no retrieval step, and --retrieval puts one in front",
-            "Leave out one of the two, or give a --system of your own.",
-        )
-    if config.retrieval is None and system.retrieval:
-        raise InvalidOptionError(
-            f"system {system.name} has a retrieval step, and none is given",
-            "Add --retrieval ENCODER, such as --retrieval siglip.",
-        )
+    check_retrieval(config, system)
     if config.videos:
         check_videos()
     cameras = split.load(split.episode_ids[0], split.k_values[0]).cameras
@@ -183,8 +174,8 @@ def _check_label(config: RunConfig, system: System) -> None:
             "Give --system a name of your own, or a python: policy that has such a model.",
         )
     if system.name in SYSTEMS and not system.paper:
-        retrieval = config.retrieval is not None
-        names = default_system(config.policy, config.memory, retrieval) if kind in BUILTINS else ""
+        step = (config.retrieval, config.retrieval_rule, config.retrieval_camera)
+        names = default_system(config.policy, config.memory, *step) if kind in BUILTINS else ""
         if names.removeprefix("retrieval-") != system.name.removeprefix("retrieval-"):
             memory = f" with the memory {config.memory}" if config.memory is not None else ""
             raise InvalidOptionError(
@@ -238,22 +229,10 @@ def check_plan(
         if item.k is not None and config.retrieval is None:
             check_history(system, manifest.history_frames)
     longest = max(plan, key=lambda item: -1 if item.k is None else item.k)
-    if config.retrieval is not None and longest.k is not None:
-        selector = make_selector(config)
+    selector = make_selector(config)
+    if selector is not None and longest.k is not None:
         buffer = split.load(longest.episode, longest.k)
         selector.select(buffer, buffer.query_frame(selector.camera))
-
-
-def retrieval_identity(config: RunConfig, split: Split) -> dict[str, Any] | None:
-    """Return what the choices of the retrieval step depend on, None without it.
-
-    Raises:
-        MissingIndexError, StaleIndexError, FormatError: The split has no fitting index.
-    """
-    if config.retrieval is None:
-        return None
-    buffer = split.load(split.episode_ids[0], split.k_values[0])
-    return make_selector(config).identity(buffer)
 
 
 def check_simulator(config: RunConfig, policy: PolicyTraits) -> None:
@@ -268,8 +247,7 @@ def check_simulator(config: RunConfig, policy: PolicyTraits) -> None:
     """
     if config.simulator not in SIMULATORS:
         return
-    selector = None if config.retrieval is None else make_selector(config)
-    options = simulator_options(config, policy.cameras, selector)
+    options = simulator_options(config, policy.cameras, make_selector(config))
     make = partial(_make_once, config.simulator)
     for outcome in run_tasks(make, [options], workers=1, time_limit=config.simulator_s, attempts=1):
         if isinstance(outcome.error, InterferenceError):

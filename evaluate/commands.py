@@ -64,9 +64,12 @@ def evaluate(
         str | None,
         typer.Option(help="Put a retrieval step with this encoder in front of the policy."),
     ] = None,
-    retrieval_threshold: Annotated[
-        float | None, typer.Option(help="Cosine below which the retrieval step cuts.")
-    ] = None,
+    retrieval_rule: Annotated[
+        str, typer.Option(help="METHOD or METHOD/CUT, as for retrieval-score.")
+    ] = "max",
+    retrieval_camera: Annotated[
+        str, typer.Option(help="Camera whose frames the retrieval step compares.")
+    ] = "front",
     robomme_python: Annotated[
         str | None,
         typer.Option(help="Interpreter that has RoboMME.", envvar="ROBOMME_PYTHON"),
@@ -162,7 +165,8 @@ def evaluate(
                 policy_options=options,
                 model_seed=model_seed,
                 retrieval=retrieval,
-                retrieval_threshold=retrieval_threshold,
+                retrieval_rule=retrieval_rule,
+                retrieval_camera=retrieval_camera,
                 robomme_python=robomme_python,
                 check_lesson=check_lesson,
                 videos=videos,

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION
 
 __all__ = [
     "IDENTITY",
-    "POLICY",
     "RunConfig",
     "check_same_run",
     "default_system",
@@ -25,13 +24,12 @@ IDENTITY = (
     "revision",
     "episode_split",
     "model_seed",
-    "retrieval",
-    "retrieval_threshold",
 )
-"""Settings that can change a result: two runs that differ in one of them never share a folder."""
+"""Settings that are part of what a run is, as they stand. Of the policy's and the retrieval step's
+only a part can change a result: `policy_identity` and `Selector.identity` say which."""
 
-POLICY = ("policy", "memory", "policy_options")
-"""Settings of which only a part can change a result: `policies.options.policy_identity` says."""
+_MAX, _FRONT = "max", "front"
+"""The paper's rule of the retrieval step, and the camera that it looks at."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,8 @@ class RunConfig:
         episode_split: `train`, `val` or `test`.
         model_seed: Seed for the policy.
         retrieval: Encoder of the retrieval step, or None.
-        retrieval_threshold: Cosine below which it cuts, or None for the encoder's own rule.
+        retrieval_rule: How it chooses, `METHOD` or `METHOD/CUT`.
+        retrieval_camera: Camera whose frames it compares.
         robomme_python: Interpreter of the official simulator, or None.
         check_lesson: Whether to compare the dataset's lesson with the simulator's.
         videos: Whether to write videos.
@@ -72,7 +71,8 @@ class RunConfig:
     episode_split: str = "test"
     model_seed: int = 0
     retrieval: str | None = None
-    retrieval_threshold: float | None = None
+    retrieval_rule: str = _MAX
+    retrieval_camera: str = _FRONT
     robomme_python: str | None = None
     check_lesson: bool = False
     videos: bool = False
@@ -90,6 +90,16 @@ class RunConfig:
                 "the memory rule is no --policy-option, as it also names the system",
                 f"Give --memory {self.policy_options['memory']}.",
             )
+        if self.retrieval is None:
+            for name, value, usual in (
+                ("rule", self.retrieval_rule, _MAX),
+                ("camera", self.retrieval_camera, _FRONT),
+            ):
+                if value != usual:
+                    raise InvalidOptionError(
+                        f"--retrieval-{name} {value} says nothing without a retrieval step",
+                        "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
+                    )
         try:
             json.dumps(self.policy_options)
         except (TypeError, ValueError):
@@ -105,12 +115,17 @@ class RunConfig:
         return memory | dict(self.policy_options)
 
 
-EXECUTION = tuple(f.name for f in fields(RunConfig) if f.name not in (*IDENTITY, *POLICY))
-"""Settings of how a run is carried out: a run may be resumed with others."""
-
-
-def default_system(policy: str, memory: str | None, retrieval: bool) -> str:
+def default_system(
+    policy: str,
+    memory: str | None = None,
+    retrieval: str | None = None,
+    retrieval_rule: str = _MAX,
+    retrieval_camera: str = _FRONT,
+) -> str:
     """Return the name under which rows stand if none is given.
+
+    That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
+    step behind it, such as `retrieval-replay-window-oracle`. Arguments as in `RunConfig`.
 
     Raises:
         InvalidOptionError: The policy does not say which system it is.
@@ -132,7 +147,11 @@ def default_system(policy: str, memory: str | None, retrieval: bool) -> str:
     if policy == "replay":
         name = f"replay-{memory or 'full'}"
     name = name or policy
-    return f"retrieval-{name}" if retrieval else name
+    if retrieval is None:
+        return name
+    rule, camera = retrieval_rule.replace("/", "-"), retrieval_camera
+    unusual = [*([rule] if rule != _MAX else []), *([camera] if camera != _FRONT else [])]
+    return "-".join(("retrieval", name, *unusual))
 
 
 def identity(

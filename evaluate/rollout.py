@@ -2,18 +2,19 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.buffer import Buffer, Chunk
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.draw import even_sample
 from robomme_interference_data.errors import PolicyError, RolloutError
 from robomme_interference_data.evaluate.agreement import check_episode, check_lesson
+from robomme_interference_data.evaluate.ahead import read_ahead
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
@@ -33,6 +34,9 @@ __all__ = ["ACTION_CHUNK", "Watcher", "base_row", "run_rollout"]
 
 ACTION_CHUNK = 16
 """Actions of a chunk that are executed before the policy is asked again (paper)."""
+
+_FRAMES_AHEAD = 256
+"""Frames of the history that are decoded ahead at most: 50 MB of a camera of 256 × 256."""
 
 
 class Watcher(Protocol):
@@ -114,34 +118,39 @@ def run_rollout(
     guard = nullcontext if watchdog is None else watchdog.guard
     began = time.perf_counter()
     buffer = None if item.k is None else split.load(item.episode, item.k)
-    with clock.part("reset_s"), guard():
-        demonstration, first, info = simulator.reset(
-            str(item.episode), demonstration=config.check_lesson
-        )
-    recorded = split.load(item.episode, split.k_values[0]) if buffer is None else buffer
-    check_episode(recorded, demonstration, first, info)
-    if config.check_lesson:
-        check_lesson(recorded, demonstration, first)
     chosen = None
     start, stop = 0, 0 if buffer is None else len(buffer)
-    with clock.part("history_s"):
-        if selector is not None and buffer is not None and len(buffer):
-            chosen = selector.select(buffer, first.images[selector.camera])
-            start, stop = chosen.start, chosen.stop
-            check_history(name_system(config.system), stop - start)
-    if watcher is not None:
-        watcher.begin(buffer, start, stop, first, info)
-    with clock.part("history_s"):
-        policy.reset(
-            RolloutInfo(
-                info.goal,
-                stop - start,
-                config.model_seed,
-                simulator if policy.privileged else None,
+    with ExitStack() as stack:
+        history = None
+        if selector is None:  # What will be given is known: it is decoded while the episode begins.
+            history = stack.enter_context(_history(buffer, start, stop, policy, config))
+        with clock.part("reset_s"), guard():
+            demonstration, first, info = simulator.reset(
+                str(item.episode), demonstration=config.check_lesson
             )
-        )
-        if buffer is not None:
-            for chunk in buffer.stream(config.history_chunk, policy.history_cameras, start, stop):
+        recorded = split.load(item.episode, split.k_values[0]) if buffer is None else buffer
+        check_episode(recorded, demonstration, first, info)
+        if config.check_lesson:
+            check_lesson(recorded, demonstration, first)
+        with clock.part("history_s"):
+            if selector is not None and buffer is not None and len(buffer):
+                chosen = selector.select(buffer, first.images[selector.camera])
+                start, stop = chosen.start, chosen.stop
+                check_history(name_system(config.system), stop - start)
+        if watcher is not None:
+            watcher.begin(buffer, start, stop, first, info)
+        with clock.part("history_s"):
+            if history is None:
+                history = stack.enter_context(_history(buffer, start, stop, policy, config))
+            policy.reset(
+                RolloutInfo(
+                    info.goal,
+                    stop - start,
+                    config.model_seed,
+                    simulator if policy.privileged else None,
+                )
+            )
+            for chunk in history:
                 policy.add_history(chunk.frames, chunk.states, stop - start)
     status, steps = _live(policy, simulator, first, info.goal, clock, watcher, guard)
     if status is Status.ERROR:
@@ -163,6 +172,16 @@ def run_rollout(
         **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
+
+
+def _history(
+    buffer: Buffer | None, start: int, stop: int, policy: Policy, config: RunConfig
+) -> AbstractContextManager[Iterator[Chunk]]:
+    """Begin to decode what a policy is given of a buffer; give it in chunks, in order."""
+    if buffer is None:
+        return nullcontext(iter(()))
+    chunks = buffer.stream(config.history_chunk, policy.history_cameras, start, stop)
+    return read_ahead(chunks, max(1, _FRAMES_AHEAD // config.history_chunk))
 
 
 def _live(

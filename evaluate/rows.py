@@ -83,7 +83,7 @@ class Rollout:
         attempt: How often the rollout was started, this time included.
         video: Path of its video inside the run's folder, or None.
         reset_s: Seconds to reset the simulator.
-        history_s: Seconds to decode the history and hand it over.
+        history_s: Seconds to hand the history over, and to wait for what is not decoded yet.
         policy_s: Seconds that the policy took for actions and observations.
         simulator_s: Seconds of stepping.
         wall_s: Seconds in all.

@@ -14,7 +14,6 @@ from robomme_interference_data.evaluate.checks import (
     check_settings,
     check_simulator,
     describe_policy,
-    retrieval_identity,
 )
 from robomme_interference_data.evaluate.config import RunConfig, default_system, identity
 from robomme_interference_data.evaluate.header import begun, ended, now, plan_record
@@ -34,6 +33,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     pin_policy,
     policy_factory,
 )
+from robomme_interference_data.evaluate.retrieval import retrieval_identity
 from robomme_interference_data.evaluate.rollout import base_row
 from robomme_interference_data.evaluate.rows import KEY_COLUMNS, Rollout
 from robomme_interference_data.evaluate.watchdog import last_words
@@ -96,7 +96,8 @@ def run_evaluation(
     policy_options: Mapping[str, Any] | None = None,
     model_seed: int = 0,
     retrieval: str | None = None,
-    retrieval_threshold: float | None = None,
+    retrieval_rule: str = "max",
+    retrieval_camera: str = "front",
     robomme_python: str | None = None,
     check_lesson: bool = False,
     videos: bool = False,
@@ -134,7 +135,8 @@ def run_evaluation(
         policy_options: Other options of the policy by name: text, numbers, True, False or None.
         model_seed: Seed for the policy.
         retrieval: Encoder of a retrieval step in front of the policy, or None.
-        retrieval_threshold: Cosine below which it cuts; None for the encoder's own rule.
+        retrieval_rule: How it chooses, `METHOD` or `METHOD/CUT` as `Rule.parse` reads it.
+        retrieval_camera: Camera whose frames it compares.
         robomme_python: Interpreter in which the official simulator is installed.
         check_lesson: Compare each lesson of the dataset with the simulator's, bit for bit.
         videos: Write a video of each rollout.
@@ -163,7 +165,7 @@ def run_evaluation(
     """
     end_if_starting()
     opened = load_split(split)
-    label = system or default_system(policy, memory, retrieval is not None)
+    label = system or default_system(policy, memory, retrieval, retrieval_rule, retrieval_camera)
     config = RunConfig(
         system=label,
         policy=pin_policy(policy),
@@ -175,7 +177,8 @@ def run_evaluation(
         episode_split=episode_split,
         model_seed=model_seed,
         retrieval=retrieval,
-        retrieval_threshold=retrieval_threshold,
+        retrieval_rule=retrieval_rule,
+        retrieval_camera=retrieval_camera,
         robomme_python=robomme_python,
         check_lesson=check_lesson,
         videos=videos,

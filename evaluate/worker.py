@@ -16,6 +16,7 @@ from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.retrieval import make_selector
 from robomme_interference_data.evaluate.rollout import base_row, run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.evaluate.videos import ClipWatcher, video_name
@@ -97,7 +98,7 @@ class RolloutWorker:
             self._split = load_split(config.split, cache=config.cache, threads=1)
         if self._policy is None:
             self._policy = self._make_policy()
-        if self._selector is None and config.retrieval is not None:
+        if self._selector is None:
             self._selector = make_selector(config)
         if self._simulator is None:
             self._simulator = make_simulator(
@@ -172,12 +173,6 @@ def error_row(
         lesson_share=None,
         error=" ".join(error.split())[:2000],
     )
-
-
-def make_selector(config: RunConfig) -> Selector:
-    """Make the retrieval step of a run."""
-    assert config.retrieval is not None
-    return Selector(config.retrieval, threshold=config.retrieval_threshold)
 
 
 def simulator_options(

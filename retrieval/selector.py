@@ -56,15 +56,13 @@ class Selector:
 
     Args:
         encoder: Name of the encoder, see `make_encoder`.
-        threshold: Cosine of adjacent frames below which a history is cut; None for the one
-            published for the encoder, or, where there is none, for `adaptive_threshold`.
-        method: One of `select.METHODS` that chooses a segment.
+        rule: How to choose, as `Rule.parse` reads it; a method that chooses a segment.
         camera: Camera whose frames it compares.
         device: Where to compute; None for a GPU if there is one.
 
     Raises:
         UnknownNameError: There is no such encoder or method.
-        InvalidOptionError: The method chooses single frames, or the threshold is no cosine.
+        InvalidOptionError: The method chooses single frames, or the cut is no cosine.
         MissingExtraError, MissingWeightsError, FormatError: See `make_encoder`.
     """
 
@@ -72,17 +70,16 @@ class Selector:
         self,
         encoder: str,
         *,
-        threshold: float | None = None,
-        method: str = "max",
+        rule: str = "max",
         camera: str = "front",
         device: str | None = None,
     ):
-        if method == "top32":
+        self.rule = Rule.parse(rule).settled(published_threshold(encoder))
+        if self.rule.method == "top32":
             raise InvalidOptionError(
                 "method 'top32' chooses single frames; a policy is handed a span",
                 f"Choose one of {', '.join(SEGMENT_METHODS)}.",
             )
-        self.rule = Rule(method, threshold).settled(published_threshold(encoder))
         self.camera = camera.removeprefix(CAMERA_PREFIX)
         self._encoder = make_encoder(encoder, device=device)
 

@@ -2,7 +2,7 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -234,7 +234,7 @@ class Buffer:
         cameras: tuple[str, ...] | None = None,
         start: int = 0,
         stop: int | None = None,
-    ) -> Iterator[Chunk]:
+    ) -> Generator[Chunk]:
         """Decode the buffer, or a span of it, in chunks, in order, holding one chunk at a time.
 
         With a cache, frames that it lacks are decoded a whole session at a time.

@@ -164,7 +164,7 @@ def test_check_unbuilt(tmp_path: Path) -> None:
     assert check_unbuilt(tmp_path / "new", "distractors", ids, "frames")
     # The sample is of the source "frames", which has a kind and no version, as RoboMME has.
     assert not check_unbuilt(units, "distractors", [*ids, skipped], "frames")
-    with pytest.raises(BuildError, match="'frames'.*not from .*'suite_version'"):
+    with pytest.raises(BuildError, match=r"'frames'.*not from .*'suite_version'"):
         check_unbuilt(units, "distractors", [*ids, skipped], "tabletop")
     for kind, wanted in (("distractors", ids), ("demonstrations", [*ids, skipped])):
         with pytest.raises(BuildError, match="holds something else"):

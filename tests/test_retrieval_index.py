@@ -212,7 +212,7 @@ def test_what_identifies_a_selector(split: Path) -> None:
         "cut": "adaptive",
         "threshold": (1 + index.typical_cosine) / 2,
     }
-    fixed = Selector("thumbnail", method="mean", threshold=0.5).identity(buffer)
+    fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
     assert (fixed["method"], fixed["cut"], fixed["threshold"]) == ("mean", 0.5, 0.5)
 
 
@@ -410,7 +410,7 @@ def test_the_selector(split: Path) -> None:
     make_index(split)
     selector = Selector("thumbnail")
     assert (selector.name, selector.camera) == ("thumbnail/max/adaptive", "front")
-    assert Selector("thumbnail", threshold=0.9, method="mean").name == "thumbnail/mean/0.9"
+    assert Selector("thumbnail", rule="mean/0.9").name == "thumbnail/mean/0.9"
     for buffer in load_split(split).buffers(k=3):
         index = buffer.query_index("thumbnail")
         assert selector.rule.threshold(index.typical_cosine) == adaptive_threshold(
@@ -434,13 +434,13 @@ def test_the_selector(split: Path) -> None:
 
 
 def test_the_selector_refuses() -> None:
-    for options, error in (
-        ({"method": "top32"}, InvalidOptionError),
-        ({"method": "best"}, UnknownNameError),
-        ({"threshold": 2.0}, InvalidOptionError),
+    for rule, error in (
+        ("top32", InvalidOptionError),
+        ("best", UnknownNameError),
+        ("max/2.0", InvalidOptionError),
     ):
         with pytest.raises(error):
-            Selector("thumbnail", **options)  # type: ignore[arg-type]
+            Selector("thumbnail", rule=rule)
     with pytest.raises(UnknownNameError, match="'thumbnial'"):
         Selector("thumbnial")
     with pytest.raises(InvalidOptionError, match="no models"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,14 @@ from robomme_interference_data.evaluate.agreement import check_lesson
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.builtin import make_builtin
+from robomme_interference_data.evaluate.retrieval import make_selector
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.progress import BuildProgress
+from robomme_interference_data.retrieval.commands import datasets_in
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.selector import Selection
 from robomme_interference_data.simulators.base import Observation, Status
 
@@ -61,6 +67,29 @@ def roll(
     )
 
 
+class Patient(World):
+    """Begins an episode only when its history is being decoded."""
+
+    decoding = threading.Event()
+
+    def reset(self, episode_id: str, demonstration: bool = True) -> Any:
+        assert self.decoding.wait(20)
+        return super().reset(episode_id, demonstration)
+
+
+def test_history_is_decoded_while_the_episode_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Buffer.stream
+
+    def noted(*options: Any) -> Any:
+        Patient.decoding.set()
+        yield from stream(*options)
+
+    monkeypatch.setattr(Buffer, "stream", noted)
+    policy = Cheat()
+    assert roll("k1", policy, simulator=Patient(), history_chunk=50).success
+    assert policy.chunks == [(50, 68), (18, 68)]
+
+
 class First:
     """A retrieval step that chooses the first so many frames."""
 
@@ -83,6 +112,32 @@ def test_what_retrieval_chose_keeps_the_position_limit(monkeypatch: pytest.Monke
     assert row.history_frames == 36
     with pytest.raises(HistoryTooLongError, match="37 history frames and 4060 steps"):
         run_rollout(settings, item, policy=Cheat(), selector=First(37), **parts)  # type: ignore[arg-type]
+
+
+def test_retrieval_hands_over_what_its_rule_chose_of_its_cameras_frames(tmp_path: Path) -> None:
+    split = factories.copy_of_split(tmp_path / "split")
+    build_index(datasets_in(split), Thumbnail(), BuildProgress(quiet=True), camera="wrist")
+    settings = config(
+        split=str(split), retrieval="thumbnail", retrieval_rule="last/0.5", retrieval_camera="wrist"
+    )
+    selector, policy = make_selector(settings), Cheat()
+    assert selector is not None
+    loaded = load_split(split)
+    chosen = selector.select(loaded.load(EPISODE, 3), loaded.load(EPISODE, 3).query_frame("wrist"))
+    assert chosen.start > 36 and chosen.stop == 36 + 3 * 32  # nothing of the lesson
+    row = run_rollout(
+        settings,
+        WorkItem("k3", EPISODE),
+        simulator=World(),
+        policy=policy,
+        split=loaded,
+        selector=selector,
+    )
+    frames = chosen.stop - chosen.start
+    assert policy.chunks == [(frames, frames)]
+    assert row.retrieval_model == "thumbnail@wrist/last/0.5"
+    assert (row.retrieval_start, row.retrieval_stop) == (chosen.start, chosen.stop)
+    assert (row.lesson_share, row.retrieval_selected_lesson_fraction) == (0.0, 0.0)
 
 
 def test_with_the_lesson_the_cheat_succeeds_at_once() -> None:

@@ -29,7 +29,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate import RunResult, run_evaluation
-from robomme_interference_data.evaluate.config import EXECUTION, IDENTITY, POLICY, RunConfig
+from robomme_interference_data.evaluate.config import IDENTITY, RunConfig
 from robomme_interference_data.evaluate.log import read_log
 from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA, TIMING_COLUMNS, Rollout
 
@@ -230,11 +230,13 @@ def test_another_run_is_refused_and_the_difference_named(
 
 def test_every_setting_is_classed() -> None:
     """A new setting either makes another run of it, or does not: somebody has to say which."""
-    assert {*IDENTITY, *POLICY} | {
+    assert {
+        *IDENTITY,
+        *("policy", "memory", "policy_options"),  # by policy_identity
+        *("retrieval", "retrieval_rule", "retrieval_camera"),  # by Selector.identity
         *("split", "split_name", "robomme_python", "check_lesson", "videos", "workers"),
         *("rollout_s", "simulator_s", "cache", "history_chunk", "max_errors"),
     } == {field.name for field in dataclasses.fields(RunConfig)}
-    assert not {*IDENTITY, *POLICY} & set(EXECUTION)
 
 
 def test_a_run_may_be_refused_if_one_is_there(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate import RunResult, run_evaluation, runner
 from robomme_interference_data.evaluate.checks import check_simulator, describe_policy
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.config import RunConfig, default_system
 from robomme_interference_data.evaluate.log import read_log
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
@@ -71,6 +71,22 @@ def config(**changes: Any) -> RunConfig:
             "has no embeddings of encoder 'thumbnail'",
         ),
         ({"policy": "python:__main__:make"}, InvalidOptionError, "worker processes run another"),
+        ({"retrieval_rule": "oracle"}, InvalidOptionError, "--retrieval-rule oracle says nothing"),
+        ({"retrieval_camera": "wrist"}, InvalidOptionError, "--retrieval-camera wrist says"),
+        (
+            {"retrieval": "thumbnail", "retrieval_rule": "top32"},
+            InvalidOptionError,
+            "a policy is handed a span",
+        ),
+        (
+            {
+                "retrieval": "thumbnail",
+                "retrieval_rule": "last/0.9",
+                "system": "retrieval-framesamp-modul",
+            },
+            InvalidOptionError,
+            "chooses by max, not by last/0.9",
+        ),
     ],
 )
 def test_what_cannot_work_is_refused_before_anything_is_written(
@@ -174,6 +190,30 @@ def test_a_name_is_given_to_the_policy_that_it_stands_for(
 
     made = config(policy=policy, memory=memory, retrieval=retrieval, system=system)
     _check_label(made, name_system(system))
+
+
+@pytest.mark.parametrize(
+    ("step", "name"),
+    [
+        ({}, "replay-window"),
+        ({"retrieval": "siglip"}, "retrieval-replay-window"),
+        ({"retrieval": "siglip", "retrieval_rule": "oracle"}, "retrieval-replay-window-oracle"),
+        (
+            {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
+            "retrieval-replay-window-max-0.9-wrist",
+        ),
+    ],
+)
+def test_rows_are_named_after_the_retrieval_step(step: dict[str, str], name: str) -> None:
+    from robomme_interference_data.evaluate.checks import _check_label
+    from robomme_interference_data.evaluate.systems import name_system
+
+    assert default_system("replay", "window", **step) == name
+    made = config(policy="replay", memory="window", system=name, **step)
+    _check_label(made, name_system(name))
+    if "retrieval_rule" in step:
+        with pytest.raises(InvalidOptionError, match="not the control retrieval-replay-window"):
+            _check_label(made, name_system("retrieval-replay-window"))
 
 
 def test_labels_are_checked_before_a_run(tmp_path: Path) -> None:

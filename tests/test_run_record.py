@@ -190,22 +190,25 @@ def test_another_version_of_the_suite_is_another_run(
         run(tmp_path / "run", **ONE)
 
 
-def test_another_encoder_behind_the_same_name_is_another_run(
+def test_another_retrieval_step_is_another_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     split = factories.copy_of_split(tmp_path / "split")
 
-    def again() -> dict[str, Any]:
+    def again(**changes: Any) -> dict[str, Any]:
         build_index(datasets_in(split), Thumbnail(), BuildProgress(quiet=True))
         out = tmp_path / "run"
-        run_evaluation(
-            CHEAT, split, out, simulator=WORLD, system="mine", retrieval="thumbnail", **ONE
-        )
+        step = {"system": "mine", "retrieval": "thumbnail"} | changes
+        run_evaluation(CHEAT, split, out, simulator=WORLD, **step, **ONE)
         return header(out)["identity"]["retrieval_index"]
 
     told = again()
     assert told.pop("fingerprint") and -1 < told.pop("threshold") < 1
     assert told == {"encoder": "thumbnail", "camera": "front", "method": "max", "cut": "adaptive"}
+    with pytest.raises(RunFolderError, match=r"retrieval_index\.method is 'max' there, 'oracle'"):
+        again(retrieval_rule="oracle")
+    with pytest.raises(RunFolderError, match=r"retrieval_index.cut is 'adaptive' there, 0\.5 here"):
+        again(retrieval_rule="max/0.5")
     other = Thumbnail().fingerprint | {"version": 99}
     monkeypatch.setattr(Thumbnail, "fingerprint", property(lambda _: other))
     with pytest.raises(RunFolderError, match=r"retrieval_index.fingerprint is '\w+' there, '\w+'"):
