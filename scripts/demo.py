@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DEMO = Path("demo")
 SHARED = Path("..") / "shared" / "data"
 SPLIT = DEMO / "split"
+THERE_BEFORE = (ROOT / DEMO).exists()
 COMMAND = Path(sys.executable).parent / "robomme-interference"
 
 FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour")
@@ -159,10 +160,17 @@ def load() -> None:
 
 
 def run(*parts: str) -> None:
-    """Print and run one of the project's commands."""
+    """Print and run one of the project's commands; end with its exit code if it fails."""
     words = " ".join(parts)
     say(f"\n$ robomme-interference {words}")
-    subprocess.run([str(COMMAND), *shlex.split(words)], cwd=ROOT, check=True)
+    code = subprocess.run([str(COMMAND), *shlex.split(words)], cwd=ROOT, check=False).returncode
+    if code and THERE_BEFORE:
+        say(
+            "\nSome of demo/ was there before. If an earlier version of the project made it, "
+            "start afresh: rm -r demo && make demo"
+        )
+    if code:
+        sys.exit(code)
 
 
 def say(text: str) -> None:
