@@ -196,6 +196,10 @@ def test_lenient_on_the_command_line(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert f"left out: {path}, line 3: unknown family 'MoveCub'" in done.stderr
     assert "| my-memory | 100.0% [20.7, 100.0] n=1 |" in done.stdout
+    assert isinstance(run("compare", path, path).exception, BadRowsError)
+    done = run("compare", path, path, "--lenient", "--json")
+    assert json.loads(done.stdout)["bad_rows"] == [1, 1]
+    assert done.stderr.count("unknown family 'MoveCub'") == 2
 
 
 def files(folder: Path) -> set[str]:

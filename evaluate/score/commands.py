@@ -13,12 +13,14 @@ from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.progress import MESSAGES
 
 if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.score.rollouts import Rollouts
     from robomme_interference_data.evaluate.score.scoring import Score
 
 __all__ = ["compare", "score"]
 
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
+Lenient = Annotated[bool, typer.Option("--lenient", help="Skip and count bad rows.")]
 
 
 class Against(StrEnum):
@@ -43,7 +45,7 @@ def score(
             "49 each), or those that any of the given rows is of."
         ),
     ] = Grid.BENCHMARK,
-    lenient: Annotated[bool, typer.Option("--lenient", help="Skip and count bad rows.")] = False,
+    lenient: Lenient = False,
     export_to: Annotated[
         Path | None,
         typer.Option("--export", help="Also write the rows here as the released CSVs have them."),
@@ -65,10 +67,7 @@ def score(
     from robomme_interference_data.evaluate.score.scoring import score as compute
 
     found = compute(rows, system, lenient, grid, against is Against.PAPER)
-    for refusal in found.rollouts.refusals:
-        MESSAGES.print(f"left out: {refusal}")
-    if found.rollouts.refused:
-        MESSAGES.print(f"{found.rollouts.refused:,} bad rows left out")
+    _tell_refused(found.rollouts)
     for note in found.notes:
         MESSAGES.print(note)
     with MESSAGES.status("Drawing the figures"):
@@ -81,6 +80,13 @@ def score(
     else:
         typer.echo(main_markdown(found.cells))
     MESSAGES.print(f"Report: {out / 'report.html'}")
+
+
+def _tell_refused(rollouts: "Rollouts") -> None:
+    for refusal in rollouts.refusals:
+        MESSAGES.print(f"left out: {refusal}")
+    if rollouts.refused:
+        MESSAGES.print(f"{rollouts.refused:,} bad rows left out")
 
 
 def _as_dict(found: "Score") -> dict[str, Any]:
@@ -105,6 +111,7 @@ def compare(
     system_b: Annotated[
         str | None, typer.Option(help="Name of the system of rows of B that name none.")
     ] = None,
+    lenient: Lenient = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare two runs, paired over the episodes that both have.
@@ -113,11 +120,14 @@ def compare(
     """
     from robomme_interference_data.evaluate.score.compare import compare as compute
 
-    found = compute(run_a, run_b, (system_a, system_b))
+    found = compute(run_a, run_b, (system_a, system_b), lenient)
+    for rollouts in found.runs:
+        _tell_refused(rollouts)
     for note in found.notes:
         MESSAGES.print(note)
     if as_json:
-        value = {"notes": list(found.notes), "rows": found.table.records()}
+        bad = [rollouts.refused for rollouts in found.runs]
+        value = {"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()}
         typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
     else:
         typer.echo(found.table.markdown())

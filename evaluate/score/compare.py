@@ -42,14 +42,19 @@ class Comparison:
         table: A row per condition, then per condition and family.
         notes: What a reader must know: that revisions differ, how many episodes flip between two
             runs of one system, what only one of the runs holds.
+        runs: The rows of the two runs.
     """
 
     table: Table
     notes: tuple[str, ...]
+    runs: tuple[Rollouts, Rollouts]
 
 
 def compare(
-    first: Path, second: Path, systems: tuple[str | None, str | None] = (None, None)
+    first: Path,
+    second: Path,
+    systems: tuple[str | None, str | None] = (None, None),
+    lenient: bool = False,
 ) -> Comparison:
     """Compare two runs of one simulator over the conditions and episodes that both have.
 
@@ -60,12 +65,15 @@ def compare(
         first: Folder or file of rows.
         second: The other one. Differences are its rate − the first's.
         systems: Names of the systems of rows that name none.
+        lenient: Skip and count bad rows.
 
     Raises:
         InvalidOptionError: They have no simulator, system, condition or episode in common.
         BadRowsError: Rows are bad.
     """
-    one, other = (read_rollouts([p], s) for p, s in zip((first, second), systems, strict=True))
+    one, other = (
+        read_rollouts([p], s, lenient) for p, s in zip((first, second), systems, strict=True)
+    )
     seeds = _seeds(one, other)
     rows: list[tuple[Any, ...]] = []
     notes = list(_differing(one, other))
@@ -99,7 +107,8 @@ def compare(
     note += note_of([(row[place], row[pairs]) for row in rows])
     corrected = holm([row[-1] for row in rows])
     whole = tuple((*row, p) for row, p in zip(rows, corrected, strict=True))
-    return Comparison(Table("compare", "Two runs compared", columns, whole, note), tuple(notes))
+    table = Table("compare", "Two runs compared", columns, whole, note)
+    return Comparison(table, tuple(notes), (one, other))
 
 
 def _pairs(one: Rollouts, other: Rollouts) -> Iterator[tuple[Outcomes, Outcomes]]:
