@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from operator import mul
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,8 @@ def main() -> None:
     )
     parser.add_argument("--draws", type=positive, default=10_000, help="of each bootstrap")
     options = parser.parse_args()
+    if not find_spec("pandas"):
+        sys.exit("pandas is needed to compare with: pip install pandas")
     print(machine("pyarrow", "pandas", "numpy", "scipy"), end="\n\n")
     with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
         folder = Path(name)
@@ -300,8 +303,4 @@ WAYS: dict[str, Callable[[Path, Path, int], None]] = {
 
 
 if __name__ == "__main__":
-    try:
-        import pandas  # noqa: F401
-    except ImportError:
-        sys.exit("pandas is needed to compare with: pip install pandas")
     main()
