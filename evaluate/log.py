@@ -78,7 +78,8 @@ class RunLog:
             FormatError: There is a finished row of this key already.
             OSError: The file cannot be written; it is named.
         """
-        if row.key in self.finished:
+        before = self.rows.get(row.key)
+        if before is not None and before.status != Status.ERROR:
             raise FormatError(f"{self.folder} has a row of {row.key} already")
         line = (canonical_json(row.as_dict()) + "\n").encode()
         path = self.folder / LOG_NAME

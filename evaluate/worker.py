@@ -27,7 +27,7 @@ from robomme_interference_data.simulators.base import Simulator, Status
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.workers import worker_number
 
-__all__ = ["RolloutWorker", "error_row", "make_selector", "simulator_options"]
+__all__ = ["RolloutWorker", "error_row", "simulator_options"]
 
 
 class RolloutWorker:
