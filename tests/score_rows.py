@@ -33,6 +33,7 @@ OUTCOMES = {
     (OWN, NO_HISTORY): "sfffffffffff",  # 1 of 12
     (OWN, "k0"): "sseff-ffffff",  # 2 of 10: an error and a missing row
 }
+GOOD = "my-memory,MoveCube,k0,0,7,easy,success,1,100"  # a line of the layout of `released`
 STATUS = {"s": "success", "f": "fail", "t": "timeout", "e": "error"}
 
 
