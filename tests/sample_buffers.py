@@ -8,12 +8,13 @@ import factories
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data import Buffer, SessionEntry, Split, load_split
+from robomme_interference_data import Buffer, SessionEntry, Split, load_buffer, load_split
 from robomme_interference_data.digest import combine
 from robomme_interference_data.schema import BufferManifest
 
 CAMERAS = ("front", "wrist")
 EPISODE = "VideoUnmask/test/1"
+QUERY = "VideoRepick/test/1"  # its lesson has 36 frames
 BUFFERS = [
     (f"{family}/test/{index}", k)
     for family in factories.FAMILIES
@@ -127,3 +128,28 @@ def made_up(name: str) -> list[SessionEntry]:
         "many": [lesson, *([first, second, third] * 21)],
         "single frames": [span(lesson, n, n + 1) for n in (7, 3, 3, 35)],
     }[name]
+
+
+def load(k: int = 3, query: str = QUERY) -> Buffer:
+    return load_buffer(query, k, factories.split())
+
+
+def reshaped(buffer: Buffer, frames: list[int], **changes: object) -> Buffer:
+    """The buffer with other sessions: the lesson and then its units in turn, so many frames each.
+
+    More frames than are stored are had by holding each of them.
+    """
+    entries = []
+    for number, count in enumerate(frames):
+        known = buffer.manifest.sessions
+        entry = known[0] if number == 0 else known[1 + (number - 1) % (len(known) - 1)]
+        repeat = -(-count // entry.stop)
+        entries.append(replace(entry, stop=count // repeat, repeat=repeat))
+    manifest = replace(
+        buffer.manifest,
+        k=max(0, len(entries) - 1),
+        sessions=tuple(entries),
+        history_frames=sum(entry.num_frames for entry in entries),
+        **changes,
+    )
+    return Buffer(manifest, buffer._datasets)
