@@ -140,6 +140,16 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let builds encode in this process, not in workers."""
+    from recordings import run_here
+
+    from robomme_interference_data.build_dataset import build as build_module
+
+    monkeypatch.setattr(build_module, "run_tasks", run_here)
+
+
+@pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the simulator `rollout_doubles:World` find the sample split, in workers too."""
     import factories
