@@ -140,6 +140,34 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let builds encode in this process, not in workers."""
+    from recordings import run_here
+
+    from robomme_interference_data.build_dataset import build as build_module
+
+    monkeypatch.setattr(build_module, "run_tasks", run_here)
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the simulator `rollout_doubles:World` find the sample split, in workers too."""
+    import factories
+    import rollout_doubles
+
+    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
+
+
+@pytest.fixture
+def troubled_world(world: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Let it find a folder `trouble` too, whose files make episodes break."""
+    import rollout_doubles
+
+    (tmp_path / "trouble").mkdir()
+    monkeypatch.setenv(rollout_doubles.TROUBLE, str(tmp_path / "trouble"))
+
+
+@pytest.fixture
 def run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str, str]]:

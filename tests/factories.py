@@ -18,6 +18,7 @@ from robomme_interference_data.progress import BuildProgress
 
 FAMILIES = ("VideoRepick", "VideoUnmask", "MoveCube", "PatternLock")
 K = (0, 1, 3)
+CAMERAS = ("observation.images.front", "observation.images.wrist")
 
 
 def build(

@@ -1,8 +1,13 @@
-"""Small LeRobot policies with weights at random, saved with their processors."""
+"""Small LeRobot policies with weights at random, saved with their processors, and played."""
 
+import json
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import (
@@ -11,9 +16,13 @@ from lerobot.policies.factory import (
     make_pre_post_processors,
 )
 
+from robomme_interference_data.evaluate.policies.base import RolloutInfo
+from robomme_interference_data.simulators.base import Observation
+
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 STATE, ACTION = "observation.state", "action"
 SIZE = 256
+SEED = 5
 
 SMALL: dict[str, dict[str, Any]] = {
     "act": {
@@ -85,3 +94,69 @@ def save_policy(
     for part in (policy, before, after):
         part.save_pretrained(folder)
     return folder
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Models this small are slower on several threads, and much slower on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_policy(tmp_path_factory.mktemp("act"), "act")
+
+
+@pytest.fixture(scope="module")
+def vqbet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_policy(tmp_path_factory.mktemp("vqbet"), "vqbet", (FRONT,))
+
+
+@cache
+def section(start: int, stop: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Made-up frames and states, each number its own."""
+    frames = {"front": [], "wrist": []}
+    states = []
+    for number in range(start, stop):
+        draw = np.random.default_rng(number)
+        for part in frames.values():
+            coarse = draw.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+            part.append(coarse.repeat(SIZE // 8, 0).repeat(SIZE // 8, 1))
+        states.append(draw.normal(size=8).astype(np.float32))
+    return {name: np.stack(part) for name, part in frames.items()}, np.stack(states)
+
+
+def observation(number: int) -> Observation:
+    frames, states = section(number, number + 1)
+    return Observation({name: part[0] for name, part in frames.items()}, states[0])
+
+
+def only(cameras: tuple[str, ...], frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: frames[name] for name in cameras}
+
+
+def play(policy: Any, history: int, live: list[int]) -> list[np.ndarray]:
+    """Give history in two chunks, then live frames; return the actions of each time."""
+    policy.reset(RolloutInfo("pick the cube", history, SEED))
+    if policy.wants_history and history:
+        for start, stop in [(0, history // 2), (history // 2, history)]:
+            if stop > start:
+                frames, states = section(start, stop)
+                policy.add_history(only(policy.history_cameras, frames), states, history)
+    at, actions = history, []
+    for count in live:
+        frames, states = section(at, at + count)
+        policy.observe(only(policy.cameras, frames), states)
+        at += count
+        actions.append(policy.act(observation(at - 1), "pick the cube"))
+    return actions
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    path = folder / "config.json"
+    config = json.loads(path.read_text(encoding="utf-8"))
+    change(config)
+    path.write_text(json.dumps(config), encoding="utf-8")

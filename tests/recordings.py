@@ -56,6 +56,9 @@ def listed(
     )
 
 
+EPISODES = [listed(f"{family}/train/{i}") for family in ("MoveCube", "Drawer") for i in range(2)]
+
+
 def images_of(episode: SourceEpisode, camera: str) -> NDArray[np.uint8]:
     """All raw frames of a camera, `(T, H, W, 3) uint8`: noise, unlike in every episode."""
     shape = (episode.raw_length, *episode.cameras[camera], 3)

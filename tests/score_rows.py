@@ -4,11 +4,14 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
+from robomme_interference_data.cli import app
 from robomme_interference_data.evaluate.rows import NO_HISTORY, ROLLOUT_SCHEMA, Rollout
 
 BASE, RETRIEVAL, OWN = "perceptual-framesamp-modul", "retrieval-framesamp-modul", "my-memory"
@@ -33,6 +36,7 @@ OUTCOMES = {
     (OWN, NO_HISTORY): "sfffffffffff",  # 1 of 12
     (OWN, "k0"): "sseff-ffffff",  # 2 of 10: an error and a missing row
 }
+GOOD = "my-memory,MoveCube,k0,0,7,easy,success,1,100"  # a line of the layout of `released`
 STATUS = {"s": "success", "f": "fail", "t": "timeout", "e": "error"}
 
 
@@ -96,3 +100,8 @@ def released(path: Path, lines: Sequence[str]) -> Path:
     header = "system,family,condition,episode,seed,difficulty,status,success,steps"
     path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
     return path
+
+
+def run(*arguments: str | Path) -> Any:
+    """What the command line does, in this process."""
+    return CliRunner().invoke(app, list(map(str, arguments)))

@@ -16,12 +16,9 @@ from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIA
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS, System
 from robomme_interference_data.ids import EpisodeId
 
+pytestmark = pytest.mark.usefixtures("world")
+
 PAGE = (Path(__file__).parent.parent / "docs" / "systems.md").read_text(encoding="utf-8")
-
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
 
 
 def row(system: System) -> list[str]:

@@ -1,7 +1,5 @@
 """One rollout: what the policy gets, when, and what is written of it."""
 
-import dataclasses
-import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ import factories
 import numpy as np
 import pytest
 import rollout_doubles
+from rollout_calls import EPISODE, config, roll
 from rollout_doubles import Cheat, World
 
 from robomme_interference_data import load_split
@@ -20,51 +19,20 @@ from robomme_interference_data.errors import (
     RolloutError,
     SimulatorCrashError,
 )
-from robomme_interference_data.evaluate import rollout, systems
-from robomme_interference_data.evaluate.agreement import check_lesson
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate import systems
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.builtin import make_builtin
 from robomme_interference_data.evaluate.retrieval import make_selector
 from robomme_interference_data.evaluate.rollout import run_rollout
-from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.progress import BuildProgress
 from robomme_interference_data.retrieval.commands import datasets_in
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.selector import Selection
-from robomme_interference_data.simulators.base import Observation, Status
+from robomme_interference_data.simulators.base import Status
 
-EPISODE = EpisodeId("PatternLock", "test", 1)  # a lesson of 36 frames
-
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
-
-
-def config(**changes: Any) -> RunConfig:
-    split = load_split(factories.split())
-    made = RunConfig("mine", "cheat", None, "world", str(split.root), split.name, split.revision)
-    return dataclasses.replace(made, **changes)
-
-
-def roll(
-    condition: str,
-    policy: Any,
-    episode: EpisodeId = EPISODE,
-    simulator: World | None = None,
-    **changes: Any,
-) -> Rollout:
-    settings = config(**changes)
-    return run_rollout(
-        settings,
-        WorkItem(condition, episode),
-        simulator=simulator or World(),
-        policy=policy,
-        split=load_split(settings.split),
-    )
+pytestmark = pytest.mark.usefixtures("world")
 
 
 class Patient(World):
@@ -140,101 +108,6 @@ def test_retrieval_hands_over_what_its_rule_chose_of_its_cameras_frames(tmp_path
     assert (row.lesson_share, row.retrieval_selected_lesson_fraction) == (0.0, 0.0)
 
 
-def test_with_the_lesson_the_cheat_succeeds_at_once() -> None:
-    policy = Cheat()
-    row = roll("k0", policy)
-    assert (row.status, row.success, row.steps) == ("success", True, 1)
-    assert policy.info.simulator is None  # only privileged policies get it
-
-
-def test_without_history_even_a_cheat_sees_nothing_of_the_demonstration() -> None:
-    for check in (False, True):  # also where the simulator is asked for the demonstration
-        row = roll("no-history", Cheat(), check_lesson=check)
-        assert (row.status, row.success, row.steps) == ("fail", False, 40)
-        assert (row.history_frames, row.lesson_frames, row.lesson_share) == (0, 0, None)
-
-
-def lesson() -> Buffer:
-    return load_split(factories.split()).load(EPISODE, 0)
-
-
-def tell_the_policy(patch: pytest.MonkeyPatch) -> None:
-    """Eight frames of the demonstration as the first live ones."""
-    live = rollout._live
-
-    def leak(policy: Any, *rest: Any) -> Any:
-        policy.observe({"front": lesson().frames("front")[:8]}, np.zeros((8, 8), np.float32))
-        return live(policy, *rest)
-
-    patch.setattr(rollout, "_live", leak)
-
-
-def change_live(patch: pytest.MonkeyPatch, **changes: Any) -> None:
-    """Change the first live observation, or the goal, that the policy gets."""
-    live = rollout._live
-
-    def leak(policy: Any, simulator: Any, first: Observation, goal: str, *rest: Any) -> Any:
-        said = changes.pop("goal", goal)
-        return live(policy, simulator, dataclasses.replace(first, **changes), said, *rest)
-
-    patch.setattr(rollout, "_live", leak)
-
-
-def show_a_frame(patch: pytest.MonkeyPatch) -> None:
-    change_live(patch, images={"front": lesson().frame(7, "front")})
-
-
-def show_a_state(patch: pytest.MonkeyPatch) -> None:
-    change_live(patch, state=lesson().states[7])
-
-
-def write_a_state(patch: pytest.MonkeyPatch) -> None:
-    change_live(patch, goal=f"go to {' '.join(f'{x:.9f}' for x in lesson().states[5].tolist())}")
-
-
-def change_info(patch: pytest.MonkeyPatch, name: str, value: Any) -> None:
-    told = rollout.RolloutInfo
-
-    def leak(*fields: Any) -> Any:
-        info = told(*fields)
-        object.__setattr__(info, name, value)
-        return info
-
-    patch.setattr(rollout, "RolloutInfo", leak)
-
-
-def inform_of_a_frame(patch: pytest.MonkeyPatch) -> None:
-    change_info(patch, "hint", {"frames": [lesson().frame(20, "wrist")]})
-
-
-def inform_of_a_state(patch: pytest.MonkeyPatch) -> None:
-    change_info(patch, "goal", f"{lesson().states[5].astype(np.float64).tolist()}")
-
-
-def hand_over_the_simulator(patch: pytest.MonkeyPatch) -> None:
-    world = World()
-    world.reset(str(EPISODE))
-    change_info(patch, "simulator", world)
-
-
-def feed_the_lesson(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(WorkItem, "k", 0)
-
-
-LEAKS = [
-    *(tell_the_policy, show_a_frame, show_a_state, write_a_state),
-    *(inform_of_a_frame, inform_of_a_state, hand_over_the_simulator, feed_the_lesson),
-]
-
-
-@pytest.mark.parametrize("leak", LEAKS)
-def test_whatever_leaks_the_cheat_finds_it(leak: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that the test above can fail: a rollout that leaks in any of these ways succeeds."""
-    leak(monkeypatch)
-    row = roll("no-history", Cheat())
-    assert (row.status, row.steps) == ("success", 1)
-
-
 @pytest.mark.parametrize("chunk", [1, 10, 64, 500])
 def test_the_history_is_the_buffer_in_chunks(chunk: int) -> None:
     policy = Cheat()
@@ -303,89 +176,6 @@ def test_the_oracle_gets_the_simulator_and_others_do_not() -> None:
 
 def test_hold_does_nothing() -> None:
     assert roll("k0", make_builtin("hold")).status == "fail"
-
-
-# --- what contradicts each other ---------------------------------------------------------------
-
-
-def test_check_lesson_passes_where_all_is_equal() -> None:
-    assert roll("k0", Cheat(), check_lesson=True).status == "success"
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        ("frame", "frame 7 of the lesson's wrist camera is not what the simulator shows"),
-        ("state", "the lesson's states are not the simulator's"),
-        ("length", "the lesson has 36 frames, the simulator's demonstration 35"),
-        ("view", "the first live front view is not the recorded query frame"),
-    ],
-)
-def test_check_lesson_names_what_differs(spoil: str, message: str) -> None:
-    lesson, first, _ = World().reset(str(EPISODE))
-    images = {name: frames.copy() for name, frames in lesson.images.items()}
-    states = lesson.states.copy()
-    if spoil == "frame":
-        images["wrist"][7, 0, 0, 0] ^= 1
-    if spoil == "state":
-        states[3, 2] += 1e-6
-    if spoil == "length":
-        states = states[1:]
-    if spoil == "view":
-        first = Observation({**first.images, "front": first.images["front"] ^ 1}, first.state)
-    played = dataclasses.replace(lesson, images=images, states=states)
-    with pytest.raises(RolloutError, match=message):
-        check_lesson(load_split(factories.split()).load(EPISODE, 0), played, first)
-
-
-@pytest.mark.parametrize("condition", ["no-history", "k3"])
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        ("seed", r"seed is \d+ in the dataset, \d+ in the simulator"),
-        ("difficulty", "difficulty is '.*' in the dataset, 'other' in the simulator"),
-        ("goal", "goal is '.*' in the dataset, 'do something else' in the simulator"),
-        ("length", "length of the lesson is 36 in the dataset, 35 in the simulator"),
-        ("state", r"the first live state is 0\.0110 away from the recorded one; .* at most 0\.01$"),
-        ("nan", "the first live state is nan away"),
-    ],
-)
-def test_another_version_of_the_simulator_is_noticed(
-    condition: str, spoil: str, message: str
-) -> None:
-    class Other(World):
-        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
-            lesson, first, info = super().reset(episode_id, demonstration)
-            state = first.state.copy()
-            state[4] += {"state": 0.011, "nan": np.nan}.get(spoil, 0)
-            changes: dict[str, dict[str, Any]] = {
-                "seed": {"seed": info.seed + 1},
-                "difficulty": {"difficulty": "other"},
-                "goal": {"goal": "do something else", "goals": ("do something else",)},
-            }
-            if spoil == "length":
-                lesson = dataclasses.replace(lesson, states=lesson.states[1:])
-            return (
-                lesson,
-                Observation(first.images, state),
-                dataclasses.replace(info, **changes.get(spoil, {})),
-            )
-
-    with pytest.raises(RolloutError) as raised:
-        roll(condition, Cheat(), simulator=Other())
-    assert re.search(message, raised.value.message)
-    assert "another version of the simulator" in (raised.value.hint or "")
-
-
-def test_what_another_machine_or_source_changes_is_let_pass() -> None:
-    class Near(World):
-        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
-            lesson, first, info = super().reset(episode_id, demonstration)
-            goals = ("in other words", *info.goals)
-            info = dataclasses.replace(info, goal=goals[0], goals=goals)
-            return lesson, Observation(first.images, first.state + np.float32(0.009)), info
-
-    assert roll("k0", Cheat(), simulator=Near()).status == "success"
 
 
 # --- policies and simulators that break --------------------------------------------------------

@@ -4,10 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import factories
 import pytest
-import rollout_doubles
-from test_run import run, untimed
+from run_calls import run, untimed
 from typer.testing import CliRunner
 
 from robomme_interference_data.cli import app
@@ -15,12 +13,7 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError, Ru
 from robomme_interference_data.evaluate import merge_runs
 from robomme_interference_data.evaluate.log import read_log
 
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
-    (tmp_path / "trouble").mkdir()
-    monkeypatch.setenv(rollout_doubles.TROUBLE, str(tmp_path / "trouble"))
+pytestmark = pytest.mark.usefixtures("troubled_world")
 
 
 def shards(tmp_path: Path, count: int = 3, **changes: Any) -> list[Path]:

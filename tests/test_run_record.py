@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import rollout_doubles
 from policy_server import PolicyServer
-from test_run import CHEAT, WORLD, run, untimed
+from run_calls import CHEAT, WORLD, run, untimed
 
 from robomme_interference_data.errors import FormatError, RunFolderError
 from robomme_interference_data.evaluate import merge_runs, run_evaluation, runner
@@ -22,12 +22,9 @@ from robomme_interference_data.retrieval.commands import datasets_in
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 
+pytestmark = pytest.mark.usefixtures("world")
+
 ONE: dict[str, Any] = {"families": ["MoveCube"], "episodes": "0", "conditions": ["no-history"]}
-
-
-@pytest.fixture(autouse=True)
-def _world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
 
 
 def header(folder: Path) -> dict[str, Any]:

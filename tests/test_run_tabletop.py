@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from run_calls import untimed
 from test_benchmarks import printed
-from test_run import untimed
 
 from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.evaluate import run_evaluation
