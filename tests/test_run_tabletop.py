@@ -75,8 +75,6 @@ def test_the_benchmark_prints_the_overhead_and_what_a_second_worker_brings(split
     ((episode, steps, seconds, *ratios, frames),) = overhead
     assert episode == "MoveCube/test/0"
     assert int(steps) > 50 and int(frames) > 50 and float(seconds) > 0
-    without, k0, cached, but_decoding = map(float, ratios)
-    assert 0 < but_decoding < k0
-    assert without > 0 and cached > 0
+    assert len(ratios) == 3 and all(float(ratio) > 0 for ratio in ratios)
     assert [row[0] for row in workers] == ["1", "2"]
     assert workers[0][2] == "1.00" and float(workers[1][2]) > 0
