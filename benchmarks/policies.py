@@ -3,6 +3,7 @@
 Server and client are two processes on the loopback interface. The adapter is given the frames of
 a k7 buffer, cuts them into messages of 16 and packs them; the bare client sends the same messages,
 packed beforehand, over the same kind of connection. Every message is answered before the next.
+The second part also decodes the buffer, which evaluate does while the server works.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from http import HTTPStatus
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,10 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from robomme_interference_data import load_split
+from robomme_interference_data.buffer import Buffer, Chunk
 from robomme_interference_data.constants import UNIT_FRAMES
+from robomme_interference_data.evaluate.ahead import read_ahead
 from robomme_interference_data.evaluate.policies.base import RolloutInfo
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
@@ -31,6 +36,7 @@ COLUMNS = ("<feeding", ">ms", ">MB/s", ">ratio")
 BARE = "bare send of the same bytes"
 FED = "WebsocketPolicy"
 READ = "WebsocketPolicy, server unpacks"
+IN_TURN, AHEAD = "decode a chunk, send it", "decode ahead, as evaluate does"
 OPTIONS: dict[str, Any] = {"compression": None, "max_size": None}
 
 
@@ -42,8 +48,11 @@ def main() -> None:
     # One frame more: the first live observation.
     images = draw.integers(0, 256, (frames + 1, 256, 256, 3), dtype=np.uint8)
     states = draw.normal(size=(frames + 1, 8)).astype(np.float32)
+    split = load_split(options.split, threads=1)
+    buffer = split.load(options.episode, split.k_values[-1])
     with servers() as ports:
         times, size = measure(ports, images, states, options.rounds)
+        decoding = measure_decoding(ports[1], buffer, options.rounds)
     print(machine("websockets", "msgpack"), end="\n\n", flush=True)
     messages = -(-len(images) // CHUNK)
     print(
@@ -60,6 +69,22 @@ def main() -> None:
                 ]
                 for way in (BARE, FED, READ)
             ],
+        ),
+        end="\n\n",
+    )
+    print(
+        table(
+            f"The k{buffer.k} buffer of {options.episode}, {len(buffer):,} frames, decoded and "
+            f"fed to the server that unpacks; medians of {options.rounds} rounds.",
+            ("<decoding and feeding", ">ms", ">ratio"),
+            [
+                [
+                    way,
+                    f"{decoding.median(way) * 1e3:.0f}",
+                    f"{decoding.ratio(way, IN_TURN):.2f}",
+                ]
+                for way in (IN_TURN, AHEAD)
+            ],
         )
     )
 
@@ -69,6 +94,10 @@ def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lesson", type=positive, default=246, help="frames of the lesson")
     parser.add_argument("--rounds", type=positive, default=7)
+    parser.add_argument(
+        "--split", type=Path, default=Path("demo/split"), help="of the buffer that is decoded"
+    )
+    parser.add_argument("--episode", default="MoveCube/test/0", metavar="ID")
     return parser.parse_args()
 
 
@@ -110,6 +139,27 @@ def measure(
 
         ways = {BARE: send, FED: lambda: feed(policies[0]), READ: lambda: feed(policies[1])}
         return interleave(ways, rounds), sum(map(len, messages))
+
+
+def measure_decoding(port: int, buffer: Buffer, rounds: int) -> Times:
+    """Time decoding and feeding a buffer, a chunk after the other and ahead."""
+    policy = WebsocketPolicy("127.0.0.1", port)
+
+    def feed(chunks: Iterator[Chunk]) -> None:
+        policy.reset(RolloutInfo(buffer.goal, len(buffer), 0))
+        for chunk in chunks:
+            policy.add_history(chunk.frames, chunk.states, len(buffer))
+        policy.observe({"front": buffer.query_frame()[None]}, buffer.query_state()[None])
+
+    def ahead() -> None:
+        with read_ahead(buffer.stream(64, ("front",)), 4) as chunks:
+            feed(chunks)
+
+    try:
+        ways = {IN_TURN: lambda: feed(buffer.stream(64, ("front",))), AHEAD: ahead}
+        return interleave(ways, rounds)
+    finally:
+        policy.close()
 
 
 @contextmanager

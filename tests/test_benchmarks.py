@@ -126,7 +126,8 @@ def test_manifests_prints_how_cost_grows() -> None:
 
 
 def test_policies_prints_the_rate_and_the_ratio_to_a_bare_send() -> None:
-    (rows,) = printed("policies", "--lesson", "10", "--rounds", "1")
+    split = ("--split", factories.split(), "--episode", "MoveCube/test/0")
+    rows, decoding = printed("policies", "--lesson", "10", "--rounds", "1", *split)
     assert [row[0] for row in rows] == [
         "bare send of the same bytes",
         "WebsocketPolicy",
@@ -138,6 +139,9 @@ def test_policies_prints_the_rate_and_the_ratio_to_a_bare_send() -> None:
     for _, milliseconds, rate, ratio in rows:
         assert is_quotient(rate, f"{size * 1e3:.0f}", milliseconds)
         assert float(ratio) > 0
+    (turn, in_turn, one), (name, ahead, ratio) = decoding
+    assert (turn, name) == ("decode a chunk, send it", "decode ahead, as evaluate does")
+    assert one == "1.00" and is_quotient(ratio, ahead, in_turn)
 
 
 @pytest.mark.slow
