@@ -122,7 +122,8 @@ def run_rollout(
     start, stop = 0, 0 if buffer is None else len(buffer)
     with ExitStack() as stack:
         history = None
-        if selector is None:  # What will be given is known: it is decoded while the episode begins.
+        # One that computes in this process holds Python's lock: decoding beside it slows both down.
+        if selector is None and getattr(simulator, "remote", False):
             history = stack.enter_context(_history(buffer, start, stop, policy, config))
         with clock.part("reset_s"), guard():
             demonstration, first, info = simulator.reset(

@@ -36,8 +36,9 @@ pytestmark = pytest.mark.usefixtures("world")
 
 
 class Patient(World):
-    """Begins an episode only when its history is being decoded."""
+    """Begins an episode in another process, and only when its history is being decoded."""
 
+    remote = True
     decoding = threading.Event()
 
     def reset(self, episode_id: str, demonstration: bool = True) -> Any:

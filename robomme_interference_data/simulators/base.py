@@ -97,7 +97,11 @@ class EpisodeInfo:
 
 
 class Simulator(Protocol):
-    """One episode at a time of the benchmark's task families."""
+    """One episode at a time of the benchmark's task families.
+
+    One that runs in another process may say so by `remote = True`: then `evaluate` decodes the
+    history while it begins the episode.
+    """
 
     def reset(
         self, episode_id: str, demonstration: bool = True

@@ -67,6 +67,7 @@ class RoboMMESimulator:
     """
 
     name = "robomme"
+    remote = True
 
     def __init__(
         self,

@@ -39,6 +39,8 @@ class RemoteSimulator:
         **options: For the simulator.
     """
 
+    remote = True
+
     def __init__(self, name: str = "tabletop", episode_s: float = 600.0, **options: Any):
         self._name, self._options = name, options
         self._episode_s = episode_s
