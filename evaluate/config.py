@@ -9,6 +9,7 @@ from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError, RunFolderError
 from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION
+from robomme_interference_data.retrieval.select import Rule
 
 __all__ = [
     "IDENTITY",
@@ -90,6 +91,7 @@ class RunConfig:
                 "the memory rule is no --policy-option, as it also names the system",
                 f"Give --memory {self.policy_options['memory']}.",
             )
+        Rule.parse(self.retrieval_rule)  # checks itself, before a name is made of it
         if self.retrieval is None:
             for name, value, usual in (
                 ("rule", self.retrieval_rule, _MAX),

@@ -40,6 +40,11 @@ pytestmark = pytest.mark.usefixtures("world")
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "--retrieval-rule oracle says nothing"),
         ({"retrieval_camera": "wrist"}, InvalidOptionError, "--retrieval-camera wrist says"),
         (
+            {"retrieval": "thumbnail", "retrieval_rule": "best!", "system": None},
+            UnknownNameError,
+            "there is no method 'best!'",
+        ),
+        (
             {"retrieval": "thumbnail", "retrieval_rule": "top32"},
             InvalidOptionError,
             "a policy is handed a span",
