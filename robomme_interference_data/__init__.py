@@ -3,19 +3,26 @@
 ```python
 from robomme_interference_data import load_buffer
 
-buffer = load_buffer("VideoRepick/test/7", k=3, split="my-split")
+buffer = load_buffer("VideoRepick/test/7", "k3", split="my-split")
 buffer.frames("front")  # (T, H, W, 3) uint8
 ```
 """
 
 from robomme_interference_data.buffer import Buffer, Chunk
 from robomme_interference_data.cache import DecodedCache
+from robomme_interference_data.conditions import Condition
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.loader import Split, load_buffer, load_split
-from robomme_interference_data.schema import BufferManifest, EpisodeRecord, SessionEntry
-from robomme_interference_data.sessions import Session
+from robomme_interference_data.query import Query
+from robomme_interference_data.records import (
+    BufferManifest,
+    EpisodeRecord,
+    Rollout,
+    Session,
+    SessionEntry,
+)
+from robomme_interference_data.split import Split, load_buffer, load_split
 
 __all__ = [
     # load
@@ -25,12 +32,15 @@ __all__ = [
     "Buffer",
     "Chunk",
     "Session",
+    "Query",
     "DecodedCache",
     # records
     "EpisodeId",
+    "Condition",
     "EpisodeRecord",
     "BufferManifest",
     "SessionEntry",
+    "Rollout",
     "Dataset",
     # errors (all of them: robomme_interference_data.errors)
     "InterferenceError",

@@ -2,36 +2,42 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.cache import DecodedCache
-from robomme_interference_data.constants import CAMERA_PREFIX, STATE
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.constants import STATE
+from robomme_interference_data.dataset import Dataset, camera_feature
 from robomme_interference_data.digest import combine
-from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
     StaleIndexError,
     UnknownNameError,
-    nearest,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema import BufferManifest
-from robomme_interference_data.sessions import Session, SessionReader
+from robomme_interference_data.query import Query
+from robomme_interference_data.records import (
+    BufferManifest,
+    Session,
+    SessionEntry,
+    place_sessions,
+)
 
 __all__ = ["Buffer", "Chunk"]
+
+_PIECE = 128
+"""Frames that one thread decodes at a time: a multiple of the key frame distance (16)."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive frames of a buffer, as `Buffer.stream` gives them.
+    """Consecutive frames of a buffer, as `Buffer.stream` gives them; the arrays are the caller's.
 
     Attributes:
         start: Index of the first frame in the buffer.
@@ -54,26 +60,30 @@ class Buffer:
 
     Attributes:
         manifest: What the buffer holds, by name.
+        query: The query episode: its goal, and what the robot sees first.
+        sessions: The sessions in order, with their places in the buffer.
     """
 
     def __init__(
         self,
         manifest: BufferManifest,
+        query: Query,
         datasets: Mapping[str, Dataset],
         *,
         cache: DecodedCache | None = None,
         threads: int | None = None,
     ):
         self.manifest = manifest
+        self.query = query
+        self.sessions = place_sessions(manifest.sessions)
         self._datasets = datasets
-        if threads is not None and threads < 1:
-            raise InvalidOptionError(f"threads={threads}; expected 1 or more")
-        self._reader = SessionReader(datasets, cache, threads or os.cpu_count() or 1)
+        self._cache = cache
+        self._threads = threads or os.cpu_count() or 1
 
     def __repr__(self) -> str:
         return (
-            f"Buffer({self.episode_id}, k={self.k}, frames={len(self)}, "
-            f"sessions={len(self.manifest.sessions)}, cameras={list(self.cameras)})"
+            f"Buffer({self.episode_id}, {self.condition}, frames={len(self)}, "
+            f"sessions={len(self.sessions)}, cameras={list(self.cameras)})"
         )
 
     def __len__(self) -> int:
@@ -86,8 +96,13 @@ class Buffer:
         return self.manifest.episode_id
 
     @property
+    def condition(self) -> str:
+        """Name of the condition, such as `k3`."""
+        return self.manifest.condition
+
+    @property
     def k(self) -> int:
-        """Number of distractor sessions."""
+        """Number of sessions that the condition adds."""
         return self.manifest.k
 
     @property
@@ -103,29 +118,25 @@ class Buffer:
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, such as `front` and `wrist`."""
-        names = self._datasets[self.manifest.query.dataset].cameras
-        return tuple(name.removeprefix(CAMERA_PREFIX) for name in names)
-
-    @cached_property
-    def sessions(self) -> tuple[Session, ...]:
-        """The sessions in order, with their places in the buffer."""
-        entries = self.manifest.sessions
-        stops = list(accumulate(entry.num_frames for entry in entries))
-        return tuple(
-            Session(e.role, e.family, e.source, stop - e.num_frames, stop, e)
-            for e, stop in zip(entries, stops, strict=True)
-        )
+        return self.query.dataset.cameras
 
     @property
     def session_index(self) -> NDArray[np.int64]:
-        """For each frame, the number of its session, `(T,) int64`."""
-        counts = [entry.num_frames for entry in self.manifest.sessions]
-        return np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+        """For each frame, the number of its session, `(T,) int64`; a new array."""
+        return np.repeat(np.arange(len(self.sessions), dtype=np.int64), list(map(len, self.sessions)))
 
     @cached_property
     def states(self) -> NDArray[np.float32]:
-        """Robot states, `(T, 8) float32`: joint positions in rad, gripper opening."""
-        return self._vectors(STATE)
+        """Robot states, `(T, 8) float32`: joint positions in rad, gripper opening; read-only."""
+        parts = [np.empty((0, *self.query.dataset.features[STATE]), np.float32)]
+        for entry in self.manifest.sessions:
+            values = self._datasets[entry.dataset].read_vectors(
+                entry.episode_index, STATE, entry.start, entry.stop
+            )
+            parts.append(np.repeat(values, entry.repeat, axis=0))
+        states = np.concatenate(parts)
+        states.setflags(write=False)
+        return states
 
     def frames(self, camera: str = "front") -> NDArray[np.uint8]:
         """Decode all frames of a camera, sessions side by side on several threads.
@@ -140,9 +151,14 @@ class Buffer:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
-        feature = self._feature(camera)
-        out = np.empty((len(self), *self._shape(feature)), np.uint8)
-        self._reader.read(self.sessions, feature, out)
+        out = np.empty((len(self), *self.query.dataset.shape(camera)), np.uint8)
+        with ThreadPoolExecutor(self._threads) as pool:
+            try:
+                for finish in [self._start_reading(s, camera, out, pool) for s in self.sessions]:
+                    finish()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
         return out
 
     def frame(self, index: int, camera: str = "front") -> NDArray[np.uint8]:
@@ -156,77 +172,13 @@ class Buffer:
             UnknownNameError: There is no such frame or camera.
             MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
         """
-        if not 0 <= index < len(self):
-            raise UnknownNameError(
-                f"frame {index} is not in the buffer of {self.episode_id} at k={self.k}, which "
-                f"has {len(self)} history frames, numbered from 0"
-            )
+        self._check_span(index, index + 1)
         session = self.sessions[bisect_right(self.sessions, index, key=lambda s: s.start) - 1]
-        feature = self._feature(camera)
-        out = np.empty((1, *self._shape(feature)), np.uint8)
-        self._reader.read_one(session, feature, index, out)
+        entry = session.entry
+        stored = entry.start + (index - session.start) // entry.repeat
+        out = np.empty((1, *self.query.dataset.shape(camera)), np.uint8)
+        self._datasets[entry.dataset].read_frames(entry.episode_index, camera, stored, out)
         return out[0]
-
-    def query_frame(self, camera: str = "front") -> NDArray[np.uint8]:
-        """Decode the first live observation, `(H, W, 3) uint8` RGB; not part of the buffer."""
-        query = self.manifest.query
-        feature = self._feature(camera)
-        out = np.empty((1, *self._shape(feature)), np.uint8)
-        self._datasets[query.dataset].read_frames(query.episode_index, feature, query.frame, out)
-        return out[0]
-
-    def query_state(self) -> NDArray[np.float32]:
-        """Return the state of the first live observation, `(8,) float32`; see `states`."""
-        query = self.manifest.query
-        dataset = self._datasets[query.dataset]
-        return dataset.read_vectors(query.episode_index, STATE, query.frame, query.frame + 1)[0]
-
-    def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
-        """Look up the embeddings of all frames; none is decoded.
-
-        Args:
-            encoder: Name of the encoder, such as `thumbnail`, whose index lies in the datasets.
-            camera: Name of the camera, with or without `observation.images.`.
-
-        Returns:
-            `(T, D) float16`, each of length 1, in the buffer's order.
-
-        Raises:
-            MissingIndexError: A dataset has no embeddings of this encoder and camera.
-            StaleIndexError: They were made of other data, with another encoder, or differently in
-                the two datasets.
-            FormatError: They are of an unknown version, or damaged.
-        """
-        parts = []
-        query = self.query_index(encoder, camera)
-        for entry in self.manifest.sessions:
-            index = self._datasets[entry.dataset].index(encoder, camera)
-            if index.made != query.made:
-                raise StaleIndexError(
-                    f"the embeddings of encoder {encoder!r} were made differently in "
-                    f"{self._datasets[self.manifest.query.dataset].files.describe()} and in "
-                    f"{self._datasets[entry.dataset].files.describe()}",
-                    "Make them again, both at once: robomme-interference index --data SPLIT "
-                    f"--encoder {encoder}",
-                )
-            values = index.span(entry.episode_index, entry.start, entry.stop)
-            parts.append(values if entry.repeat == 1 else np.repeat(values, entry.repeat, axis=0))
-        if len(parts) == 1:
-            return parts[0]
-        return np.concatenate(parts) if parts else np.empty((0, query.size), np.float16)
-
-    def query_embedding(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
-        """Look up the embedding of the first live observation, `(D,) float16`; see `embeddings`.
-
-        For grading without a simulator: in a rollout, what the robot sees is embedded then.
-        """
-        query = self.manifest.query
-        index = self.query_index(encoder, camera)
-        return index.span(query.episode_index, query.frame, query.frame + 1)[0]
-
-    def query_index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:
-        """Return the index of the query's dataset; see `embeddings` for the errors."""
-        return self._datasets[self.manifest.query.dataset].index(encoder, camera)
 
     def stream(
         self,
@@ -246,37 +198,63 @@ class Buffer:
             stop: Frame after its last one; None for the buffer's end.
 
         Raises:
-            InvalidOptionError: `chunk` is not positive, or the span is not inside the buffer.
-            UnknownNameError, MissingFileError, FormatError, TruncatedVideoError: As `frames`.
+            InvalidOptionError: `chunk` is not positive.
+            UnknownNameError: The span is not inside the buffer, or there is no such camera.
+            MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
         """
         if chunk < 1:
-            raise InvalidOptionError(f"chunk={chunk}; expected 1 or more")
+            raise InvalidOptionError.expected("chunk", chunk, "1 or more")
         end = len(self) if stop is None else stop
-        if not 0 <= start <= end <= len(self):
-            raise InvalidOptionError(
-                f"frames {start} to {end} are not inside the buffer of {self.episode_id} at "
-                f"k={self.k}, which has {len(self)} history frames, numbered from 0"
-            )
+        self._check_span(start, end)
         wanted = self.cameras if cameras is None else cameras
-        names = {name: self._feature(name) for name in wanted}
-        decoders = {
-            name: self._reader.iter_frames(self.sessions, feature, start, end)
-            for name, feature in names.items()
-        }
+        shapes = {name: self.query.dataset.shape(name) for name in wanted}
+        decoders = {name: self._iter_frames(name, start, end) for name in wanted}
         session_index = self.session_index
         try:
             for first in range(start, end, chunk):
                 last = min(first + chunk, end)
                 frames = {}
-                for name, feature in names.items():
-                    out = np.empty((last - first, *self._shape(feature)), np.uint8)
-                    for position in range(last - first):
-                        out[position] = next(decoders[name])
-                    frames[name] = out
-                yield Chunk(first, frames, self.states[first:last], session_index[first:last])
+                for name, shape in shapes.items():
+                    frames[name] = np.empty((last - first, *shape), np.uint8)
+                    for image in frames[name]:
+                        image[...] = next(decoders[name])
+                states = self.states[first:last].copy()
+                yield Chunk(first, frames, states, session_index[first:last].copy())
         finally:
             for decoder in decoders.values():
                 decoder.close()
+
+    def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
+        """Look up the embeddings of all frames; none is decoded.
+
+        Args:
+            encoder: Name of the encoder, such as `thumbnail`, whose index lies in the datasets.
+            camera: Name of the camera, with or without `observation.images.`.
+
+        Returns:
+            `(T, D) float16`, each of length 1, in the buffer's order; a new array.
+
+        Raises:
+            MissingIndexError: A dataset has no embeddings of this encoder and camera.
+            StaleIndexError: They were made of other data, with another encoder, or differently in
+                the datasets.
+            FormatError: They are of an unknown version, or damaged.
+        """
+        of_query = self.query.dataset.index(encoder, camera)
+        parts = [np.empty((0, of_query.header.size), np.float16)]
+        for entry in self.manifest.sessions:
+            index = self._datasets[entry.dataset].index(encoder, camera)
+            if index.made != of_query.made:
+                places = (self.query.dataset, self._datasets[entry.dataset])
+                raise StaleIndexError(
+                    f"the embeddings of encoder {encoder!r} were made differently in "
+                    f"{' and in '.join(place.files.describe() for place in places)}",
+                    "Make them again, both at once: robomme-interference index SPLIT "
+                    f"--encoder {encoder}",
+                )
+            values = index.span(entry.episode_index, entry.start, entry.stop)
+            parts.append(np.repeat(values, entry.repeat, axis=0))
+        return np.concatenate(parts)
 
     def verify(self) -> None:
         """Decode everything and compare it with the manifest's SHA-256.
@@ -284,43 +262,109 @@ class Buffer:
         Raises:
             HashMismatchError: A session's data is not what the manifest names.
         """
-        for session in self.sessions:
-            entry = session.entry
+        for entry in self.manifest.sessions:
             dataset = self._datasets[entry.dataset]
-            found = dataset.span_digests(entry.episode_index, entry.start, entry.stop)
+            [found] = dataset.digests(entry.episode_index, entry.start, [entry.stop])
             if combine(found) == entry.sha256:
                 continue
-            recorded = dataset.digests(entry.episode_index, entry.start, entry.stop) or {}
+            recorded = self._recorded(entry) or {}
             differing = [name for name in found if found[name] != recorded.get(name)]
             raise HashMismatchError(
-                f"{self.episode_id} at k={self.k}: {entry.role} {entry.source} "
-                f"({entry.dataset} episode {entry.episode_index}, frames {entry.start} to "
-                f"{entry.stop - 1}) does not have the SHA-256 of the manifest; differing: "
+                f"{self.manifest}: {entry.role} {entry.source} ({entry.dataset} episode "
+                f"{entry.episode_index}, frames {entry.start} to {entry.stop - 1}) does not have "
+                "the SHA-256 of the manifest; differing: "
                 f"{', '.join(differing) or 'the manifest itself'}",
                 "The data is damaged or belongs to another version: download or build it again, "
                 "then run robomme-interference verify SPLIT",
             )
 
-    def _vectors(self, feature: str) -> NDArray[np.float32]:
-        parts = []
-        for entry in self.manifest.sessions:
-            values = self._datasets[entry.dataset].read_vectors(
-                entry.episode_index, feature, entry.start, entry.stop
-            )
-            parts.append(np.repeat(values, entry.repeat, axis=0))
-        if not parts:
-            shape = self._datasets[self.manifest.query.dataset].features[feature]
-            return np.empty((0, *shape), np.float32)
-        return np.concatenate(parts)
-
-    def _feature(self, camera: str) -> str:
-        name = camera.removeprefix(CAMERA_PREFIX)
-        if name not in self.cameras:
+    def _check_span(self, start: int, stop: int) -> None:
+        if not 0 <= start <= stop <= len(self):
             raise UnknownNameError(
-                f"camera {camera!r} is not in the buffer of {self.episode_id}",
-                nearest(name, self.cameras),
+                f"frames {start} to {stop - 1} are not in the buffer of {self.manifest}, which has "
+                f"{len(self)} history frames, numbered from 0"
             )
-        return CAMERA_PREFIX + name
 
-    def _shape(self, feature: str) -> tuple[int, ...]:
-        return self._datasets[self.manifest.query.dataset].features[feature]
+    def _recorded(self, entry: SessionEntry) -> dict[str, str] | None:
+        """Return the recorded digests of a session by feature; None if none are recorded."""
+        record = self._datasets[entry.dataset].record(entry.episode_index)
+        return record.digests(entry.start, entry.stop)
+
+    def _cached_name(self, entry: SessionEntry, camera: str) -> str | None:
+        """Return the name of a session's frames in the cache; None without cache or digest."""
+        recorded = self._recorded(entry) if self._cache is not None else None
+        return recorded[camera_feature(camera)] if recorded else None
+
+    def _start_reading(
+        self, session: Session, camera: str, out: NDArray[np.uint8], pool: ThreadPoolExecutor
+    ) -> Callable[[], None]:
+        """Start to read a session into its place in `out`; the result waits until it is done."""
+        entry, cache = session.entry, self._cache
+        target = out[session.start : session.stop]
+        length = entry.stop - entry.start
+        name = self._cached_name(entry, camera)
+        if cache is not None and name is not None:
+            cached = cache.get(name, (length, *out.shape[1:]))
+            if cached is not None:
+                return pool.submit(_copy_repeated, target, cached, entry.repeat).result
+        span = target if entry.repeat == 1 else np.empty((length, *out.shape[1:]), np.uint8)
+        piece = _PIECE if self._threads > 1 else length
+        read = [
+            pool.submit(
+                self._datasets[entry.dataset].read_frames,
+                entry.episode_index,
+                camera,
+                entry.start + first,
+                span[first : first + piece],
+            )
+            for first in range(0, length, piece)
+        ]
+
+        def finish() -> None:
+            for future in read:
+                future.result()
+            if span is not target:
+                _copy_repeated(target, span, entry.repeat)
+            if cache is not None and name is not None:
+                cache.put(name, span)
+
+        return finish
+
+    def _iter_frames(self, camera: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
+        """Yield frames `start` to `stop` (excluded), `(H, W, 3) uint8`, in order."""
+        for session in self.sessions:
+            first, last = max(start, session.start), min(stop, session.stop)
+            if first >= last:
+                continue
+            entry = session.entry
+            stored = entry.start + (first - session.start) // entry.repeat
+            end = entry.start + -(-(last - session.start) // entry.repeat)
+            position = first
+            for frame in self._stored_frames(entry, camera, stored, end):
+                # A frame is shown until the next one's first place.
+                until = position + entry.repeat - (position - session.start) % entry.repeat
+                for position in range(position, min(last, until)):
+                    yield frame
+                position += 1
+
+    def _stored_frames(
+        self, entry: SessionEntry, camera: str, start: int, stop: int
+    ) -> Generator[NDArray[np.uint8]]:
+        """Yield stored frames, start inclusive, stop exclusive; with a cache, out of it."""
+        dataset, cache = self._datasets[entry.dataset], self._cache
+        name = self._cached_name(entry, camera)
+        if cache is None or name is None:
+            yield from dataset.iter_frames(entry.episode_index, camera, start, stop)
+            return
+        shape = (entry.stop - entry.start, *dataset.shape(camera))
+        frames = cache.get(name, shape)
+        if frames is None:
+            frames = np.empty(shape, np.uint8)
+            dataset.read_frames(entry.episode_index, camera, entry.start, frames)
+            cache.put(name, frames)
+        yield from frames[start - entry.start : stop - entry.start]
+
+
+def _copy_repeated(target: NDArray[np.uint8], frames: NDArray[np.uint8], repeat: int) -> None:
+    for offset in range(repeat):
+        target[offset::repeat] = frames

@@ -1,7 +1,9 @@
 """A cache of decoded frames: memory-mappable arrays by content hash, bounded in size."""
 
 import os
+import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -16,6 +18,9 @@ __all__ = ["DecodedCache", "default_cache_folder"]
 
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
 
+_told: set[Path] = set()
+"""Folders that could not be written to, which was said once."""
+
 
 def default_cache_folder() -> Path:
     """Return the folder for decoded frames, under `XDG_CACHE_HOME` or `~/.cache`."""
@@ -28,7 +33,8 @@ class DecodedCache:
     """Decoded frames of sessions, one `.npy` file each, named by the SHA-256 of the frames.
 
     Files that were not used for longest are removed when the folder outgrows its bound. Several
-    processes may share a folder: files appear whole, and one that vanishes is decoded again.
+    processes may share a folder: files appear whole, and one that vanishes is decoded again. Where
+    nothing can be written, as on a full disk, it says so once, and keeps nothing.
 
     Args:
         folder: Where the arrays lie; made when first written to.
@@ -55,18 +61,28 @@ class DecodedCache:
         path = self._path(sha256)
         try:
             frames = np.lib.format.open_memmap(path, mode="r")  # type: ignore[no-untyped-call]
-            os.utime(path)
         except (OSError, ValueError, TokenError):  # what numpy raises for damaged files
             return None
+        with suppress(OSError):  # a folder that only others may write
+            os.utime(path)
         return frames if frames.shape == shape and frames.dtype == np.uint8 else None
 
     def put(self, sha256: str, frames: NDArray[np.uint8]) -> None:
         """Store frames, unless they alone exceed the bound, and remove the least used ones."""
         if frames.nbytes + _HEADER > self.max_bytes:
             return
-        with atomic_path(self._path(sha256)) as partial, partial.open("wb") as file:
-            np.save(file, frames)
-        self._shrink()
+        try:
+            with atomic_path(self._path(sha256)) as partial, partial.open("wb") as file:
+                np.save(file, frames)
+            self._shrink()
+        except OSError as error:
+            if self.folder not in _told:
+                _told.add(self.folder)
+                warnings.warn(
+                    f"decoded frames are not kept in {self.folder}: {error.strerror or error}",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
 
     def _path(self, sha256: str) -> Path:
         return self.folder / f"{sha256}.npy"

@@ -3,6 +3,9 @@
 FORMAT_VERSION = 1
 """Version of the files that this package writes; a reader refuses one that it does not know."""
 
+PROTOCOL_VERSION = 1
+"""Version of the rules by which a rollout is run; rows of different versions never mix."""
+
 RULE_VERSION = 1
 """Version of the rule that draws distractor units for a query (see `draw.py`)."""
 
@@ -23,10 +26,10 @@ FAMILIES = (
 
 SPLITS = ("train", "val", "test")
 
-DEFAULT_K = (0, 1, 3, 7)
-"""Numbers of distractor sessions in the paper's conditions k0, k1, k3 and k7."""
+DIFFICULTIES = ("easy", "medium", "hard")
 
 MAX_K = 63
+"""Most sessions that a condition adds to the lesson (ours; the paper's most is 7)."""
 
 UNIT_FRAMES = 32
 """Stored frames in a distractor unit."""
@@ -43,6 +46,9 @@ MAX_STEPS = 1300
 POSITION_LIMIT = 4096
 """Steps for which released MME-VLA servers hold position embeddings."""
 
+ACTION_CHUNK = 16
+"""Actions of a chunk that are executed before the policy is asked again."""
+
 SAMPLE_FRAMES = 32
 """Frames that FrameSamp keeps of its whole history."""
 
@@ -57,7 +63,7 @@ STATE = "observation.state"
 ACTION = "action"
 CAMERA_PREFIX = "observation.images."
 
-# --- paths inside a dataset (LeRobot v3 layout, plus our two files in meta/) --------------------
+# --- paths inside a dataset (LeRobot v3 layout, plus our three files in meta/) ------------------
 
 INFO_PATH = "meta/info.json"
 TASKS_PATH = "meta/tasks.parquet"
@@ -65,11 +71,9 @@ STATS_PATH = "meta/stats.json"
 EPISODES_DIR = "meta/episodes"
 IDENTITY_PATH = "meta/interference.json"
 REPORT_PATH = "meta/build_report.json"
+SUMS_PATH = "meta/SHA256SUMS"
 INDEX_DIR = "index"
 INDEX_HEADER = "index.json"
-INDEX_EMBEDDINGS = "embeddings.npy"
-INDEX_ROWS = "rows.parquet"
-INDEX_CENTRE = "centre.npy"
 
 PAPER_ENCODER = "google/siglip-so400m-patch14-384"
 """Model that embeds frames in the paper; its index is `index/siglip`."""
@@ -79,6 +83,5 @@ PAPER_ENCODER = "google/siglip-so400m-patch14-384"
 DEMONSTRATIONS = "demonstrations"
 DISTRACTORS = "distractors"
 MANIFESTS = "manifests"
-MANIFEST_PARQUET = "buffers.parquet"
-MANIFEST_JSONL = "buffers.jsonl"
-MANIFEST_JSON = "manifest.json"
+MANIFEST_HEADER = "manifest.json"
+MANIFEST_ROWS = "buffers.parquet"

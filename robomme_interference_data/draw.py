@@ -25,11 +25,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 
-from robomme_interference_data.constants import FAMILIES, RULE_VERSION, SAMPLE_FRAMES
+from robomme_interference_data.constants import FAMILIES, RULE_VERSION
 from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["UnitPool", "even_sample", "lesson_share"]
+__all__ = ["UnitPool"]
 
 
 class UnitPool:
@@ -175,38 +175,3 @@ class _Eligible:
     def _joined(self, family: str, number: int) -> int:
         """Return in how many of the queries before `number` the family has joined."""
         return number * len(self.families[family]) // self.largest
-
-
-def even_sample(history_frames: int, samples: int = SAMPLE_FRAMES) -> list[int]:
-    """Return the frames that an even sample takes at the first step: FrameSamp's rule.
-
-    The sample is of the history and the first live observation together: all frames while there
-    are fewer than `samples`, else those at the integer `linspace(0, t, samples)`, t being the
-    index of the live observation.
-
-    Args:
-        history_frames: Frames of the history buffer; also the index of the live observation.
-        samples: Size of the sample, 2 or more.
-
-    Returns:
-        Indices, ascending; the last one is the live observation's.
-    """
-    if history_frames + 1 < samples:
-        return list(range(history_frames + 1))
-    # Exact integers: index j of linspace(0, t, n) is floor(j·t / (n − 1)).
-    return [j * history_frames // (samples - 1) for j in range(samples)]
-
-
-def lesson_share(lesson_frames: int, history_frames: int, samples: int = SAMPLE_FRAMES) -> float:
-    """Return the expected share of lesson frames in an even sample at the first step.
-
-    Args:
-        lesson_frames: Frames of the lesson, which comes first in the history.
-        history_frames: Frames of the whole history buffer, without the live observation.
-        samples: Size of the sample, 2 or more.
-
-    Returns:
-        Share from 0 to 1; the live observation counts as not lesson.
-    """
-    indices = even_sample(history_frames, samples)
-    return sum(index < lesson_frames for index in indices) / len(indices)

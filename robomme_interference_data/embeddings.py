@@ -1,29 +1,24 @@
 """Look up the embeddings of stored frames: the index that lies beside a dataset's frames.
 
-An index is made by `robomme-interference index` (the retrieval area); reading it needs numpy and
-pyarrow only. `docs/format.md` lists its files.
+An index is made by `robomme-interference index` (the retrieval area); reading it needs numpy
+only. Every episode has a file of its own. `docs/format.md` lists them.
 """
 
 import re
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data import parquet
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
-    FORMAT_VERSION,
-    INDEX_CENTRE,
     INDEX_DIR,
-    INDEX_EMBEDDINGS,
     INDEX_HEADER,
-    INDEX_ROWS,
     PAPER_ENCODER,
 )
 from robomme_interference_data.errors import (
@@ -33,17 +28,72 @@ from robomme_interference_data.errors import (
     StaleIndexError,
     UnknownNameError,
 )
-from robomme_interference_data.files import Files, LocalFiles, check_names, read_json, sha256_file
+from robomme_interference_data.files import Files, LocalFiles, parse_sums, sha256_file
+from robomme_interference_data.rows import read_header
 
-__all__ = ["EmbeddingIndex", "encoder_id", "index_folder", "normalised"]
+__all__ = [
+    "CENTRE_FILE",
+    "INDEX_SUMS",
+    "EmbeddingIndex",
+    "EncoderRecord",
+    "IndexHeader",
+    "encoder_id",
+    "episode_file",
+    "index_folder",
+    "normalised",
+]
 
-_BLOCK = 4096
-"""Embeddings that are looked through at a time."""
+CENTRE_FILE = "centre.npy"
+INDEX_SUMS = "SHA256SUMS"
 
-_HEADER_KEYS = (
-    *("encoder", "computed", "camera", "revision", "pool"),
-    *("frames", "size", "typical_cosine", "files"),
-)
+
+@dataclass(frozen=True)
+class EncoderRecord:
+    """What an index records of its encoder.
+
+    Attributes:
+        name: As `encoder_id` has it.
+        fingerprint: What determines the features: model, weights, preprocessing, code.
+        sha256: Over fingerprint and centre; only embeddings that share it are compared.
+    """
+
+    name: str
+    fingerprint: dict[str, Any]
+    sha256: str
+
+
+@dataclass(frozen=True)
+class IndexHeader:
+    """`index.json`, written last: without it there is no index.
+
+    Attributes:
+        format_version: Of the files.
+        encoder: The encoder.
+        computed: Device, precision and batch: they may change the last bits.
+        camera: Name of the camera that was embedded.
+        revision: Revision of the dataset.
+        pool: Revision of the distractor units that centre and typical cosine are of.
+        frames: Embeddings in all.
+        size: Values in an embedding.
+        typical_cosine: Median cosine of two frames of different distractor units of the pool.
+        sums: SHA-256 of `SHA256SUMS`, which lists the other files.
+    """
+
+    format_version: int
+    encoder: EncoderRecord
+    computed: dict[str, Any]
+    camera: str
+    revision: str
+    pool: str
+    frames: int
+    size: int
+    typical_cosine: float
+    sums: str
+
+
+def episode_file(episode_index: int) -> str:
+    """Return where an episode's embeddings lie inside the folder of an index."""
+    return f"chunk-{episode_index // 1000:03d}/episode-{episode_index:06d}.npy"
 
 
 def encoder_id(encoder: str) -> str:
@@ -126,7 +176,7 @@ class EmbeddingIndex:
         of = f"encoder {encoder!r}" + ("" if camera == "front" else f" and camera {camera!r}")
         option = "" if camera == "front" else f" --camera {camera}"
         self._remedy = (
-            f"Type: robomme-interference index --data {_data_of(files)} --encoder {encoder}{option}"
+            f"Type: robomme-interference index {_data_of(files)} --encoder {encoder}{option}"
         )
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
@@ -135,31 +185,20 @@ class EmbeddingIndex:
                 f"{self._root} has no embeddings of {of}", self._remedy
             ) from None
         try:
-            self.header = read_json(path)
+            self.header = read_header(path, IndexHeader)
         except FormatError as error:
-            raise self._damaged(error.message) from None
-        if self.header.get("format_version") != FORMAT_VERSION:
-            raise FormatError(
-                f"{path} has format version {self.header.get('format_version')!r}; this package "
-                f"reads {FORMAT_VERSION}",
-                "Install the version of robomme-interference-data that wrote it, or make it "
-                f"again. {self._remedy}",
-            )
-        try:
-            check_names(path, self.header, _HEADER_KEYS)
-        except FormatError as error:
-            raise self._damaged(error.message) from None
-        made = self.header["encoder"]["name"], self.camera.removeprefix(CAMERA_PREFIX)
+            raise FormatError(error.message, self._remedy) from None
+        made = self.header.encoder.name, self.header.camera
         if made != (encoder_id(encoder), camera):
             raise StaleIndexError(
                 f"the embeddings in {self._root}/{self._folder} are of encoder {made[0]!r} and "
                 f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
                 f"Give the encoder as {made[0]!r}, or make them anew. {self._remedy}",
             )
-        if self.header["revision"] != revision:
+        if self.header.revision != revision:
             raise StaleIndexError(
                 f"the embeddings of {of} in {self._root} were made of data with "
-                f"revision {str(self.header['revision'])[:12]}…; the data now has {revision[:12]}…",
+                f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
                 f"Make them again. {self._remedy}",
             )
 
@@ -168,137 +207,90 @@ class EmbeddingIndex:
         return self._files.describe()
 
     @property
-    def camera(self) -> str:
-        """Feature name of the camera that was embedded."""
-        return str(self.header["camera"])
-
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 over what determines the encoder's output; equal ones may be compared."""
-        return str(self.header["encoder"]["sha256"])
-
-    @property
     def made(self) -> tuple[str, str, str]:
         """What embeddings that are compared with each other share: encoder, camera and pool."""
-        return self.fingerprint, self.camera, self.pool
-
-    @property
-    def pool(self) -> str:
-        """Revision of the distractor units that `centre` and `typical_cosine` are of."""
-        return str(self.header["pool"])
-
-    @property
-    def size(self) -> int:
-        """Values in an embedding."""
-        return int(self.header["size"])
-
-    @property
-    def typical_cosine(self) -> float:
-        """Median cosine of two frames of different distractor units of the pool."""
-        return float(self.header["typical_cosine"])
+        return self.header.encoder.sha256, self.header.camera, self.header.pool
 
     @cached_property
     def centre(self) -> NDArray[np.float32] | None:
         """What is taken off the encoder's output before it is normalised, or None."""
-        if INDEX_CENTRE not in self.header["files"]:
+        if CENTRE_FILE not in self._sums:
             return None
-        centre = self._array(INDEX_CENTRE, (self.size,), np.float32)
-        return np.array(centre)
-
-    @cached_property
-    def embeddings(self) -> NDArray[np.float16]:
-        """All embeddings, `(frames, size) float16`, each of length 1; a read-only memory map.
-
-        Their file is compared with its SHA-256 first, once.
-        """
-        shape = int(self.header["frames"]), self.size
-        found = self._array(INDEX_EMBEDDINGS, shape, np.float16)
-        for first in range(0, len(found), _BLOCK):
-            if not np.isfinite(found[first : first + _BLOCK]).all():
-                raise self._damaged(f"{self._root}/{self._folder} holds what is no finite number")
-        return found
-
-    def check(self) -> None:
-        """Read all of it, and compare every file with its SHA-256.
-
-        Raises:
-            FormatError: A file is missing or damaged.
-        """
-        _ = self.embeddings, self.centre, self._first_rows
-
-    @cached_property
-    def _first_rows(self) -> dict[int, tuple[int, int]]:
-        """For each episode, the row of its first frame and the number of its frames."""
-        path = self._verified(INDEX_ROWS)
-        names = ("episode_index", "frame", "row")
-        try:
-            with parquet.reading(path), pq.ParquetFile(path) as file:
-                check_names(path, file.schema_arrow.names, names)
-                table = file.read(columns=list(names))
-                episodes, frames, rows = (table[name].to_numpy() for name in names)
-        except FormatError as error:
-            raise self._damaged(error.message) from None
-        firsts = np.flatnonzero(np.diff(episodes, prepend=-1))
-        counts = np.diff(firsts, append=len(episodes))
-        expected = np.arange(len(episodes)) - np.repeat(firsts, counts)
-        whole = (
-            len(rows) == self.header["frames"]
-            and len(np.unique(episodes)) == len(firsts)
-            and np.array_equal(frames, expected)
-            and np.array_equal(rows, np.arange(len(rows)))
-        )
-        if not whole:
-            raise self._damaged(
-                f"{path} does not list the frames of the episodes, one after the other"
-            )
-        starts = zip(episodes[firsts], firsts, counts, strict=True)
-        return {int(episode): (int(first), int(count)) for episode, first, count in starts}
+        return self._array(CENTRE_FILE, (self.header.size,), np.float32)
 
     def span(self, episode_index: int, start: int, stop: int) -> NDArray[np.float16]:
         """Return the embeddings of stored frames `start` to `stop` (excluded) of an episode.
 
         Returns:
-            `(stop - start, size) float16`: a view into the memory map.
+            `(stop - start, size) float16`, each of length 1; a new array.
 
         Raises:
             UnknownNameError: The index does not hold these frames.
             FormatError: A file of the index is missing or damaged.
         """
-        first, count = self._first_rows.get(episode_index, (0, 0))
-        if not 0 <= start <= stop <= count:
+        name = episode_file(episode_index)
+        found = self._array(name, (-1, self.header.size), np.float16) if name in self._sums else ()
+        if not 0 <= start <= stop <= len(found):
             raise UnknownNameError(
                 f"frames {start} to {stop - 1} of episode {episode_index} are not in "
-                f"{self._root}/{self._folder}, which has {count} frames of that episode",
+                f"{self._root}/{self._folder}, which has {len(found)} frames of that episode",
                 f"It is damaged: make it again. {self._remedy}",
             )
-        return self.embeddings[first + start : first + stop]
+        return np.asarray(found)[start:stop].copy()
+
+    def check(self, lengths: dict[int, int]) -> None:
+        """Read all of it: every file against its SHA-256, and the frames of every episode.
+
+        Args:
+            lengths: Stored frames of each episode of the dataset.
+
+        Raises:
+            FormatError: A file is missing or damaged, or one is too many.
+        """
+        _ = self.centre
+        for episode, length in lengths.items():
+            self.span(episode, 0, length)
+        expected = {episode_file(episode) for episode in lengths}
+        listed = {name.removeprefix(f"{self._folder}/") for name in self._files.list(self._folder)}
+        known = {*self._sums, INDEX_HEADER, INDEX_SUMS}
+        if extra := sorted(listed ^ known | (self._sums.keys() - expected - {CENTRE_FILE})):
+            raise self._damaged(f"{extra[0]} is missing, or too many")
+        if self.header.frames != sum(lengths.values()):
+            raise self._damaged(f"{self.header.frames} frames; the dataset has {sum(lengths.values())}")
+
+    @cached_property
+    def _sums(self) -> dict[str, str]:
+        path = self._path(INDEX_SUMS)
+        if sha256_file(path) != self.header.sums:
+            raise self._damaged(f"{INDEX_SUMS} does not have the SHA-256 of {INDEX_HEADER}")
+        return parse_sums(path.read_text(encoding="utf-8"), path)
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        path = self._verified(name)
+        path = self._path(name)
+        if sha256_file(path) != self._sums[name]:
+            raise self._damaged(f"{name} does not have the SHA-256 of {INDEX_SUMS}")
         try:
-            array = np.load(path, mmap_mode="r")
+            array = np.load(path)
         except (OSError, ValueError, EOFError) as error:
-            raise self._damaged(f"{path} cannot be read: {error}") from None
-        if array.shape != shape or array.dtype != dtype:
+            raise self._damaged(f"{name} cannot be read: {error}") from None
+        fits = array.ndim == len(shape) and all(
+            side in (-1, found) for side, found in zip(shape, array.shape, strict=True)
+        )
+        if not fits or array.dtype != dtype or not np.isfinite(array).all():
             raise self._damaged(
-                f"{path} holds {array.dtype} of shape {array.shape}; expected {np.dtype(dtype)} "
-                f"of shape {shape}"
+                f"{name} holds {array.dtype} of shape {array.shape}; expected finite "
+                f"{np.dtype(dtype)} of shape {shape}"
             )
         return array
 
-    def _verified(self, name: str) -> Path:
-        """Return the path of a file after its SHA-256 was compared with the header's."""
+    def _path(self, name: str) -> Path:
         try:
-            path = self._files.path(f"{self._folder}/{name}")
+            return self._files.path(f"{self._folder}/{name}")
         except MissingFileError as error:
             raise self._damaged(error.message) from None
-        recorded = self.header["files"].get(name, {}).get("sha256")
-        if sha256_file(path) != recorded:
-            raise self._damaged(f"{path} does not have the SHA-256 of {INDEX_HEADER}")
-        return path
 
-    def _damaged(self, message: str) -> FormatError:
-        return FormatError(message, f"The index is damaged: make it again. {self._remedy}")
+    def _damaged(self, what: str) -> FormatError:
+        return FormatError(f"{self._root}/{self._folder}: {what}", self._remedy)
 
 
 def _data_of(files: Files) -> str:

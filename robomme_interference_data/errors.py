@@ -1,12 +1,14 @@
 """Every error that this package raises on purpose.
 
 Each is also a fitting builtin, so that callers can catch either, and carries a `hint`: what to
-do next, with the command to type where there is one.
+do next, with the command to type where there is one. What is said often is said once, by a
+constructor of the type.
 """
 
 from bisect import bisect
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import Any, Self
 
 __all__ = [
     "InterferenceError",
@@ -44,6 +46,7 @@ __all__ = [
     "WorkerError",
     "WorkerRetiredError",
     # helpers
+    "first_line",
     "nearest",
 ]
 
@@ -59,26 +62,56 @@ class InterferenceError(Exception):
     def __init__(self, message: str, hint: str | None = None):
         super().__init__(message)
         self.message = message
-        self.hint = hint
+        self.hint = hint or None
 
     def __str__(self) -> str:
         return self.message if self.hint is None else f"{self.message}\n{self.hint}"
 
+    def about(self, what: object) -> Self:
+        """Return the same error with what it is about in front, such as an episode."""
+        return type(self)(f"{what}: {self.message}", self.hint)
+
 
 class InvalidIdError(InterferenceError, ValueError):
-    """An episode id that does not read `<Family>/<split>/<index>`."""
+    """An episode id or condition that does not read as one."""
 
 
 class UnknownNameError(InterferenceError, LookupError):
-    """An episode, family, k or camera that the data does not hold."""
+    """An episode, family, condition or camera that the data does not hold."""
+
+    @classmethod
+    def among(cls, what: str, given: object, where: object, known: Iterable[object]) -> Self:
+        """Return the error for a name that is not there: `what` it names, and what there is."""
+        return cls(f"{what} {given!r} is not in {where}", nearest(str(given), map(str, known)))
 
 
 class InvalidOptionError(InterferenceError, ValueError):
     """An option or argument outside what it may be."""
 
+    @classmethod
+    def expected(cls, option: str, given: object, expected: str, hint: str | None = None) -> Self:
+        """Return the error for an option: its name, what was given, what was expected."""
+        return cls(f"{option} {given!r}; expected {expected}", hint)
+
+    @classmethod
+    def one_of(cls, option: str, given: object, known: Iterable[str]) -> Self:
+        """Return the error for an option that is none of the known names."""
+        names = list(known)
+        return cls(
+            f"{option} {given!r} is none of {', '.join(names)}", nearest(str(given), names, more="")
+        )
+
 
 class MissingExtraError(InterferenceError, ImportError):
     """A library of an optional extra is not installed."""
+
+    @classmethod
+    def needs(cls, what: str, library: str, extra: str) -> Self:
+        """Return the error for work that needs a library of an extra."""
+        return cls(
+            f"{what} needs {library}, which is not installed",
+            f'Install it: pip install "robomme-interference-data[{extra}]"',
+        )
 
 
 class MissingFileError(InterferenceError, FileNotFoundError):
@@ -92,9 +125,22 @@ class HubError(InterferenceError, OSError):
 class FormatError(InterferenceError, ValueError):
     """A file that cannot be read as what it should be, or of an unknown format version."""
 
+    @classmethod
+    def damaged(cls, path: object, what: object) -> Self:
+        """Return the error for a file that holds what it should not: its path, and what."""
+        return cls(f"{path}: {what}", "The file is damaged: download or build it again.")
+
+    @classmethod
+    def version(cls, path: object, found: object, known: object) -> Self:
+        """Return the error for a file of another format version."""
+        return cls(
+            f"{path} has format version {found!r}; this package reads {known}",
+            "Install the version of robomme-interference-data that wrote it, or make it again.",
+        )
+
 
 class HashMismatchError(InterferenceError, ValueError):
-    """Decoded data whose SHA-256 is not the recorded one."""
+    """Data whose SHA-256 is not the recorded one."""
 
 
 class TruncatedVideoError(InterferenceError, ValueError):
@@ -173,15 +219,16 @@ class WorkerRetiredError(InterferenceError, RuntimeError):
     """A worker that can do no further task: what it had to do is left to the others."""
 
 
-def nearest(given: str, known: Iterable[str]) -> str:
+def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
     """Return a sentence that offers the nearest valid names.
 
     Args:
         given: The unknown name.
         known: All valid names; at most 10 of them are listed when none is near.
+        more: What the list begins with; empty for no list.
 
     Returns:
-        `"Did you mean 'a' or 'b'?"`, `"Known: …"`, or an empty string if `known` is empty.
+        `"Did you mean 'a' or 'b'?"`, `"Known: …"`, or an empty string if there is nothing to say.
     """
     names = sorted(known)
     # Comparing takes long: of very many names, those that begin alike are compared.
@@ -190,7 +237,13 @@ def nearest(given: str, known: Iterable[str]) -> str:
     close = get_close_matches(given.lower(), list(folded), n=3, cutoff=0.6)
     if close:
         return "Did you mean " + " or ".join(repr(folded[name]) for name in close) + "?"
-    if not names:
+    if not names or not more:
         return ""
-    more = f", … ({len(names)} in all)" if len(names) > 10 else ""
-    return "Known: " + ", ".join(names[:10]) + more
+    rest = f", … ({len(names)} in all)" if len(names) > 10 else ""
+    return more + ", ".join(names[:10]) + rest
+
+
+def first_line(error: BaseException) -> str:
+    """Return what an error says, in one line without its hint."""
+    text: Any = error.message if isinstance(error, InterferenceError) else str(error)
+    return (str(text).splitlines() or [type(error).__name__])[0]

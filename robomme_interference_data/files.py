@@ -1,5 +1,6 @@
 """Reach the files of a dataset, and write files so that none is ever seen half-written."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -7,27 +8,31 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
-from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 
 __all__ = [
     "Files",
     "LocalFiles",
     "atomic_path",
     "canonical_json",
-    "check_names",
+    "format_sums",
+    "hold",
+    "parse_sums",
     "read_json",
     "sha256_file",
     "write_json",
+    "write_text",
 ]
 
 
 class Files(Protocol):
     """The one way in which this package reaches the files of a dataset or split.
 
-    A path is always relative, with `/`, such as `meta/info.json`.
+    A path is always relative, with `/`, such as `meta/info.json`. Paths come out of data files
+    that a stranger may have written: none leads out of the dataset, not by a link either.
     """
 
     def path(self, relative: str) -> Path:
@@ -35,6 +40,7 @@ class Files(Protocol):
 
         Raises:
             MissingFileError: There is no such file.
+            FormatError: The path leads out of the dataset.
         """
         ...
 
@@ -55,8 +61,18 @@ class LocalFiles:
 
     def path(self, relative: str) -> Path:
         """Return the file's path; see `Files.path`."""
-        path = self.root / relative
-        if not path.is_file():
+        path = self.root / check_relative(relative, self.describe())
+        # Links are followed only inside the folder, and into the store that the Hub's client
+        # keeps its snapshots' files in.
+        root = self.root.resolve()
+        store = root.parent.parent / "blobs" if root.parent.name == "snapshots" else root
+        real = path.resolve()
+        if not (real.is_relative_to(root) or real.is_relative_to(store)):
+            raise FormatError(
+                f"{relative} in {self.root} is a link that leads out of the folder",
+                "Put the file itself there.",
+            )
+        if not real.is_file():
             raise MissingFileError(
                 f"{relative} is missing in {self.root}",
                 "The folder is not a complete dataset: build it again, or point to the folder "
@@ -74,14 +90,23 @@ class LocalFiles:
         return str(self.root)
 
 
+def check_relative(relative: str, where: str) -> str:
+    """Return a relative path that stays in its folder.
+
+    Raises:
+        FormatError: It is absolute or has a `..`.
+    """
+    path = PurePosixPath(relative)
+    if path.is_absolute() or ".." in path.parts or "\0" in relative:
+        raise FormatError.damaged(where, f"the path {relative!r} leads out of it")
+    return relative
+
+
 def canonical_json(value: Any) -> str:
     """Return the one JSON text of a value: sorted keys, no spaces, UTF-8, no NaN."""
     return json.dumps(
         value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )
-
-
-_DAMAGED = "The file is damaged: download or build it again."
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -92,30 +117,23 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise FormatError(f"{path} is not JSON: {error}", _DAMAGED) from None
+    except (ValueError, RecursionError) as error:
+        raise FormatError.damaged(path, f"not JSON: {error}") from None
     if not isinstance(value, dict):
-        raise FormatError(f"{path} holds no JSON object", _DAMAGED)
+        raise FormatError.damaged(path, "no JSON object")
     return value
-
-
-def check_names(path: Path, found: Iterable[str], expected: Iterable[str]) -> None:
-    """Check that a file has all expected columns or keys.
-
-    Raises:
-        FormatError: It lacks some.
-    """
-    present = set(found)
-    missing = [name for name in expected if name not in present]
-    if missing:
-        raise FormatError(f"{path} lacks {', '.join(missing)}", _DAMAGED)
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON with sorted keys, atomically."""
     text = json.dumps(value, sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text with `\\n` at line ends, atomically."""
     with atomic_path(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+        partial.write_text(text, encoding="utf-8", newline="\n")
 
 
 @contextmanager
@@ -142,3 +160,40 @@ def sha256_file(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def format_sums(root: Path, paths: Iterable[str]) -> str:
+    """Return the SHA-256 of files as `sha256sum` writes them, a line each, sorted by path."""
+    return "".join(f"{sha256_file(root / path)}  {path}\n" for path in sorted(paths))
+
+
+def parse_sums(text: str, path: object) -> dict[str, str]:
+    """Read what `format_sums` wrote: SHA-256 by path.
+
+    Raises:
+        FormatError: A line is not such a one.
+    """
+    sums = {}
+    for line in text.splitlines():
+        digest, gap, name = line.partition("  ")
+        if not gap or len(digest) != 64 or not name:
+            raise FormatError.damaged(path, f"{line[:80]!r} is no line of SHA-256 and path")
+        sums[name] = digest
+    return sums
+
+
+@contextmanager
+def hold(lock: Path, busy: InterferenceError) -> Iterator[None]:
+    """Hold a lock file until the block ends; the lock goes with the process, however it ends.
+
+    Args:
+        lock: The file, made if need be and left behind. Not the folder itself: network file
+            systems lock only what is open for writing.
+        busy: Raised if another process holds it.
+    """
+    with lock.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise busy from None
+        yield

@@ -1,69 +1,98 @@
-"""Reach the files of a dataset on the Hugging Face Hub, pinned to one commit.
+"""Reach repositories on the Hugging Face Hub, pinned to one commit: datasets, policies, encoders.
 
-The client library decides where the Hub and the cache are and which token is used, so its own
-settings hold: `HF_ENDPOINT`, `HF_HUB_OFFLINE`, `HF_HOME`, `HF_HUB_CACHE`, `HF_TOKEN`.
+The stock client does the work, so its own settings hold (`HF_ENDPOINT`, `HF_HUB_OFFLINE`,
+`HF_HOME`, `HF_HUB_CACHE`, `HF_TOKEN`), and its cache is the only one.
 """
 
+import os
 import re
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from robomme_interference_data.errors import HubError, InterferenceError, MissingFileError
-from robomme_interference_data.files import atomic_path
+from robomme_interference_data.errors import (
+    HubError,
+    InterferenceError,
+    InvalidOptionError,
+    MissingFileError,
+    first_line,
+)
+from robomme_interference_data.files import LocalFiles, check_relative
 
-__all__ = ["HubFiles", "is_repo_id"]
+__all__ = ["HubFiles", "is_repo_id", "locate"]
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-_COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 def is_repo_id(text: str) -> bool:
-    """Tell whether a text reads `namespace/name`, as the id of a dataset on the Hub does."""
+    """Tell whether a text reads `namespace/name`, as the id of a repository on the Hub does."""
     return _REPO_ID.fullmatch(text) is not None
 
 
-class HubFiles:
-    """Files of a dataset repository at one commit, downloaded one by one into the Hub's cache.
-
-    Nothing is fetched before it is asked for. The revision is resolved once, at the first use;
-    copies made after that (worker processes get one each) keep the commit.
+def locate(
+    location: str | os.PathLike[str], repo_type: str = "dataset"
+) -> "LocalFiles | HubFiles":
+    """Return the files at a location.
 
     Args:
-        repo_id: Dataset repository, `namespace/name`.
+        location: A folder, or a repository on the Hub: `namespace/name`, or with a branch, tag or
+            commit `namespace/name@revision`. A folder that is there goes before a repository.
+        repo_type: `dataset` or `model`.
+
+    Raises:
+        InvalidOptionError: It is neither.
+    """
+    folder = Path(location).expanduser()
+    if folder.is_dir():
+        return LocalFiles(folder)
+    repo_id, at, revision = str(location).partition("@")
+    if not is_repo_id(repo_id) or (at and not revision):
+        raise InvalidOptionError(
+            f"{str(location)!r} is neither a folder nor a {repo_type} repository on the Hub",
+            "Give an existing folder, namespace/name, or namespace/name@revision.",
+        )
+    return HubFiles(repo_id, revision or None, repo_type)
+
+
+class HubFiles:
+    """Files of a repository at one commit, downloaded into the Hub's cache when asked for.
+
+    The revision is resolved once, at the first use; copies made after that (worker processes get
+    one each) keep the commit. Offline, it is what the revision last stood for.
+
+    Args:
+        repo_id: Repository, `namespace/name`.
         revision: Branch, tag or commit hash; None for the main branch.
+        repo_type: `dataset` or `model`.
     """
 
-    def __init__(self, repo_id: str, revision: str | None = None):
+    def __init__(self, repo_id: str, revision: str | None = None, repo_type: str = "dataset"):
         self.repo_id = repo_id
         self.revision = revision or "main"
+        self.repo_type = repo_type
 
     @cached_property
     def commit(self) -> str:
-        """Commit hash that the revision stands for; offline, the last one that was seen.
+        """Commit hash that the revision stands for.
 
         Raises:
             HubError: The repository or revision is unknown, needs permission, or cannot be
                 reached and is not in the cache.
         """
-        from huggingface_hub import HfApi
+        from huggingface_hub import resolve_revision
 
-        if _COMMIT.fullmatch(self.revision):
-            return self.revision
-        try:
-            info = HfApi().repo_info(self.repo_id, repo_type="dataset", revision=self.revision)
-        except _client_errors() as error:
-            if _is_unreachable(error) and self._ref.is_file():
-                return self._ref.read_text(encoding="utf-8").strip()
-            raise self._explain(error) from error
-        commit = str(info.sha)
-        # Where the client itself notes what a branch stood for; it does so only when it downloads
-        # by branch name, and here every download is by commit.
-        with atomic_path(self._ref) as partial:
-            partial.write_text(commit, encoding="utf-8")
-        return commit
+        return str(
+            self._asked(
+                None,
+                resolve_revision,
+                self.repo_id,
+                repo_type=self.repo_type,
+                revision=self.revision,
+            ).resolved
+        )
 
     def path(self, relative: str) -> Path:
-        """Return the file's path in the cache, downloading it first if need be.
+        """Return the file's path in the cache, downloading it first if need be; see `Files.path`.
 
         Raises:
             MissingFileError: The repository has no such file.
@@ -71,65 +100,74 @@ class HubFiles:
         """
         from huggingface_hub import hf_hub_download
 
-        commit = self.commit
-        try:
-            return Path(
-                hf_hub_download(self.repo_id, relative, repo_type="dataset", revision=commit)
+        check_relative(relative, self.describe())
+        return Path(
+            self._asked(
+                relative,
+                hf_hub_download,
+                self.repo_id,
+                relative,
+                repo_type=self.repo_type,
+                revision=self.commit,
             )
-        except _client_errors() as error:
-            raise self._explain(error, relative) from error
+        )
 
-    def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted relative paths of all files under a folder; empty if none.
-
-        Offline these are the files in the cache, which may not be all that there are.
+    def snapshot(self, *patterns: str) -> Path:
+        """Download the files that match a pattern, such as `meta/*`; return the folder of all.
 
         Raises:
             HubError: See `commit`.
         """
-        from huggingface_hub import HfApi
-        from huggingface_hub.errors import EntryNotFoundError
-        from huggingface_hub.hf_api import RepoFile
+        from huggingface_hub import snapshot_download
 
-        commit = self.commit
-        try:
-            tree = HfApi().list_repo_tree(
-                self.repo_id, folder, recursive=True, repo_type="dataset", revision=commit
+        return Path(
+            self._asked(
+                None,
+                snapshot_download,
+                self.repo_id,
+                repo_type=self.repo_type,
+                revision=self.commit,
+                allow_patterns=list(patterns),
             )
-            found = [entry.path for entry in tree if isinstance(entry, RepoFile)]
-        except _client_errors() as error:
-            root = self._cache / "snapshots" / commit
-            if isinstance(error, EntryNotFoundError):
-                return []
-            if not _is_unreachable(error) or not root.is_dir():
-                raise self._explain(error) from error
-            paths = (root / folder).rglob("*")
-            found = [path.relative_to(root).as_posix() for path in paths if path.is_file()]
-        return sorted(path for path in found if path.endswith(suffix))
+        )
+
+    def list(self, folder: str, suffix: str = "") -> list[str]:
+        """Return the sorted paths of the files under a folder, which are downloaded.
+
+        Raises:
+            HubError: See `commit`.
+        """
+        return LocalFiles(self.snapshot(f"{folder}/*{suffix}")).list(folder, suffix)
 
     def describe(self) -> str:
         """Return `namespace/name@revision`, with the commit as revision once it is known."""
         return f"{self.repo_id}@{self.__dict__.get('commit', self.revision)}"
 
-    @property
-    def _cache(self) -> Path:
-        from huggingface_hub import constants
-        from huggingface_hub.file_download import repo_folder_name
+    def _asked(self, relative: str | None, ask: Any, *arguments: Any, **options: Any) -> Any:
+        """Ask the client, and return its error in this package's words."""
+        import httpx
+        from huggingface_hub import errors
 
-        folder = repo_folder_name(repo_id=self.repo_id, repo_type="dataset")
-        return Path(constants.HF_HUB_CACHE) / folder
+        try:
+            return ask(*arguments, **options)
+        except (
+            errors.HfHubHTTPError,
+            errors.EntryNotFoundError,
+            errors.FileMetadataError,
+            errors.HFValidationError,
+            errors.OfflineModeIsEnabled,
+            errors.RevisionResolutionError,
+            errors.IncompleteSnapshotError,
+            httpx.TransportError,
+        ) as error:
+            raise self._explain(error, relative) from error
 
-    @property
-    def _ref(self) -> Path:
-        return self._cache / "refs" / self.revision
-
-    def _explain(self, error: Exception, relative: str | None = None) -> InterferenceError:
-        """Return the client's error in this package's words."""
+    def _explain(self, error: Exception, relative: str | None) -> InterferenceError:
         from huggingface_hub import constants, errors
 
-        endpoint = constants.ENDPOINT
-        page = f"{endpoint}/datasets/{self.repo_id}"
-        repository = f"dataset repository {self.repo_id!r} on {endpoint}"
+        kind = "datasets/" if self.repo_type == "dataset" else ""
+        page = f"{constants.ENDPOINT}/{kind}{self.repo_id}"
+        repository = f"{self.repo_type} repository {self.repo_id!r} on {constants.ENDPOINT}"
         if isinstance(error, errors.GatedRepoError):
             return HubError(
                 f"the {repository} is gated, and this login has not been given access",
@@ -146,15 +184,16 @@ class HubFiles:
                 "Check the name; if a folder on this machine was meant, it does not exist. For a "
                 "private repository, type: hf auth login",
             )
-        if isinstance(error, errors.EntryNotFoundError) and not _is_unreachable(error):
+        if isinstance(error, errors.RemoteEntryNotFoundError):
             return MissingFileError(
                 f"{relative} is missing in {self.describe()}",
-                f"The repository is not a complete dataset; its files: {page}/tree/{self.commit}",
+                f"The repository is not complete; its files: {page}/tree/{self.commit}",
             )
         what = f"the {repository}" if relative is None else f"{relative} of the {repository}"
-        revision = f" --revision {self.__dict__.get('commit', self.revision)}"
-        command = f"hf download --repo-type dataset {self.repo_id}{revision}" + (
-            f" {relative}" if relative else ""
+        option = "" if self.repo_type == "model" else f" --repo-type {self.repo_type}"
+        command = (
+            f"hf download{option} {self.repo_id} --revision "
+            f"{self.__dict__.get('commit', self.revision)}" + (f" {relative}" if relative else "")
         )
         if constants.HF_HUB_OFFLINE:
             return HubError(
@@ -162,31 +201,6 @@ class HubFiles:
                 f"Where there is a network, type: HF_HUB_OFFLINE=0 {command}",
             )
         return HubError(
-            f"{what} is not in the cache, and the Hub cannot be reached: "
-            f"{(str(error).splitlines() or [type(error).__name__])[0]}",
+            f"{what} is not in the cache, and the Hub cannot be reached: {first_line(error)}",
             f"Try again when it can be reached, with: {command}",
         )
-
-
-def _client_errors() -> tuple[type[Exception], ...]:
-    """Return what the client raises for a request that failed."""
-    import httpx
-    from huggingface_hub import errors
-
-    return (
-        errors.HfHubHTTPError,
-        errors.EntryNotFoundError,
-        errors.FileMetadataError,
-        errors.HFValidationError,
-        errors.OfflineModeIsEnabled,
-        httpx.TransportError,
-    )
-
-
-def _is_unreachable(error: Exception) -> bool:
-    """Tell whether the Hub gave no answer, as against one that refuses."""
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
-
-    if isinstance(error, HfHubHTTPError):
-        return error.response.status_code >= 500
-    return not isinstance(error, HFValidationError)

@@ -1,17 +1,18 @@
-"""Episode ids and condition names: parse and format are inverses of each other."""
+"""Episode ids, and lists of episode numbers: parse and format are inverses of each other."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Self
 
-from robomme_interference_data.constants import FAMILIES, MAX_K, SPLITS
-from robomme_interference_data.errors import InvalidIdError, nearest
+from robomme_interference_data.constants import FAMILIES, SPLITS
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, nearest
 
-__all__ = ["EpisodeId", "condition_name", "parse_condition"]
+__all__ = ["EpisodeId", "format_numbers", "parse_numbers"]
 
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
-_CONDITION = re.compile(r"k(0|[1-9][0-9]?)")
+_SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 
 
@@ -36,7 +37,7 @@ class EpisodeId:
     index: int
 
     def __post_init__(self) -> None:
-        if not _FAMILY.fullmatch(self.family):
+        if not isinstance(self.family, str) or not _FAMILY.fullmatch(self.family):
             raise InvalidIdError(
                 f"{self.family!r} is not a family name",
                 "A family is a letter followed by letters, digits, '_', '.' or '-', such as "
@@ -45,21 +46,23 @@ class EpisodeId:
         if self.split not in SPLITS:
             raise InvalidIdError(
                 f"{self.split!r} is not a split; expected one of {', '.join(SPLITS)}",
-                nearest(self.split, SPLITS),
+                nearest(str(self.split), SPLITS),
             )
-        if not 0 <= self.index < 10**18:
+        if type(self.index) is not int or not 0 <= self.index < 10**18:
             raise InvalidIdError(
-                f"episode index {self.index} is out of range", "Indices count from 0."
+                f"{self.index!r} is not an episode index", "Indices are numbers from 0 on."
             )
 
     @classmethod
-    def parse(cls, text: str) -> Self:
-        """Read an id from text.
+    def parse(cls, text: "str | EpisodeId") -> Self:
+        """Read an id from text; an id is returned as it is.
 
         Raises:
             InvalidIdError: The text is not `<Family>/<split>/<index>`.
         """
-        parts = text.split("/")
+        if isinstance(text, cls):
+            return text
+        parts = text.split("/") if isinstance(text, str) else []
         if len(parts) != 3 or not _INDEX.fullmatch(parts[2]):
             raise InvalidIdError(
                 f"{text!r} is not an episode id",
@@ -80,20 +83,33 @@ class EpisodeId:
         return self.sort_key < other.sort_key
 
 
-def condition_name(k: int) -> str:
-    """Name of the condition with `k` distractor sessions: `k0`, `k1`, `k3`, `k7` and so on."""
-    return f"k{k}"
+def parse_numbers(text: str) -> tuple[int, ...]:
+    """Read episode numbers such as `0-49` or `0,3,10-12`; both ends are included.
 
-
-def parse_condition(text: str) -> int:
-    """Read `k` from a condition name; the inverse of `condition_name`.
+    Returns:
+        The numbers, ascending, each once.
 
     Raises:
-        InvalidIdError: The text is not `k` followed by a number from 0 to 63.
+        InvalidOptionError: The text is something else.
     """
-    match = _CONDITION.fullmatch(text)
-    if not match or int(match[1]) > MAX_K:
-        raise InvalidIdError(
-            f"{text!r} is not a condition with history", f"Expected k0, k1, … k{MAX_K}."
-        )
-    return int(match[1])
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = _SPAN.fullmatch(part.strip())
+        if match is None or int(match[2] or match[1]) < int(match[1]):
+            raise InvalidOptionError(
+                f"{text!r} is not a list of episode numbers: {part.strip()!r}",
+                "Expected numbers and spans with commas between them, such as 0-49 or 0,3,10-12.",
+            )
+        numbers.update(range(int(match[1]), int(match[2] or match[1]) + 1))
+    return tuple(sorted(numbers))
+
+
+def format_numbers(numbers: Iterable[int]) -> str:
+    """Write ascending numbers as `parse_numbers` reads them."""
+    spans: list[list[int]] = []
+    for number in numbers:
+        if spans and spans[-1][1] == number - 1:
+            spans[-1][1] = number
+        else:
+            spans.append([number, number])
+    return ",".join(f"{a}-{b}" if a < b else str(a) for a, b in spans)

@@ -1,13 +1,12 @@
-"""Read parquet files: the rows with given values, and one clear error for damaged files.
+"""Read parquet files: spans of rows, values out of columns, and one clear error for damage.
 
 `pyarrow.parquet.read_table` with filters is left aside: its scanner takes seconds to load, and
 can wait forever on a damaged file.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +16,9 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, InterferenceError
 
-__all__ = ["matching", "read_rows", "reading"]
+__all__ = ["RowSpan", "is_listed", "open_parquet", "reading"]
+
+_IMAGES_AT_ONCE = 8
 
 
 @contextmanager
@@ -33,40 +34,144 @@ def reading(path: Path) -> Iterator[None]:
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         text = str(error).partition("\n")[0]
-        raise FormatError(
-            f"{path} cannot be read: {text}", "The file is damaged: download or build it again."
-        ) from None
+        raise FormatError.damaged(path, f"cannot be read: {text}") from None
 
 
-def matching(table: pa.Table, equal: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """Return for each row whether its columns have the given values, `(N,) bool`."""
-    matches = np.ones(len(table), bool)
-    for name, value in equal.items():
-        column = table[name]
-        same = pc.equal(column, pa.scalar(value, column.type)).fill_null(False)
-        matches &= same.to_numpy()
-    return matches
+def open_parquet(path: Path) -> pq.ParquetFile:
+    """Open a parquet file for reading piece by piece.
+
+    Raises:
+        FormatError: It is not a parquet file.
+    """
+    with reading(path):
+        return pq.ParquetFile(path, buffer_size=1 << 20)
 
 
-def read_rows(
-    file: pq.ParquetFile, columns: list[str] | None, keep: NDArray[np.bool_] | None = None
-) -> Iterator[pa.Table]:
-    """Yield rows, row group by row group; groups without a row to keep are not read.
+def is_listed(kind: pa.DataType) -> bool:
+    """Tell whether a type is one of Arrow's lists."""
+    return bool(
+        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    )
 
-    To know the rows to keep, read the columns that tell: the statistics of a row group may not be
-    asked, as pyarrow ends the process where those are damaged.
+
+class RowSpan:
+    """Rows of a parquet file that lie one after the other.
+
+    Only the row groups that hold them are read. The statistics of row groups are never asked:
+    pyarrow ends the process where those are damaged.
 
     Args:
-        file: The opened file.
-        columns: Columns to yield, None for all.
-        keep: For each row of the file whether to yield it, `(N,) bool`; None for all rows.
+        path: The file.
+        start: First row.
+        stop: Row after the last one; None for all that there are.
+
+    Raises:
+        FormatError: By every method: the file cannot be read as asked.
     """
-    first = 0
-    for group in range(file.num_row_groups):
-        rows = file.metadata.row_group(group).num_rows
-        if keep is None:
-            yield file.read_row_group(group, columns=columns)
-        elif keep[first : first + rows].any():
-            table = file.read_row_group(group, columns=columns)
-            yield table.filter(keep[first : first + rows])
-        first += rows
+
+    def __init__(self, path: Path, start: int = 0, stop: int | None = None):
+        self.path = path
+        self._file = open_parquet(path)
+        self.start = start
+        self.stop = self._file.metadata.num_rows if stop is None else stop
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def part(self, start: int, stop: int) -> "RowSpan":
+        """Return rows of the same file, numbered as in the file."""
+        return RowSpan(self.path, start, stop)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return list(self._file.schema_arrow.names)
+
+    def table(self, columns: list[str] | None = None) -> pa.Table:
+        """Return the rows with the given columns, or with all."""
+        for name in columns or ():
+            self._type(name)
+        groups, first = self._row_groups()
+        with reading(self.path):
+            return self._file.read_row_groups(groups, columns=columns).slice(
+                self.start - first, len(self)
+            )
+
+    def scalars(self, name: str) -> NDArray[np.int64]:
+        """Return a column of booleans or integers, or of lists of one such value, `(T,) int64`."""
+        column, what = self.table([name])[name], f"column {name!r}"
+        kind = column.type
+        if is_listed(kind):
+            column, kind = pc.list_flatten(column), kind.value_type
+            if len(column) != len(self):
+                raise FormatError.damaged(self.path, f"{what} has lists of several values")
+        if not (pa.types.is_boolean(kind) or pa.types.is_integer(kind)) or column.null_count:
+            raise FormatError(
+                f"{self.path}: {what} is of type {kind} with {column.null_count} empty values; "
+                "expected booleans or integers, none empty"
+            )
+        return np.asarray(pc.cast(column, pa.int64()).to_numpy())
+
+    def vectors(self, name: str) -> NDArray[np.float32]:
+        """Return a column of lists of numbers as `(T, D) float32`."""
+        column, what = self.table([name])[name], f"{self.path}: column {name!r}"
+        kind = column.type
+        if not is_listed(kind) or not pa.types.is_floating(kind.value_type):
+            raise FormatError(f"{what} is of type {kind}; expected lists of floats")
+        lengths = pc.unique(pc.list_value_length(column))
+        flat = pc.list_flatten(column)
+        if column.null_count or flat.null_count or len(lengths) != 1:
+            raise FormatError(
+                f"{what} has empty values or vectors of several lengths: "
+                f"{sorted(lengths.drop_null().to_pylist())}",
+                "Every row needs a vector, and all of them the same length.",
+            )
+        values = flat.to_numpy().reshape(len(column), lengths[0].as_py())
+        return np.ascontiguousarray(values, dtype=np.float32)
+
+    def images(self, name: str) -> Iterator[bytes]:
+        """Yield the encoded images of a column in order, a few of them in memory at a time.
+
+        The column is a struct with the field `bytes`, as Hugging Face `Image` columns are. At
+        most the encoded bytes of one row group are held, and less where the writer allows it.
+        """
+        kind = self._type(name)
+        if not pa.types.is_struct(kind) or kind.get_field_index("bytes") < 0:
+            raise FormatError(
+                f"{self.path}: column {name!r} is of type {kind}; expected images as "
+                "struct<bytes, path>"
+            )
+        groups, row = self._row_groups()
+        batches = self._file.iter_batches(_IMAGES_AT_ONCE, row_groups=groups, columns=[name])
+        with reading(self.path):
+            for batch in batches:
+                for cell in batch.column(name):
+                    if self.start <= row < self.stop:
+                        data = cell["bytes"].as_py()
+                        if data is None:
+                            raise FormatError(
+                                f"{self.path}: the image in row {row} of column {name!r} is not "
+                                "stored in the file",
+                                "Write the dataset again with the images in its parquet files.",
+                            )
+                        yield data
+                    row += 1
+
+    def _type(self, name: str) -> pa.DataType:
+        if name not in self.names:
+            raise FormatError.damaged(
+                self.path, f"no column {name!r}; its columns are {', '.join(self.names)}"
+            )
+        return self._file.schema_arrow.field(name).type
+
+    def _row_groups(self) -> tuple[list[int], int]:
+        """Return the row groups that hold the span, and the first row of them."""
+        groups: list[int] = []
+        first = row = 0
+        for group in range(self._file.metadata.num_row_groups):
+            rows = self._file.metadata.row_group(group).num_rows
+            if row < self.stop and row + rows > self.start:
+                first = first if groups else row
+                groups.append(group)
+            row += rows
+        return groups, first

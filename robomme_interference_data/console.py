@@ -1,9 +1,11 @@
-"""What commands tell on stderr: messages, and how far work is."""
+"""What commands print: messages and progress on stderr, JSON on stdout."""
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Self
+from typing import Annotated, Any, Self
 
+import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -17,10 +19,18 @@ from rich.progress import (
 )
 from rich.text import Text
 
-__all__ = ["MESSAGES", "BuildProgress"]
+__all__ = ["MESSAGES", "AsJson", "WorkProgress", "print_json"]
 
 MESSAGES = Console(stderr=True, soft_wrap=True, markup=False, emoji=False, highlight=False)
 """What commands say beside their output: lines are never wrapped, so that paths can be copied."""
+
+AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
+"""The parameter `as_json` of a command that can."""
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON value to stdout."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
 
 
 class _Speed(ProgressColumn):
@@ -33,7 +43,7 @@ class _Speed(ProgressColumn):
         return Text(f"{speed:,.0f} {self._unit}/s" if speed else "", style="progress.data.speed")
 
 
-class BuildProgress:
+class WorkProgress:
     """A progress bar on stderr; use as a context manager.
 
     Args:

@@ -1,4 +1,4 @@
-"""Encode frames as video with PyAV, and gather the image statistics that LeRobot stores."""
+"""Encode frames as video with PyAV: datasets, recordings, and clips to look at."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -13,9 +13,9 @@ import numpy as np
 from av.codec.codec import UnknownCodecError
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import BuildError, InvalidOptionError, nearest
+from robomme_interference_data.errors import BuildError, InvalidOptionError
 
-__all__ = ["CODECS", "RECORDING", "Codec", "ImageStats", "VideoEncoder", "get_codec"]
+__all__ = ["CLIP", "CODECS", "RECORDING", "Codec", "VideoEncoder", "get_codec"]
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,16 @@ CODECS = {
 RECORDING = Codec(name="ffv1", vcodec="ffv1", pix_fmt="bgr0", settings={}, options={}, exact=True)
 """How recordings are kept in a frames folder: lossless and quick, but no codec of LeRobot's."""
 
+CLIP = Codec(
+    name="clip",
+    vcodec="libx264",
+    pix_fmt="yuv420p",
+    settings={},
+    options={"crf": "22", "preset": "veryfast"},
+    exact=False,
+)
+"""Clips of rollouts, to look at in any player: H.264 in MP4; even heights and widths."""
+
 
 def get_codec(name: str) -> Codec:
     """Return a codec by name.
@@ -94,7 +104,7 @@ def get_codec(name: str) -> Codec:
         InvalidOptionError: There is no such codec.
     """
     if name not in CODECS:
-        raise InvalidOptionError(f"--codec {name!r} is unknown", nearest(name, CODECS))
+        raise InvalidOptionError.one_of("codec", name, CODECS)
     return CODECS[name]
 
 
@@ -156,42 +166,3 @@ class VideoEncoder:
             yield
         except (av.error.FFmpegError, UnknownCodecError) as error:
             raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
-
-
-class ImageStats:
-    """Per-channel statistics of images, from every fourth row and column of every frame.
-
-    LeRobot, too, estimates image statistics from downsampled frames. Counting the 256 values
-    makes them exact on those pixels, and the same on every machine.
-    """
-
-    _STEP = 4
-    _QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-
-    def __init__(self) -> None:
-        self._counts = np.zeros((3, 256), np.int64)
-
-    def add(self, image: NDArray[np.uint8]) -> None:
-        """Count a frame, `(H, W, 3) uint8`."""
-        pixels = image[:: self._STEP, :: self._STEP]
-        for channel in range(3):
-            self._counts[channel] += np.bincount(pixels[..., channel].ravel(), minlength=256)
-
-    def result(self) -> dict[str, NDArray[np.float64]]:
-        """Return statistic name to one value per channel, `(3,)`, on the scale 0 to 255."""
-        values = np.arange(256, dtype=np.float64)
-        total = self._counts.sum(axis=1)
-        mean = (self._counts * values).sum(axis=1) / total
-        variance = (self._counts * (values[None] - mean[:, None]) ** 2).sum(axis=1) / total
-        cumulated = self._counts.cumsum(axis=1)
-        stats = {
-            "min": np.argmax(self._counts > 0, axis=1).astype(np.float64),
-            "max": 255.0 - np.argmax(self._counts[:, ::-1] > 0, axis=1),
-            "mean": mean,
-            "std": np.sqrt(variance),
-            "count": np.array([int(total[0])]),
-        }
-        for quantile in self._QUANTILES:
-            reached = cumulated >= quantile * total[:, None]
-            stats[f"q{round(quantile * 100):02d}"] = np.argmax(reached, axis=1).astype(np.float64)
-        return stats

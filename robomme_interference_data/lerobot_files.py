@@ -1,0 +1,382 @@
+"""Read LeRobot datasets with pyarrow and PyAV alone: v3.0, and v2.1 as its variant.
+
+The only reader of that layout: history datasets of this package and recordings of anybody else go
+through it. Tests hold it against lerobot's own.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from robomme_interference_data import video
+from robomme_interference_data.constants import EPISODES_DIR, INFO_PATH, TASKS_PATH
+from robomme_interference_data.errors import (
+    FormatError,
+    MissingFileError,
+    TruncatedVideoError,
+    UnknownNameError,
+)
+from robomme_interference_data.files import Files, read_json
+from robomme_interference_data.parquet import RowSpan, open_parquet, reading
+
+__all__ = ["EpisodePlace", "LeRobotFiles", "fill_template"]
+
+VERSIONS = ("v3.0", "v2.1")
+
+_V21_EPISODES = "meta/episodes.jsonl"
+_V21_TASKS = "meta/tasks.jsonl"
+_V21_STATS = "meta/episodes_stats.jsonl"
+
+_MAX_VALUES = 1 << 28
+"""Values in one frame of a feature, at most: nothing is allocated for a shape beyond."""
+
+_MAX_EPISODES = 10_000_000
+_FIELD = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
+_ROWS_KEPT = 1024
+
+
+@dataclass(frozen=True)
+class EpisodePlace:
+    """Where an episode lies in its dataset.
+
+    Attributes:
+        index: Number of the episode in the dataset.
+        length: Frames.
+        data: Relative path of the parquet file with its rows.
+        videos: Column to `(relative path, number of the first frame in that file)`.
+    """
+
+    index: int
+    length: int
+    data: str
+    videos: dict[str, tuple[str, int]]
+
+
+def fill_template(template: str, where: object, **values: str | int) -> str:
+    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else.
+
+    Raises:
+        FormatError: The template holds anything else in braces.
+    """
+
+    def value(match: re.Match[str]) -> str:
+        found = values.get(match[1])
+        if found is None or (match[2] and not isinstance(found, int)):
+            raise FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
+        return f"{found:0{match[2]}d}" if match[2] else str(found)
+
+    filled = _FIELD.sub(value, template)
+    if "{" in filled or "}" in filled:
+        raise FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
+    return filled
+
+
+class LeRobotFiles:
+    """A LeRobot dataset: its metadata, and values and frames of its episodes.
+
+    Args:
+        files: How to reach the dataset.
+        keep_stats: Columns whose statistics are kept: `constant` tells of them.
+
+    Raises:
+        MissingFileError: `meta/info.json` is missing.
+        FormatError: It is of an unknown version, or damaged.
+    """
+
+    def __init__(self, files: Files, keep_stats: tuple[str, ...] = ()):
+        self.files = files
+        self._keep_stats = keep_stats
+        self._rows: dict[int, dict[str, Any]] = {}
+        try:
+            path = files.path(INFO_PATH)
+        except MissingFileError as error:
+            raise MissingFileError(
+                f"{files.describe()} is no LeRobot dataset: {INFO_PATH} is missing",
+                "Point to the folder that holds meta/, data/ and videos/.",
+            ) from error
+        self.info = read_json(path)
+        self.version = self.info.get("codebase_version")
+        if self.version not in VERSIONS:
+            raise FormatError(
+                f"{files.describe()} is a LeRobot dataset of version {self.version!r}; this "
+                f"package reads {' and '.join(VERSIONS)}",
+                "Convert it with LeRobot's own scripts (lerobot.scripts."
+                "convert_dataset_v21_to_v30 and its predecessors).",
+            )
+        _check_info(self.info, path)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return float(self.info["fps"])
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """The dataset's columns, with `dtype` and `shape`."""
+        return dict(self.info["features"])
+
+    def shape(self, column: str) -> tuple[int, ...]:
+        """Return the shape of one value of a column; of a camera `(H, W, 3)`, however it is told."""
+        feature = self.info["features"][column]
+        shape = tuple(feature["shape"])
+        if feature["dtype"] in ("video", "image") and len(shape) == 3 and shape[2] != 3:
+            shape = (*shape[1:], shape[0])
+        return shape
+
+    def __len__(self) -> int:
+        return int(self.info["total_episodes"])
+
+    @cached_property
+    def table(self) -> pa.Table:
+        """The per-episode columns by episode index; statistics only of what is kept.
+
+        Raises:
+            MissingFileError: A file in `meta/` is missing.
+            FormatError: A file cannot be read, or does not list the episodes from 0 on.
+        """
+        table = self._v30_table() if self.version == "v3.0" else self._v21_table()
+        where = self.files.describe()
+        for name in ("episode_index", "length"):
+            if name not in table.column_names or not pa.types.is_integer(table[name].type):
+                raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
+        table = table.sort_by("episode_index")
+        if not np.array_equal(table["episode_index"].to_numpy(), np.arange(len(self))):
+            raise FormatError.damaged(
+                where, f"meta/ does not list the episodes 0 to {len(self) - 1}, each once"
+            )
+        return table.combine_chunks()
+
+    @cached_property
+    def tasks(self) -> set[str]:
+        """The task texts that the dataset lists."""
+        if self.version == "v2.1":
+            return {str(row.get("task")) for row in self._json_lines(_V21_TASKS)}
+        rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
+        return {str(row.get("task", row.get("__index_level_0__"))) for row in rows}
+
+    def row(self, index: int) -> dict[str, Any]:
+        """Return the per-episode columns of an episode as plain values.
+
+        Raises:
+            UnknownNameError: There is no such episode.
+        """
+        if not 0 <= index < len(self):
+            raise UnknownNameError(
+                f"episode {index} is not in {self.files.describe()}, which has {len(self)} episodes"
+            )
+        row = self._rows.get(index)
+        if row is None:
+            if len(self._rows) > _ROWS_KEPT:
+                self._rows.clear()
+            row = self._rows[index] = self.table.slice(index, 1).to_pylist()[0]
+        return row
+
+    def constant(self, column: str, index: int) -> int | None:
+        """Return the value that a kept column has in all frames of an episode; None if not told."""
+        low, high = (self.row(index).get(f"stats/{column}/{bound}") for bound in ("min", "max"))
+        low, high = (b[0] if isinstance(b, list) and b else b for b in (low, high))
+        told = isinstance(low, int | float) and low == high and low == int(low)
+        return int(low) if told else None
+
+    def place(self, index: int) -> EpisodePlace:
+        """Return where an episode lies.
+
+        Raises:
+            FormatError: The metadata does not say it as LeRobot does.
+        """
+        row, info, where = self.row(index), self.info, self.files.describe()
+        videos = [name for name, f in self.features.items() if f["dtype"] == "video"]
+        length = _whole(row, "length", where)
+        if self.version == "v2.1":
+            chunk = index // int(info.get("chunks_size") or 1000)
+            named: dict[str, str | int] = {"episode_chunk": chunk, "episode_index": index}
+            data = fill_template(info["data_path"], where, **named)
+            paths = {
+                name: (fill_template(info["video_path"], where, video_key=name, **named), 0)
+                for name in videos
+            }
+            return EpisodePlace(index, length, data, paths)
+        data = fill_template(
+            info["data_path"],
+            where,
+            chunk_index=_whole(row, "data/chunk_index", where),
+            file_index=_whole(row, "data/file_index", where),
+        )
+        paths = {}
+        for name in videos:
+            key = f"videos/{name}/"
+            path = fill_template(
+                info["video_path"],
+                where,
+                video_key=name,
+                chunk_index=_whole(row, key + "chunk_index", where),
+                file_index=_whole(row, key + "file_index", where),
+            )
+            start = row.get(key + "from_timestamp")
+            if not isinstance(start, int | float) or not 0 <= start < 1e9:
+                raise FormatError.damaged(where, f"{key}from_timestamp is {start!r}")
+            paths[name] = (path, round(start * self.fps))
+        return EpisodePlace(index, length, data, paths)
+
+    def rows(self, index: int) -> RowSpan:
+        """Return the rows of an episode in its data file.
+
+        Raises:
+            MissingFileError, FormatError: The file is missing or cannot be read.
+            TruncatedVideoError: The rows are not all there, one after the other.
+        """
+        place = self.place(index)
+        path = self.files.path(place.data)
+        whole = RowSpan(path)
+        found = np.flatnonzero(whole.scalars("episode_index") == index)
+        start = int(found[0]) if len(found) else 0
+        rows = whole.part(start, start + len(found))
+        if not np.array_equal(found, np.arange(start, start + place.length)) or not np.array_equal(
+            rows.scalars("frame_index"), np.arange(place.length)
+        ):
+            raise TruncatedVideoError(
+                f"{path} holds {len(found)} rows of episode {index}; {place.length}, one after the "
+                "other and counted from 0, are expected",
+                "The dataset is damaged: download or build it again.",
+            )
+        return rows
+
+    def vectors(self, index: int, column: str) -> NDArray[np.float32]:
+        """Read a column of vectors of an episode, `(T, D) float32`.
+
+        Raises:
+            FormatError: It has other sizes than `info.json` says; and as `rows`.
+        """
+        rows = self.rows(index)
+        values = rows.vectors(column)
+        if values.shape[1:] != self.shape(column):
+            raise FormatError.damaged(
+                rows.path,
+                f"{column} of episode {index} has {values.shape[1]} values a frame; info.json "
+                f"says {self.shape(column)}",
+            )
+        return values
+
+    def iter_frames(
+        self, index: int, column: str, start: int, stop: int
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order.
+
+        Raises:
+            MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
+        """
+        path, first = self._video(index, column, start, stop)
+        return video.iter_frames(path, first + start, first + stop, self.fps, self.shape(column))
+
+    def read_frames(self, index: int, column: str, start: int, out: NDArray[np.uint8]) -> None:
+        """Decode frames from `start` on into `out`, `(T, H, W, 3) uint8`; errors as there."""
+        path, first = self._video(index, column, start, start + len(out))
+        video.decode_into(out, path, first + start, self.fps)
+
+    def _video(self, index: int, column: str, start: int, stop: int) -> tuple[Any, int]:
+        place = self.place(index)
+        self.check_span(index, start, stop)
+        path, first = place.videos[column]
+        return self.files.path(path), first
+
+    def check_span(self, index: int, start: int, stop: int) -> None:
+        """Check that an episode has frames `start` to `stop` (excluded).
+
+        Raises:
+            TruncatedVideoError: It has not.
+        """
+        length = self.row(index)["length"]
+        if not 0 <= start <= stop <= length:
+            raise TruncatedVideoError(
+                f"episode {index} of {self.files.describe()} has {length} stored frames; frames "
+                f"{start} to {stop - 1} were asked for"
+            )
+
+    def _v30_table(self) -> pa.Table:
+        kept = [f"stats/{name}/{bound}" for name in self._keep_stats for bound in ("min", "max")]
+        paths = [self.files.path(name) for name in self.files.list(EPISODES_DIR, ".parquet")]
+        if not paths:
+            raise MissingFileError(
+                f"{EPISODES_DIR} holds no parquet file in {self.files.describe()}",
+                "The dataset is not complete: download or build it again.",
+            )
+        tables = []
+        for path in paths:
+            file = open_parquet(path)
+            names = [n for n in file.schema_arrow.names if not n.startswith("stats/") or n in kept]
+            with reading(path):
+                tables.append(file.read(columns=names))
+        with reading(paths[0]):  # files with columns of different types
+            return pa.concat_tables(tables)
+
+    def _v21_table(self) -> pa.Table:
+        rows = list(self._json_lines(_V21_EPISODES))
+        if self._keep_stats and _V21_STATS in self.files.list("meta", ".jsonl"):
+            by_index = {row.get("episode_index"): row.get("stats") for row in self._json_lines(_V21_STATS)}
+            for row in rows:
+                stats = by_index.get(row.get("episode_index"))
+                for name in self._keep_stats:
+                    bounds = stats.get(name) if isinstance(stats, dict) else None
+                    for bound in ("min", "max"):
+                        row[f"stats/{name}/{bound}"] = (bounds or {}).get(bound)
+        names = dict.fromkeys(name for row in rows for name in row)
+        with reading(self.files.path(_V21_EPISODES)):
+            return pa.table({name: [row.get(name) for row in rows] for name in names})
+
+    def _json_lines(self, relative: str) -> Iterator[dict[str, Any]]:
+        path = self.files.path(relative)
+        with path.open(encoding="utf-8", errors="replace") as lines:
+            for number, line in enumerate(lines, 1):
+                if not line.strip():
+                    continue
+                try:
+                    row = json.loads(line)
+                except (ValueError, RecursionError) as error:
+                    raise FormatError.damaged(f"{path}, line {number}", error) from None
+                if not isinstance(row, dict):
+                    raise FormatError.damaged(f"{path}, line {number}", "no JSON object")
+                yield row
+
+
+def _check_info(info: dict[str, Any], path: object) -> None:
+    """Check what is read of `info.json`: types and sizes, before anything is allocated.
+
+    Raises:
+        FormatError: Something is not as LeRobot writes it.
+    """
+
+    def check(holds: bool, name: str) -> None:
+        if not holds:
+            shown = repr(info.get(name))
+            raise FormatError.damaged(path, f"{name} is {shown[:200]}")
+
+    fps, total = info.get("fps"), info.get("total_episodes")
+    check(isinstance(fps, int | float) and 0 < fps <= 1e6, "fps")
+    check(isinstance(total, int) and 0 <= total <= _MAX_EPISODES, "total_episodes")
+    check(isinstance(info.get("data_path"), str), "data_path")
+    features = info.get("features")
+    check(isinstance(features, dict) and bool(features), "features")
+    for feature in features.values() if isinstance(features, dict) else ():
+        shape = feature.get("shape") if isinstance(feature, dict) else None
+        sized = isinstance(shape, list | tuple) and all(
+            isinstance(side, int) and side > 0 for side in shape
+        )
+        check(sized and math.prod(shape or ()) <= _MAX_VALUES, "features")
+        check(isinstance(feature.get("dtype"), str), "features")
+        if feature["dtype"] == "video":
+            check(isinstance(info.get("video_path"), str), "video_path")
+
+
+def _whole(row: dict[str, Any], name: str, where: str) -> int:
+    value = row.get(name)
+    if not isinstance(value, int) or value < 0:
+        raise FormatError.damaged(where, f"{name} of an episode is {value!r}")
+    return value

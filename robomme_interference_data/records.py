@@ -1,0 +1,450 @@
+"""What is written down, each declared once: episodes, buffers, rollouts.
+
+The columns of every table and the fields of every header follow from these (see `rows.py`);
+`docs/format.md` describes them to readers of the files.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import accumulate
+from typing import Any
+
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.ids import EpisodeId
+
+__all__ = [
+    "KEY_COLUMNS",
+    "ROLES",
+    "TIMING_COLUMNS",
+    "BufferManifest",
+    "DatasetIdentity",
+    "EpisodeRecord",
+    "ManifestHeader",
+    "QueryFrame",
+    "Rollout",
+    "Session",
+    "SessionEntry",
+    "Status",
+]
+
+ROLES = ("lesson", "distractor", "filler", "contradiction")
+"""What a session is to its query: its own demonstration (or a part of it), a session of another
+family, material without content, or one that contradicts the lesson. The paper's conditions use
+the first two."""
+
+
+class Status(StrEnum):
+    """How an episode stands after a step.
+
+    `error` means that something broke: such a rollout is no failure of the policy.
+    """
+
+    ONGOING = "ongoing"
+    SUCCESS = "success"
+    FAIL = "fail"
+    TIMEOUT = "timeout"
+    ERROR = "error"
+
+
+FINAL = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
+
+
+# --- datasets ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """An episode of a dataset, with what its source recorded of it.
+
+    Attributes:
+        episode_index: Number of the episode in the dataset, from 0.
+        episode_id: Id of the episode that was recorded; of a unit, the one it was made of.
+        length: Stored frames. A demonstration's last one is the query frame.
+        goals: Wordings of the goal; at least one. The first is the dataset's task text.
+        seed: Seed of the simulator, or None.
+        difficulty: `easy`, `medium`, `hard`, or None.
+        simulator: `robomme`, `tabletop`, …, or None.
+        exec_start_idx: Index of the query frame, which is the number of lesson frames; None in a
+            distractor unit.
+        exact: False if a frame was ever lossily compressed.
+        feature_sha256: Digest over all frames by feature, see `digest.py`.
+        lesson_sha256: Digest over the lesson, without the query frame, by feature; None in a unit.
+    """
+
+    episode_index: int
+    episode_id: EpisodeId
+    length: int
+    goals: tuple[str, ...]
+    seed: int | None
+    difficulty: str | None
+    simulator: str | None
+    exec_start_idx: int | None
+    exact: bool
+    feature_sha256: dict[str, str]
+    lesson_sha256: dict[str, str] | None
+
+    def __post_init__(self) -> None:
+        if not self.goals:
+            raise FormatError(f"{self.episode_id} has no goal")
+        start = self.exec_start_idx
+        if self.length < 1 or not (start is None or 0 < start < self.length):
+            raise FormatError(
+                f"{self.episode_id} has length {self.length} and exec_start_idx {start}"
+            )
+
+    @property
+    def goal(self) -> str:
+        """The goal in words: the first of its wordings."""
+        return self.goals[0]
+
+    def digests(self, start: int, stop: int) -> dict[str, str] | None:
+        """Return the recorded digests of a span by feature; None if none are recorded for it."""
+        if (start, stop) == (0, self.length):
+            return self.feature_sha256
+        return self.lesson_sha256 if (start, stop) == (0, self.exec_start_idx) else None
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How much a dataset holds: episodes, stored frames, and episodes by family."""
+
+    episodes: int
+    frames: int
+    families: dict[str, int]
+
+
+@dataclass(frozen=True)
+class DatasetIdentity:
+    """`meta/interference.json`: what a dataset is.
+
+    Attributes:
+        format_version: Of the files.
+        kind: `demonstrations` or `distractors`.
+        version: Such as `1.0.0`.
+        revision: Identity of the content: SHA-256 over all episode records.
+        exact: Whether all episodes are.
+        codec: Name of the video settings.
+        cameras: Names of the cameras, sorted.
+        unit: `frames` and `stride` of a unit; None in demonstrations.
+        simulators: That the episodes come from.
+        sources: What the sources say of themselves.
+        counts: How much there is.
+        sums: SHA-256 of `meta/SHA256SUMS`, which lists every other file.
+    """
+
+    format_version: int
+    kind: str
+    version: str
+    revision: str
+    exact: bool
+    codec: str
+    cameras: tuple[str, ...]
+    unit: dict[str, int] | None
+    simulators: tuple[str, ...]
+    sources: tuple[dict[str, Any], ...]
+    counts: Counts
+    sums: str
+
+
+# --- buffers -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """One session of a history buffer: where its frames lie and what they must hash to.
+
+    Attributes:
+        role: One of `ROLES`.
+        family: Family of the recorded episode.
+        source: Id of the recorded episode.
+        dataset: Name of the dataset in the split, such as `demonstrations`.
+        revision: Identity of that dataset.
+        episode_index: Number of the episode in that dataset.
+        start: First stored frame of the span.
+        stop: Frame after the last one.
+        repeat: How often each frame is shown in a row; 1 but for held frames.
+        sha256: Digest over the span, each frame once, see `digest.py`.
+    """
+
+    role: str
+    family: str
+    source: EpisodeId
+    dataset: str
+    revision: str
+    episode_index: int
+    start: int
+    stop: int
+    repeat: int
+    sha256: str
+
+    def __post_init__(self) -> None:
+        if self.role not in ROLES:
+            raise FormatError(f"session role {self.role!r} is none of {', '.join(ROLES)}")
+        if not 0 <= self.start < self.stop or self.repeat < 1:
+            raise FormatError(
+                f"session span [{self.start}, {self.stop}) × {self.repeat} of {self.source} is "
+                "empty or negative"
+            )
+
+    @property
+    def num_frames(self) -> int:
+        """Frames that the session adds to the buffer."""
+        return (self.stop - self.start) * self.repeat
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session in its place in a buffer.
+
+    Attributes:
+        role: `lesson`, `distractor`, … (see `ROLES`).
+        family: Family of the recorded episode.
+        source: Id of the recorded episode.
+        start: First frame of the session in the buffer.
+        stop: Frame after its last one.
+        entry: Where the frames are stored.
+    """
+
+    role: str
+    family: str
+    source: EpisodeId
+    start: int
+    stop: int
+    entry: SessionEntry = field(repr=False)
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+
+def place_sessions(entries: tuple[SessionEntry, ...]) -> tuple[Session, ...]:
+    """Return sessions in their places, one after the other."""
+    stops = accumulate(entry.num_frames for entry in entries)
+    return tuple(
+        Session(one.role, one.family, one.source, stop - one.num_frames, stop, one)
+        for one, stop in zip(entries, stops, strict=True)
+    )
+
+
+@dataclass(frozen=True)
+class QueryFrame:
+    """Where the first live observation of a query episode is stored."""
+
+    dataset: str
+    revision: str
+    episode_index: int
+    frame: int
+
+
+@dataclass(frozen=True)
+class BufferManifest:
+    """A history buffer by name: what it holds, without the frames.
+
+    Attributes:
+        episode_id: The query episode.
+        condition: Name of the condition: with `episode_id`, the buffer's key.
+        k: Number of sessions that the condition adds.
+        goals: Wordings of the query's goal; at least one.
+        seed: Seed of the query episode in its simulator, or None.
+        difficulty: `easy`, `medium`, `hard`, or None.
+        simulator: Simulator that the query episode belongs to, or None.
+        exact: Whether all frames are the recorded ones, bit for bit.
+        lesson_frames: Frames of the lesson in the buffer.
+        history_frames: Frames of the whole buffer: the `exec_start_idx` of the policy servers.
+        lesson_share: Share of lesson frames in an even 32-frame sample of history and first live
+            observation at the first step, see `sampling.lesson_share`.
+        query: Where the first live observation is stored; never part of the buffer.
+        sessions: The sessions in order.
+    """
+
+    episode_id: EpisodeId
+    condition: str
+    k: int
+    goals: tuple[str, ...]
+    seed: int | None
+    difficulty: str | None
+    simulator: str | None
+    exact: bool
+    lesson_frames: int
+    history_frames: int
+    lesson_share: float
+    query: QueryFrame
+    sessions: tuple[SessionEntry, ...]
+
+    def __post_init__(self) -> None:
+        frames = sum(session.num_frames for session in self.sessions)
+        if frames != self.history_frames:
+            raise FormatError(
+                f"{self}: the sessions hold {frames} frames, history_frames says "
+                f"{self.history_frames}"
+            )
+
+    def __str__(self) -> str:
+        return f"{self.episode_id} under {self.condition}"
+
+    @property
+    def goal(self) -> str:
+        """The goal in words: the first of its wordings."""
+        return self.goals[0]
+
+
+@dataclass(frozen=True)
+class ManifestDataset:
+    """A dataset that manifests name.
+
+    Attributes:
+        kind: `demonstrations` or `distractors`.
+        version: Its version.
+        revision: Its revision: sessions name it.
+        identity: SHA-256 of its `meta/interference.json`.
+    """
+
+    kind: str
+    version: str
+    revision: str
+    identity: str
+
+
+@dataclass(frozen=True)
+class ManifestHeader:
+    """`manifests/manifest.json`: how the buffers of a split were planned.
+
+    Attributes:
+        format_version: Of the files.
+        rule_version: Of the draw.
+        seed: Of the draw.
+        conditions: Names of the planned conditions, in order.
+        position_limit: Longest history and rollout together, or None.
+        datasets: The datasets by name, which are folders of the split.
+        counts: Numbers of `queries`, `buffers` and `sessions`.
+        rows: SHA-256 of `buffers.parquet`.
+    """
+
+    format_version: int
+    rule_version: int
+    seed: int
+    conditions: tuple[str, ...]
+    position_limit: int | None
+    datasets: dict[str, ManifestDataset]
+    counts: dict[str, int]
+    rows: str
+
+
+# --- rollouts ----------------------------------------------------------------------------------
+
+KEY_COLUMNS = (
+    "system",
+    "simulator",
+    "split",
+    "revision",
+    "family",
+    "condition",
+    "episode_split",
+    "episode",
+    "model_seed",
+    "protocol_version",
+)
+"""What makes a rollout the one that it is: no two rows of a run agree in all of them."""
+
+TIMING_COLUMNS = ("reset_s", "history_s", "policy_s", "simulator_s", "wall_s", "finished_at")
+"""Columns that differ from one run to the next; all others do not."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One rollout.
+
+    Attributes:
+        system: Name of the system: a policy together with its memory mechanism.
+        simulator: `tabletop` or `robomme`.
+        split: Name of the split of buffers.
+        revision: Identity of that split, `Split.revision`.
+        family: Task family.
+        condition: `no-history`, `k0`, `k1`, …
+        episode_split: `train`, `val` or `test`.
+        episode: Index of the query episode.
+        model_seed: Seed that the policy was given.
+        protocol_version: `PROTOCOL_VERSION` of the run.
+        seed: Seed of the scene.
+        difficulty: `easy`, `medium` or `hard`; None if not known.
+        goal: The goal in words, as the policy got it.
+        status: `success`, `fail`, `timeout` (after 1300 steps) or `error`.
+        success: Whether the status is `success`; None for an error, which is neither.
+        steps: Executed steps.
+        history_frames: Frames that the policy was given before the first live observation.
+        lesson_frames: Those of them that are of the lesson.
+        lesson_share: Share of lesson frames in an even 32-frame sample of what was given and the
+            first live observation (see `sampling.lesson_share`); None without history.
+        retrieval_model: Encoder and rule of the retrieval step, or None.
+        retrieval_start: First frame in the buffer of the retrieved span, or None.
+        retrieval_stop: Frame after its last one, or None.
+        retrieval_selected_lesson_fraction: Share of lesson frames in an even 32-frame sample of
+            the retrieved span and the first live observation, as the released CSV has it.
+        retrieval_selected_filler_fraction: The same for frames of other sessions.
+        retrieval_selected_query_fraction: The same for the first live observation.
+        error: What broke, in one line; None unless the status is `error`.
+        attempt: How often the rollout was started, this time included.
+        video: Path of its video inside the run's folder, or None.
+        reset_s: Seconds to reset the simulator.
+        history_s: Seconds to hand the history over, and to wait for what is not decoded yet.
+        policy_s: Seconds that the policy took for actions and observations.
+        simulator_s: Seconds of stepping.
+        wall_s: Seconds in all.
+        finished_at: When it ended, UTC, `2026-01-31T12:00:00Z`.
+    """
+
+    system: str
+    simulator: str
+    split: str
+    revision: str
+    family: str
+    condition: str
+    episode_split: str
+    episode: int
+    model_seed: int
+    protocol_version: int
+    seed: int | None
+    difficulty: str | None
+    goal: str | None
+    status: str
+    success: bool | None
+    steps: int
+    history_frames: int
+    lesson_frames: int
+    lesson_share: float | None
+    retrieval_model: str | None = None
+    retrieval_start: int | None = None
+    retrieval_stop: int | None = None
+    retrieval_selected_lesson_fraction: float | None = None
+    retrieval_selected_filler_fraction: float | None = None
+    retrieval_selected_query_fraction: float | None = None
+    error: str | None = None
+    attempt: int = 1
+    video: str | None = None
+    reset_s: float | None = None
+    history_s: float | None = None
+    policy_s: float | None = None
+    simulator_s: float | None = None
+    wall_s: float | None = None
+    finished_at: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.status not in FINAL:
+            raise FormatError(f"status {self.status!r} is none of {', '.join(FINAL)}")
+        expected = None if self.status == Status.ERROR else self.status == Status.SUCCESS
+        if self.success is not expected:
+            raise FormatError(
+                f"success {self.success} contradicts status {self.status!r}; expected {expected}"
+            )
+        if not 0 <= self.steps <= MAX_STEPS:
+            raise FormatError(f"steps {self.steps}; expected 0 to {MAX_STEPS}")
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """The values of `KEY_COLUMNS`."""
+        return tuple(getattr(self, name) for name in KEY_COLUMNS)
+
+    @property
+    def episode_id(self) -> EpisodeId:
+        """The query episode."""
+        return EpisodeId(self.family, self.episode_split, self.episode)

@@ -1,0 +1,88 @@
+"""What a sample of a history holds, whatever sessions the history is made of: pure."""
+
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+from robomme_interference_data.constants import SAMPLE_FRAMES
+
+__all__ = ["Span", "even_sample", "lesson_frames", "lesson_share", "spread"]
+
+
+class Span(Protocol):
+    """Frames of a buffer that have one role: `start` is the first, `stop` follows the last."""
+
+    @property
+    def role(self) -> str: ...
+    @property
+    def start(self) -> int: ...
+    @property
+    def stop(self) -> int: ...
+
+
+def even_sample(history_frames: int, samples: int = SAMPLE_FRAMES) -> list[int]:
+    """Return the frames that an even sample takes at the first step: FrameSamp's rule.
+
+    The sample is of the history and the first live observation together: all frames while there
+    are fewer than `samples`, else those at the integer `linspace(0, t, samples)`, t being the
+    index of the live observation.
+
+    Args:
+        history_frames: Frames of the history buffer; also the index of the live observation.
+        samples: Size of the sample, 2 or more.
+
+    Returns:
+        Indices, ascending; the last one is the live observation's.
+    """
+    if history_frames + 1 < samples:
+        return list(range(history_frames + 1))
+    # Exact integers: index j of linspace(0, t, n) is floor(j·t / (n − 1)).
+    return [j * history_frames // (samples - 1) for j in range(samples)]
+
+
+def spread(start: int, stop: int, count: int) -> list[int]:
+    """Return at most `count` evenly spread indices from `start` to `stop` (excluded).
+
+    The first and the last frame are among them, unless `count` is 1.
+    """
+    last = stop - start - 1
+    count = min(count, last + 1)
+    return [start + j * last // max(count - 1, 1) for j in range(count)]
+
+
+def lesson_frames(sessions: Iterable[Span], start: int = 0, stop: int | None = None) -> int:
+    """Count the frames of a span of a buffer, by default of all, that are of the lesson.
+
+    Args:
+        sessions: The buffer's sessions.
+        start: First frame of the span.
+        stop: Frame after its last one; None for the buffer's end.
+    """
+    return sum(
+        max(0, min(session.stop, session.stop if stop is None else stop) - max(session.start, start))
+        for session in sessions
+        if session.role == "lesson"
+    )
+
+
+def lesson_share(
+    sessions: Sequence[Span], start: int, stop: int, samples: int = SAMPLE_FRAMES
+) -> float:
+    """Return the share of lesson frames in an even sample of a span of a buffer.
+
+    Args:
+        sessions: The buffer's sessions.
+        start: First frame of the span.
+        stop: Frame after its last one.
+        samples: Size of the sample, 2 or more; the live observation after the span is its last
+            frame, and is no lesson.
+
+    Returns:
+        Share from 0 to 1.
+    """
+    lessons = [session for session in sessions if session.role == "lesson"]
+    sample = even_sample(stop - start, samples)
+    inside = sum(
+        any(session.start <= start + index < session.stop for session in lessons)
+        for index in sample[:-1]
+    )
+    return inside / len(sample)

@@ -1,0 +1,169 @@
+"""Settings declared once: the fields of a frozen dataclass are the Python API and the options.
+
+```python
+@dataclass(frozen=True)
+class Config:
+    out: Path = setting(help="Folder of the run.")
+    workers: int = setting(1, help="Worker processes.")
+
+@app.command()
+@with_settings
+def evaluate(config: Config, as_json: AsJson = False) -> None: ...
+```
+
+gives the command the options `--out` and `--workers`. A tuple is an option that takes several
+values, with spaces or commas between them; a truth value is a flag.
+"""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Sequence
+from functools import wraps
+from types import NoneType, UnionType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+__all__ = ["option_names", "setting", "spread_values", "with_settings"]
+
+_SETTING = "setting"
+
+
+def setting(
+    default: Any = dataclasses.MISSING,
+    *,
+    help: str,  # noqa: A002 - as typer has it
+    name: str | None = None,
+    metavar: str | None = None,
+    env: str | None = None,
+    shown: str | None = None,
+) -> Any:
+    """Declare a field that is also an option.
+
+    Args:
+        default: Its value if it is not given; without, it has to be.
+        help: What it says, in a line.
+        name: Its option, where that is not the field's name; `-` stands for an argument.
+        metavar: What its value is called.
+        env: Environment variable that can give it.
+        shown: What is shown as its default, where that says more than the value.
+    """
+    told = {"help": help, "name": name, "metavar": metavar, "env": env, "shown": shown}
+    return dataclasses.field(default=default, metadata={_SETTING: told})
+
+
+def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
+    """Give a command the options of the dataclass that one of its parameters is."""
+    signature = inspect.signature(function, eval_str=True)
+    parameters: list[inspect.Parameter] = []
+    configs: dict[str, tuple[type, list[str]]] = {}
+    for parameter in signature.parameters.values():
+        kind = parameter.annotation
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            options = _options(kind)
+            configs[parameter.name] = kind, [option.name for option in options]
+            parameters += options
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+    parameters.sort(key=lambda one: one.default is not inspect.Parameter.empty)
+
+    @wraps(function)
+    def command(**given: Any) -> R:
+        built = {
+            name: config(**{field: _value(given.pop(field)) for field in fields})
+            for name, (config, fields) in configs.items()
+        }
+        return function(**built, **given)  # type: ignore[call-arg]
+
+    command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    return command
+
+
+def spread_values(arguments: Sequence[str], several: Sequence[str]) -> list[str]:
+    """Repeat an option before each of its values: click's options take one value each.
+
+    Args:
+        arguments: The command line, such as `--k 0 1,3`.
+        several: Options that take several values, such as `--k`.
+
+    Returns:
+        The command line as click reads it: `--k 0 --k 1 --k 3`.
+    """
+    spread: list[str] = []
+    option: str | None = None
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if argument.startswith("--"):
+            option = name if name in several else None
+            argument = value if option and equals else argument  # noqa: PLW2901
+            if option and not equals:
+                continue
+        if option is None:
+            spread.append(argument)
+        else:
+            for part in filter(None, argument.split(",")):
+                spread += [option, part]
+    return spread
+
+
+def option_names(config: type) -> dict[str, str]:
+    """Return the option of each field of a dataclass of settings, such as `--episode-split`."""
+    return {name: _option_name(name, told) for name, _, told, _ in _declared(config)}
+
+
+def _declared(config: Any) -> list[tuple[str, Any, dict[str, Any], Any]]:
+    """Return name, type, what was told, and default of each setting."""
+    hints = get_type_hints(config)
+    return [
+        (field.name, hints[field.name], field.metadata[_SETTING], field.default)
+        for field in dataclasses.fields(config)
+        if _SETTING in field.metadata
+    ]
+
+
+def _option_name(name: str, told: dict[str, Any]) -> str:
+    return told["name"] or "--" + name.replace("_", "-")
+
+
+def _options(config: type) -> list[inspect.Parameter]:
+    import typer
+
+    found = []
+    for name, hint, told, default in _declared(config):
+        plain = _without_none(hint)
+        if get_origin(plain) is tuple:
+            item = get_args(plain)[0]
+            kind: Any = list[item] if plain is hint else list[item] | None
+            metavar = told["metavar"] or "NAME…"
+        else:
+            kind, metavar = hint, told["metavar"]
+        about: dict[str, Any] = {"help": told["help"], "metavar": metavar, "envvar": told["env"]}
+        if told["shown"] is not None:
+            about["show_default"] = told["shown"]
+        elif default in (None, ()):
+            about["show_default"] = False
+        if told["name"] == "-":
+            annotation = Annotated[kind, typer.Argument(**about)]
+        else:
+            annotation = Annotated[kind, typer.Option(_option_name(name, told), **about)]
+        missing = default is dataclasses.MISSING
+        value = inspect.Parameter.empty if missing else _default(default)
+        found.append(
+            inspect.Parameter(
+                name, inspect.Parameter.KEYWORD_ONLY, default=value, annotation=annotation
+            )
+        )
+    return found
+
+
+def _without_none(hint: Any) -> Any:
+    if get_origin(hint) is UnionType:
+        return next(part for part in get_args(hint) if part is not NoneType)
+    return hint
+
+
+def _default(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _value(given: Any) -> Any:
+    return tuple(given) if isinstance(given, list) else given
