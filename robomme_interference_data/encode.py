@@ -117,12 +117,21 @@ class VideoEncoder:
         fps: Frame rate in Hz.
         height: Rows of pixels.
         width: Columns of pixels.
+        container: FFmpeg's name of the container; None if the path's suffix says it.
 
     Raises:
         BuildError: The file cannot be written, or the frames are too small for the codec.
     """
 
-    def __init__(self, path: Path, codec: Codec, fps: int, height: int, width: int):
+    def __init__(
+        self,
+        path: Path,
+        codec: Codec,
+        fps: int,
+        height: int,
+        width: int,
+        container: str | None = None,
+    ):
         if min(height, width) < codec.min_side:
             raise BuildError(
                 f"{path.stem}: frames of {width}×{height} pixels are too small for {codec.name}, "
@@ -133,7 +142,9 @@ class VideoEncoder:
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
         with self._errors():
             # Matroska would write a random number otherwise.
-            self._container = av.open(str(path), "w", container_options={"fflags": "+bitexact"})
+            self._container = av.open(
+                str(path), "w", format=container, container_options={"fflags": "+bitexact"}
+            )
             self._stream = self._container.add_stream(
                 codec.vcodec, rate=fps, options=dict(codec.options)
             )
