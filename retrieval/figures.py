@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.page import GREY, INK, open_figure, save_figure, tidy
+from robomme_interference_data.drawing import GREY, INK, open_figure, save_figure, tidy
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.page import GREY, INK, Page, ink_on, open_page, tidy, tint
+from robomme_interference_data.drawing import GREY, INK, Page, ink_on, open_page, tidy, tint
 from robomme_interference_data.retrieval.grade import Grade
 from robomme_interference_data.retrieval.report import Reasons, reasons
 from robomme_interference_data.retrieval.segment import MIN_FRAMES

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.bootstrap import Interval
+from robomme_interference_data.stats import Interval
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell, Grade

@@ -8,7 +8,7 @@ from pathlib import Path
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
 from robomme_interference_data.draw import even_sample
-from robomme_interference_data.page import Page, ink_on, open_page, tint
+from robomme_interference_data.drawing import Page, ink_on, open_page, tint
 from robomme_interference_data.sessions import Session
 
 __all__ = ["Block", "arrange", "draw_strip", "session_colors", "shown_frames"]

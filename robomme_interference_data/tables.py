@@ -1,16 +1,13 @@
-"""Tables as data, and as CSV and Markdown. Rules for what stands in them are elsewhere."""
+"""Tables as data, for terminals, and as CSV and Markdown: the one renderer of all of them."""
 
 import csv
 import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
-from robomme_interference_data.files import atomic_path
-
-__all__ = ["Column", "Kind", "Table", "percent", "points", "write_tables"]
+__all__ = ["Column", "Kind", "Table", "percent", "points"]
 
 Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
 
@@ -85,21 +82,6 @@ class Table:
         ]
         text = "\n".join([laid[0], "  ".join("-" * width for width in widths), *laid[1:]])
         return "\n\n".join(part for part in (self.title, text, self.note) if part)
-
-
-def write_tables(tables: Sequence[Table], folder: Path, main: str) -> None:
-    """Write each table as `<name>.csv` and `<name>.md`.
-
-    Args:
-        tables: The tables.
-        folder: Where to write.
-        main: Markdown of the table `main`, which is laid out as in the paper.
-    """
-    for table in tables:
-        markdown = main if table.name == "main" else table.markdown()
-        for suffix, text in ((".csv", table.csv()), (".md", markdown)):
-            with atomic_path(folder / (table.name + suffix)) as partial:
-                partial.write_text(text, encoding="utf-8", newline="\n")
 
 
 def percent(value: float) -> str:

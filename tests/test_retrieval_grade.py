@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.intervals import wilson
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.retrieval.calibrate import (
     calibrate,
     fit,
@@ -199,7 +199,7 @@ def test_cells_by_hand() -> None:
 
 
 def test_the_pass_mark() -> None:
-    from robomme_interference_data.bootstrap import Interval
+    from robomme_interference_data.stats import Interval
 
     def cell(purity: float, coverage: float) -> Cell:
         values = [Interval(value, 0, 1) for value in (1, purity, coverage, 0)]

@@ -17,7 +17,7 @@ from sample_buffers import QUERY, load, reshaped
 
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError, UnknownNameError
-from robomme_interference_data.page import open_page
+from robomme_interference_data.drawing import open_page
 from robomme_interference_data.strip import arrange, draw_strip
 
 pytest.importorskip("matplotlib")

@@ -9,7 +9,7 @@ from sample_buffers import QUERY, load, reshaped
 from robomme_interference_data.draw import even_sample, lesson_share
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.page import ink_on, tint
+from robomme_interference_data.drawing import ink_on, tint
 from robomme_interference_data.sessions import Session
 from robomme_interference_data.strip import (
     COLORS,

@@ -1,0 +1,44 @@
+"""Score rows of rollouts: what can be asked for. `scoring.score` does it."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from robomme_interference_data.settings import setting
+
+__all__ = ["Against", "Grid", "Settings"]
+
+
+class Against(StrEnum):
+    """What rates can be set against."""
+
+    PAPER = "paper"
+
+
+class Grid(StrEnum):
+    """Which cells are expected, and which episodes a complete one has.
+
+    `benchmark`: the paper's five conditions, each with its nine families × test episodes 0 to 49;
+    `given`: those conditions and episodes that any of the rows of the simulator is of. A condition
+    that does not apply to a system is not expected of it.
+    """
+
+    BENCHMARK = "benchmark"
+    GIVEN = "given"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is scored, and how."""
+
+    rows: tuple[Path, ...] = setting(
+        name="-", metavar="ROWS…", help="Folders of runs, or CSV, parquet or jsonl files."
+    )
+    system: str | None = setting(None, help="Name of the system of rows that name none.")
+    against: Against | None = setting(None, help="Put the published rates beside these.")
+    grid: Grid = setting(
+        Grid.BENCHMARK,
+        help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to 49 "
+        "each), or those that any of the given rows is of.",
+    )
+    lenient: bool = setting(False, help="Leave bad rows out, and count them.")

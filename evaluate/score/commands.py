@@ -1,51 +1,26 @@
 """The commands `score` and `compare`."""
 
-import json
 import shlex
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.evaluate.score.grid import Grid
-from robomme_interference_data.progress import MESSAGES
+from robomme_interference_data.console import MESSAGES, AsJson, print_json
+from robomme_interference_data.evaluate.score import Settings
+from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.score.rollouts import Rollouts
-    from robomme_interference_data.evaluate.score.scoring import Score
+    from robomme_interference_data.evaluate.score.rows import Rows
 
 __all__ = ["compare", "score"]
 
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
-Lenient = Annotated[bool, typer.Option("--lenient", help="Skip and count bad rows.")]
-
-
-class Against(StrEnum):
-    """What rates can be set against."""
-
-    PAPER = "paper"
-
-
+@with_settings
 def score(
-    rows: Annotated[list[Path], typer.Argument(help="Folders of runs, or CSV or parquet files.")],
+    settings: Settings,
     out: Annotated[Path, typer.Option(help="Folder for tables, figures and the report.")],
-    system: Annotated[
-        str | None, typer.Option(help="Name of the system of rows that name none.")
-    ] = None,
-    against: Annotated[
-        Against | None, typer.Option(help="Put the published rates beside these.")
-    ] = None,
-    grid: Annotated[
-        Grid,
-        typer.Option(
-            help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to "
-            "49 each), or those that any of the given rows is of."
-        ),
-    ] = Grid.BENCHMARK,
-    lenient: Lenient = False,
     export_to: Annotated[
         Path | None,
         typer.Option("--export", help="Also write the rows here as the released CSVs have them."),
@@ -62,44 +37,34 @@ def score(
     robomme-interference score rollouts.csv --system retrieval-framesamp-modul --against paper
     --out my-score
     """
-    from robomme_interference_data.evaluate.score.cells import main_markdown
-    from robomme_interference_data.evaluate.score.outputs import write_outputs
+    from robomme_interference_data.evaluate.score.headline import headline
     from robomme_interference_data.evaluate.score.scoring import score as compute
+    from robomme_interference_data.evaluate.score.scoring import write_score
 
-    found = compute(rows, system, lenient, grid, against is Against.PAPER)
-    _tell_refused(found.rollouts)
+    found = compute(settings)
+    _tell_refused(found.rows)
     for note in found.notes:
         MESSAGES.print(note)
     with MESSAGES.status("Drawing the figures"):
         command = shlex.join(["robomme-interference", *sys.argv[1:]])
-        exported = write_outputs(found, out, export_to, system, command)
+        exported = write_score(found, out, export_to, command)
     for path in exported:
         MESSAGES.print(f"{path} written")
     if as_json:
-        typer.echo(json.dumps(_as_dict(found), indent=2, ensure_ascii=False, allow_nan=False))
+        print_json(
+            {
+                "headlines": {simulator: headline(found, simulator) for simulator in found.cubes},
+                "rows": len(found.rows),
+                "bad_rows": found.rows.refused,
+                "notes": list(found.notes),
+                "grid": settings.grid,
+                "tables": {name: table.records() for name, table in found.tables.items()},
+            }
+        )
     else:
-        typer.echo(main_markdown(found.cells))
+        for grid in found.grids:
+            typer.echo(f"{grid.text()}\n")
     MESSAGES.print(f"Report: {out / 'report.html'}")
-
-
-def _tell_refused(rollouts: "Rollouts") -> None:
-    for refusal in rollouts.refusals:
-        MESSAGES.print(f"left out: {refusal}")
-    if rollouts.refused:
-        MESSAGES.print(f"{rollouts.refused:,} bad rows left out")
-
-
-def _as_dict(found: "Score") -> dict[str, Any]:
-    from robomme_interference_data.evaluate.score.headline import headline
-
-    return {
-        "headlines": {simulator: headline(found, simulator) for simulator in found.expected},
-        "rows": len(found.rollouts.packed),
-        "bad_rows": found.rollouts.refused,
-        "notes": list(found.notes),
-        "grid": found.grid,
-        "tables": {name: table.records() for name, table in found.tables.items()},
-    }
 
 
 def compare(
@@ -111,23 +76,34 @@ def compare(
     system_b: Annotated[
         str | None, typer.Option(help="Name of the system of rows of B that name none.")
     ] = None,
-    lenient: Lenient = False,
+    lenient: Annotated[
+        bool, typer.Option("--lenient", help="Leave bad rows out, and count them.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare two runs, paired over the episodes that both have.
 
-    Example: robomme-interference compare my-run my-run-with-retrieval
+    Examples:
+    robomme-interference compare my-run my-run-with-retrieval
+
+    robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     """
     from robomme_interference_data.evaluate.score.compare import compare as compute
 
     found = compute(run_a, run_b, (system_a, system_b), lenient)
-    for rollouts in found.runs:
-        _tell_refused(rollouts)
+    for rows in found.runs:
+        _tell_refused(rows)
     for note in found.notes:
         MESSAGES.print(note)
     if as_json:
-        bad = [rollouts.refused for rollouts in found.runs]
-        value = {"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()}
-        typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+        bad = [rows.refused for rows in found.runs]
+        print_json({"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()})
     else:
-        typer.echo(found.table.markdown())
+        typer.echo(found.table.text())
+
+
+def _tell_refused(rows: "Rows") -> None:
+    for refusal in rows.refusals:
+        MESSAGES.print(f"left out: {refusal}")
+    if rows.refused:
+        MESSAGES.print(f"{rows.refused:,} bad rows left out")

@@ -1,34 +1,19 @@
 """Two runs, paired over the episodes that both have."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from robomme_interference_data.bootstrap import Resampler, difference
-from robomme_interference_data.constants import FAMILIES, SPLITS
+from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.rows import condition_rank
-from robomme_interference_data.evaluate.score.outcomes import (
-    Outcomes,
-    families_of,
-    outcomes_of,
-)
-from robomme_interference_data.evaluate.score.paired import (
-    COLUMNS,
-    Side,
-    Tested,
-    interval_of,
-    note_of,
-    pairs_of,
-    tested,
-)
-from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
-from robomme_interference_data.evaluate.score.statistics import holm
-from robomme_interference_data.intervals import wilson
+from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.cube import Cube, Statuses, cubes_of, success
+from robomme_interference_data.evaluate.score.pairs import Pairs, pair, paired_table
+from robomme_interference_data.evaluate.score.rows import Rows, read_rows
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.stats import Resampler, difference, wilson
 from robomme_interference_data.tables import Column, Table, percent
 
 __all__ = ["Comparison", "compare"]
@@ -47,7 +32,7 @@ class Comparison:
 
     table: Table
     notes: tuple[str, ...]
-    runs: tuple[Rollouts, Rollouts]
+    runs: tuple[Rows, Rows]
 
 
 def compare(
@@ -65,162 +50,137 @@ def compare(
         first: Folder or file of rows.
         second: The other one. Differences are its rate − the first's.
         systems: Names of the systems of rows that name none.
-        lenient: Skip and count bad rows.
+        lenient: Leave bad rows out, and count them.
 
     Raises:
         InvalidOptionError: They have no simulator, system, condition or episode in common.
         BadRowsError: Rows are bad.
     """
     one, other = (
-        read_rollouts([p], s, lenient) for p, s in zip((first, second), systems, strict=True)
+        read_rows([p], s, lenient) for p, s in zip((first, second), systems, strict=True)
     )
-    seeds = _seeds(one, other)
-    rows: list[tuple[Any, ...]] = []
-    notes = list(_differing(one, other))
-    met = list(_pairs(one, other))
+    met = list(_met(one, other))
+    notes, found = list(_differing(one, other)), []
     for a, b in met:
-        shared = sorted((c for c in a.conditions if c in b.conditions), key=condition_rank)
-        found = [_Condition(a, b, condition, seeds) for condition in shared]
-        for part in ("", *FAMILIES):
-            for here in found:
-                if numbers := here.row(part):
-                    names = (a.simulator, a.system, b.system, part or "all", here.condition)
-                    rows.append((*names, *numbers))
-        if a.system == b.system and _same_histories(a.simulator, one, other):
-            notes += _noise(a, found, one, other)
-    if not rows:
+        conditions = [c for c in a.conditions if c in b.conditions]
+        pairs = {(part, c): _pairs(a, b, c, part) for part in ("", *FAMILIES) for c in conditions}
+        for (part, condition), here in pairs.items():
+            if here.n:
+                own = (a.cube.simulator, a.system, b.system, part or "all", condition)
+                found.append((own, here, ()))
+        if a.system == b.system and _same_histories(a.cube.simulator, one, other):
+            notes += _noise(a, b, {c: pairs["", c] for c in conditions})
+    if not found:
         raise InvalidOptionError(
             f"{first} and {second} have no episode under a common condition that counts in both",
             "Compare runs over the same episodes.",
         )
     notes += _left_out("a", one, met) + _left_out("b", other, [(b, a) for a, b in met])
-    columns = (
-        *(Column(n) for n in ("simulator", "system_a", "system_b", "family", "condition")),
-        *(Column("n", "count"), Column("rate_a", "rate"), Column("rate_b", "rate")),
-        *(Column("difference", "points"), *COLUMNS),
-    )
-    note = (
+    table = paired_table(
+        "compare",
+        "Two runs compared",
+        [Column(n) for n in ("simulator", "system_a", "system_b", "family", "condition")],
+        found,
         f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
-        "b − a, gained and lost are from a to b. "
+        "b − a, gained and lost are from a to b.",
+        {"rate_a": "first", "rate_b": "second"},
     )
-    place, pairs = (next(i for i, c in enumerate(columns) if c.name == n) for n in ("n", "pairs"))
-    note += note_of([(row[place], row[pairs]) for row in rows])
-    corrected = holm([row[-1] for row in rows])
-    whole = tuple((*row, p) for row, p in zip(rows, corrected, strict=True))
-    table = Table("compare", "Two runs compared", columns, whole, note)
     return Comparison(table, tuple(notes), (one, other))
 
 
-def _pairs(one: Rollouts, other: Rollouts) -> Iterator[tuple[Outcomes, Outcomes]]:
-    simulators = set(one.simulators) & set(other.simulators)
-    if not simulators:
+@dataclass(frozen=True)
+class _Side:
+    """One system in one simulator of a run."""
+
+    cube: Cube
+    system: str
+
+    @property
+    def conditions(self) -> list[str]:
+        return self.cube.ran(self.system)
+
+    def status(self, condition: str, episodes: Sequence[EpisodeId]) -> Statuses:
+        place = {one: at for at, one in enumerate(self.cube.episodes)}
+        return self.cube.status[self.cube.cell(self.system, condition)][
+            [place[one] for one in episodes]
+        ]
+
+    def counted(self, condition: str) -> set[EpisodeId]:
+        counts = self.cube.counted[self.cube.cell(self.system, condition)]
+        return {self.cube.episodes[at] for at in np.flatnonzero(counts)}
+
+
+def _sides(rows: Rows) -> Iterator[_Side]:
+    for cube in cubes_of(rows, Grid.GIVEN).values():
+        yield from (_Side(cube, system) for system in cube.systems)
+
+
+def _met(one: Rows, other: Rows) -> Iterator[tuple[_Side, _Side]]:
+    """Yield what is compared, simulator by simulator, in the order of tables."""
+    simulators, systems = (
+        [rows.names(column) for rows in (one, other)] for column in ("simulator", "system")
+    )
+    if set(simulators[0]).isdisjoint(simulators[1]):
         raise InvalidOptionError(
-            f"the rows are of different simulators: {', '.join(one.simulators)} and "
-            f"{', '.join(other.simulators)}",
+            f"the rows are of different simulators: {' and '.join(map(', '.join, simulators))}",
             "Only rows of one simulator can be compared.",
         )
-    _check_episodes(one, other, simulators)
-    common = [system for system in one.systems if system in other.systems]
-    alone = len(one.systems) == len(other.systems) == 1
-    if not common and not alone:
+    common = [system for system in systems[0] if system in systems[1]]
+    if not common and max(map(len, systems)) > 1:
         raise InvalidOptionError(
-            f"no system is in both: {', '.join(one.systems)} and {', '.join(other.systems)}",
+            f"no system is in both: {' and '.join(map(', '.join, systems))}",
             "Compare runs of the same systems, or of one system each.",
         )
-    partners = {s: s for s in common} or {one.systems[0]: other.systems[0]}
-    there = {(o.simulator, o.system): o for o in outcomes_of(other)}
-    for a in outcomes_of(one):
-        b = there.get((a.simulator, partners.get(a.system, "")))
+    partners = {one: one for one in common} or {systems[0][0]: systems[1][0]}
+    there = {(side.cube.simulator, side.system): side for side in _sides(other)}
+    for a in _sides(one):
+        b = there.get((a.cube.simulator, partners.get(a.system, "")))
         if b is not None:
+            _check_scenes(a.cube, b.cube)
             yield a, b
 
 
-def _check_episodes(one: Rollouts, other: Rollouts, simulators: set[str]) -> None:
+def _check_scenes(a: Cube, b: Cube) -> None:
     """Check that the two runs' scenes are the same: an episode's seed is one."""
-    groups = len(FAMILIES) * len(SPLITS)
-    for simulator in sorted(simulators):
-        a, b = (r.seeds[r.simulators.index(simulator) * groups :][:groups] for r in (one, other))
-        width = min(a.shape[1], b.shape[1])
-        a, b = a[:, :width], b[:, :width]
-        wrong = np.argwhere((a >= 0) & (b >= 0) & (a != b))
-        if len(wrong):
-            group, index = wrong[0].tolist()
-            family, split = divmod(group, len(SPLITS))
+    seeds = dict(zip(b.episodes, b.seed.tolist(), strict=True))
+    for episode, seed in zip(a.episodes, a.seed.tolist(), strict=True):
+        if seed >= 0 and seeds.get(episode, -1) not in (-1, seed):
             raise InvalidOptionError(
-                f"{FAMILIES[family]}/{SPLITS[split]}/{index} has the seed {a[group, index]} in one "
-                f"run and {b[group, index]} in the other",
+                f"{episode} has the seed {seed} in one run and {seeds[episode]} in the other",
                 "Different scenes cannot be paired: compare runs over the same episodes.",
             )
 
 
-@dataclass(frozen=True)
-class _Seeds:
-    """Numbers that stand for the model seeds of the two runs, by their codes."""
+def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
+    """Compare two sides under a condition, over all shared episodes or those of a family."""
+    shared = set(b.cube.episodes)
+    episodes = [e for e in a.cube.episodes if e in shared and family in ("", e.family)]
+    first, second = (side.status(condition, episodes) for side in (a, b))
+    values = np.stack([success(first), success(second)], axis=1)
+    values = values[~np.isnan(values).any(axis=1)]
+    (drawn,) = Resampler(values, a.cube.simulator).intervals([difference(0, 1)])
+    return pair(first, second, drawn, _matched(a.cube.model_seeds, b.cube.model_seeds))
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    shared: bool
 
-
-def _seeds(one: Rollouts, other: Rollouts) -> _Seeds:
+def _matched(a: Sequence[int], b: Sequence[int]) -> tuple[list[int], list[int]]:
     """Match the model seeds of two runs; if they share none, the lowest with the lowest."""
-    a, b = (np.array(r.model_seeds, np.int64) for r in (one, other))
-    if not np.isin(a, b).any():
-        return _Seeds(np.arange(len(a)), np.arange(len(b)), False)
-    known = np.union1d(a, b)
-    return _Seeds(np.searchsorted(known, a), np.searchsorted(known, b), True)
+    shared = [seed for seed in a if seed in b]
+    if shared:
+        return [a.index(seed) for seed in shared], [b.index(seed) for seed in shared]
+    places = list(range(min(len(a), len(b))))
+    return places, places
 
 
-class _Condition:
-    """One condition of a system in both runs, over the episodes that both have."""
-
-    def __init__(self, a: Outcomes, b: Outcomes, condition: str, seeds: _Seeds):
-        self.condition = condition
-        self._simulator = a.simulator
-        episodes = np.intersect1d(a.episodes, b.episodes, assume_unique=True)
-        columns = [one.column(condition, episodes) for one in (a, b)]
-        self._values = np.stack(columns, axis=1)
-        known = ~np.isnan(self._values).any(axis=1)
-        self._values, self._episodes = self._values[known], episodes[known]
-        self._once = a.once(condition, self._episodes) & b.once(condition, self._episodes)
-        self._pairs = pairs_of(Side(a, condition, seeds.first), Side(b, condition, seeds.second))
-
-    def tested(self, part: str = "") -> Tested:
-        """Return McNemar's exact test in all pairs, or in those of a family."""
-        return tested(self._pairs, _of(part, self._pairs.episodes))
-
-    def row(self, part: str) -> tuple[Any, ...]:
-        """Return the numbers of all episodes, or of a family; none if no episode counts."""
-        here = _of(part, self._episodes)
-        values = self._values[here]
-        if not len(values):
-            return ()
-        (drawn,) = Resampler(values, self._simulator).intervals([difference(0, 1)])
-        change, kind = interval_of(values, bool(self._once[here].all()), drawn)
-        test = self.tested(part)
-        return (
-            *(len(values), float(values[:, 0].mean()), float(values[:, 1].mean())),
-            *(change.value, change.low, change.high, kind),
-            *(test.pairs, test.gained, test.lost, test.flips, test.p),
-        )
-
-
-def _of(part: str, episodes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    if not part:
-        return np.ones(len(episodes), bool)
-    return families_of(episodes) == FAMILIES.index(part)
-
-
-def _same_histories(simulator: str, one: Rollouts, other: Rollouts) -> bool:
+def _same_histories(simulator: str, one: Rows, other: Rows) -> bool:
     """Whether the runs name one revision of a split, or neither names any."""
     return one.revisions.get(simulator) == other.revisions.get(simulator)
 
 
-def _differing(one: Rollouts, other: Rollouts) -> Iterator[str]:
-    for simulator in one.simulators:
-        if simulator not in other.simulators or _same_histories(simulator, one, other):
+def _differing(one: Rows, other: Rows) -> Iterator[str]:
+    for simulator in one.names("simulator"):
+        if simulator not in other.names("simulator") or _same_histories(simulator, one, other):
             continue
-        revisions = [r.revisions.get(simulator) for r in (one, other)]
+        revisions = [rows.revisions.get(simulator) for rows in (one, other)]
         if None in revisions:
             yield (
                 f"Only one of the runs names the revision of its split of {simulator}: the "
@@ -233,53 +193,47 @@ def _differing(one: Rollouts, other: Rollouts) -> Iterator[str]:
             )
 
 
-def _noise(
-    a: Outcomes, found: Sequence[_Condition], one: Rollouts, other: Rollouts
-) -> Iterator[str]:
+def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
     """Say how many episodes flip between two runs of the same system: the noise floor."""
     shares = []
-    for here in found:
-        test = here.tested()
-        if test.pairs:
-            low, high = wilson(test.gained + test.lost, test.pairs)
+    for condition, here in pairs.items():
+        if here.pairs:
+            low, high = wilson(here.gained + here.lost, here.pairs)
             shares.append(
-                f"{here.condition} {percent(test.flips)} of {test.pairs} "
+                f"{condition} {percent(here.flips)} of {here.pairs} "
                 f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
             )
     if shares:
-        same = set(one.model_seeds) & set(other.model_seeds)
+        same = not set(a.cube.model_seeds).isdisjoint(b.cube.model_seeds)
         seeds = "the same model seeds" if same else "other model seeds"
         yield (
-            f"{a.system} ran in both, with {seeds}, in {a.simulator}. If nothing else differs, "
-            f"this share of episodes flips by itself, which is the noise floor: "
+            f"{a.system} ran in both, with {seeds}, in {a.cube.simulator}. If nothing else "
+            "differs, this share of episodes flips by itself, which is the noise floor: "
             f"{', '.join(shares)}."
         )
 
 
-def _left_out(name: str, rollouts: Rollouts, met: Sequence[tuple[Outcomes, Outcomes]]) -> list[str]:
+def _left_out(name: str, rows: Rows, met: Sequence[tuple[_Side, _Side]]) -> list[str]:
     """Say what one run has and the comparison leaves out, nothing if that is nothing."""
     parts = []
-    compared = {(a.simulator, a.system) for a, _ in met}
-    alone = [o for o in outcomes_of(rollouts) if (o.simulator, o.system) not in compared]
-    if alone:
-        parts.append(_counted("system", [f"{o.system} in {o.simulator}" for o in alone]))
+    compared = {(a.cube.simulator, a.system) for a, _ in met}
+    sides = [(side.cube.simulator, side.system) for side in _sides(rows)]
+    if alone := [f"{system} in {sim}" for sim, system in sides if (sim, system) not in compared]:
+        parts.append(_counted("system", alone))
     for a, b in met:
         only = [c for c in a.conditions if c not in b.conditions]
         found = [_counted("condition", only)] if only else []
-        found += _episodes_of_one(a, b)
-        parts += [f"of {a.system} in {a.simulator} {' and '.join(found)}"] if found else []
-    return [f"Only in {name}, and left out: {'; '.join(parts)}."] if parts else []
-
-
-def _episodes_of_one(a: Outcomes, b: Outcomes) -> Iterator[str]:
-    """Count the episodes that count under a shared condition in the first run alone."""
-    under: dict[int, list[str]] = {}
-    for condition in (c for c in a.conditions if c in b.conditions):
-        here, there = (o.episodes[o.scored[o.conditions.index(condition)] > 0] for o in (a, b))
-        if lone := len(np.setdiff1d(here, there, assume_unique=True)):
+        under: dict[int, list[str]] = {}
+        for condition in (c for c in a.conditions if c in b.conditions):
+            lone = len(a.counted(condition) - b.counted(condition))
             under.setdefault(lone, []).append(condition)
-    for lone, conditions in under.items():
-        yield f"{lone:,} episode{'s' * (lone > 1)} under {', '.join(conditions)}"
+        found += [
+            f"{lone:,} episode{'s' * (lone > 1)} under {', '.join(conditions)}"
+            for lone, conditions in under.items()
+            if lone
+        ]
+        parts += [f"of {a.system} in {a.cube.simulator} {' and '.join(found)}"] if found else []
+    return [f"Only in {name}, and left out: {'; '.join(parts)}."] if parts else []
 
 
 def _counted(what: str, names: Sequence[str]) -> str:

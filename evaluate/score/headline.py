@@ -3,7 +3,8 @@
 import math
 from collections.abc import Sequence
 
-from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
+from robomme_interference_data.conditions import NO_HISTORY, parse_condition
+from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import START, Contrast, base_of
 from robomme_interference_data.evaluate.score.paper import published
@@ -28,7 +29,7 @@ def headline(score: Score, simulator: str) -> str:
     if complete:
         sentences = _leading(score, complete)
     else:
-        sentences = [_nothing_complete(cells, len(score.expected[simulator].episodes))]
+        sentences = [_nothing_complete(cells, int(score.cubes[simulator].expected.sum()))]
     if not all(cell.complete for cell in found):
         done = sum(cell.complete for cell in found)
         sentences.append(f"{done} of {len(found)} cells are complete.")
@@ -85,20 +86,20 @@ def _nothing_complete(cells: Sequence[Cell], expected: int) -> str:
 
 
 def _from_start(leader: Cell, contrast: Contrast) -> str:
-    k = condition_rank(contrast.condition)
+    k = parse_condition(contrast.condition).k
     sessions = "distractor session" + ("s" if k > 1 else "")
-    test, p = contrast.test, contrast.test.p
+    pairs, p = contrast.pairs, contrast.pairs.p
     tested = "" if math.isnan(p) else f", McNemar p = {_p(p)}"
-    change = contrast.change
+    change = pairs.change
     # Not every difference has an interval.
     bounds = "" if math.isnan(change.low) else f"{points(change.low)} to {points(change.high)}; "
-    over = "" if contrast.complete else f", not complete, over the {contrast.n} episodes it has"
+    over = "" if contrast.complete else f", not complete, over the {pairs.n} episodes it has"
     return (
         f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} episodes "
         f"when the history holds the lesson alone ({START}, 95% interval {_interval(leader)}), and "
-        f"in {percent(contrast.rate)} with {k} {sessions} behind it ({contrast.condition}{over}): "
-        f"{points(change.value)} points ({bounds}{test.gained} episodes gained, "
-        f"{test.lost} lost{tested})."
+        f"in {percent(pairs.second)} with {k} {sessions} behind it ({contrast.condition}{over}): "
+        f"{points(change.value)} points ({bounds}{pairs.gained} episodes gained, "
+        f"{pairs.lost} lost{tested})."
     )
 
 
@@ -108,7 +109,7 @@ def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     known = {(o.simulator, o.system, o.condition): o for o in published()}
     end = known.get((contrast.simulator, base or "", contrast.condition))
     start = known.get((contrast.simulator, base or "", START))
-    if not score.against_paper or start is None or end is None:
+    if score.settings.against is not Against.PAPER or start is None or end is None:
         return []
     return [
         f"Without retrieval, {display_name(end.system)} falls from {percent(start.rate)} to "
@@ -123,9 +124,9 @@ def _last_contrast(score: Score, leader: Cell) -> Contrast | None:
         for contrast in effects.contrasts
         if (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
         and contrast.against == (leader.system, START)
-        and contrast.n
+        and contrast.pairs.n
     ]
-    return max(found, key=lambda contrast: condition_rank(contrast.condition), default=None)
+    return max(found, key=lambda contrast: parse_condition(contrast.condition).k, default=None)
 
 
 def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:

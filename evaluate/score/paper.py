@@ -8,10 +8,10 @@ from importlib import resources
 
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.intervals import newcombe, wilson
+from robomme_interference_data.stats import newcombe, wilson
 from robomme_interference_data.tables import Column, Table
 
-__all__ = ["SOURCE", "Published", "comparable", "paper_table", "published"]
+__all__ = ["SOURCE", "Published", "comparable", "not_compared", "paper_table", "published"]
 
 SOURCE = (
     "RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August 2026), "
@@ -112,14 +112,23 @@ def paper_table(cells: Sequence[Cell]) -> Table:
                 *(cell.rate - paper.rate, *bounds, cell.complete),
             )
         )
-    others = sorted({cell.simulator for cell in cells} - {one.simulator for one in published()})
-    left = (
-        f" Rows of {', '.join(others)} are not set against the paper's RoboMME." if others else ""
-    )
     note = (
         f"Published: {SOURCE}. complete: over the benchmark's 450 episodes, as the published rates "
-        "are. 95% intervals: Wilson for rates; Newcombe's hybrid score for "
-        "differences, which takes both sides as independent samples: the paper's rows are not at "
-        f"hand to be paired.{left}"
+        "are. 95% intervals: Wilson for rates; Newcombe's hybrid score for differences, which "
+        "takes both sides as independent samples: the paper's rows are not at hand to be paired."
     )
+    note = " ".join([note, *not_compared(cells)])
     return Table("paper", "Beside the published rates", columns, tuple(rows), note)
+
+
+def not_compared(cells: Sequence[Cell]) -> list[str]:
+    """Return in sentences what cannot be set against the published rates, if there is any."""
+    simulators = {one.simulator for one in published()}
+    found = []
+    if others := sorted({cell.simulator for cell in cells} - simulators):
+        found.append(f"Rows of {', '.join(others)} are not set against the paper's RoboMME.")
+    here = [cell for cell in cells if cell.simulator in simulators]
+    compared = {cell.system for cell, _ in comparable(here)}
+    if alone := list(dict.fromkeys(c.system for c in here if c.system not in compared)):
+        found.append(f"Not in the paper under these conditions: {', '.join(alone)}.")
+    return found

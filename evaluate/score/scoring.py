@@ -1,36 +1,41 @@
-"""A scoring from rows to tables; everything but pictures and pages."""
+"""A scoring, from rows to tables and to the folder that they are written to."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.evaluate.score import Against, Grid, Settings
 from robomme_interference_data.evaluate.score.cells import (
     Cell,
-    cells_by,
+    cells_of,
     coverage_table,
+    main_grids,
     rate_table,
 )
-from robomme_interference_data.evaluate.score.effect_tables import (
+from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
+from robomme_interference_data.evaluate.score.effects import (
+    Effects,
+    base_of,
     contrast_table,
     decay_table,
+    effects_of,
     lift_table,
     noise_table,
 )
-from robomme_interference_data.evaluate.score.effects import Effects, base_of, effects_of
-from robomme_interference_data.evaluate.score.grid import Grid
-from robomme_interference_data.evaluate.score.outcomes import (
-    Expected,
-    Outcomes,
-    expected_episodes,
-    outcomes_of,
-)
-from robomme_interference_data.evaluate.score.paper import paper_table
-from robomme_interference_data.evaluate.score.rollouts import Rollouts, read_rollouts
+from robomme_interference_data.evaluate.score.paper import not_compared, paper_table
+from robomme_interference_data.evaluate.score.rows import Rows, read_rows
+from robomme_interference_data.files import write_text
+from robomme_interference_data.stats import DRAWS
 from robomme_interference_data.tables import Table
 
-__all__ = ["Score", "score"]
+__all__ = ["TABLES", "Score", "score", "write_score"]
+
+TABLES = (
+    *("main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage"),
+    "paper",
+)
+"""Every table that a score may have."""
 
 
 @dataclass(frozen=True)
@@ -38,129 +43,155 @@ class Score:
     """Everything that is computed from rows.
 
     Attributes:
-        rollouts: The rows.
-        grid: Which episodes a complete cell has.
-        against_paper: Whether published rates stand beside ours.
+        settings: What was asked for.
         draws: Bootstrap samples.
-        call: The call of `score` that made it, as Python has it.
+        rows: The rows.
         notes: What a reader must know, such as that two systems are not paired.
-        expected: The episodes of a complete cell, by simulator.
-        outcomes: By system and simulator, in the order of tables.
-        effects: Of each of `outcomes`.
+        cubes: What came of the rollouts, by simulator.
+        effects: Of each system in each simulator, in the order of tables.
         cells: System × condition.
         family_cells: The same by family.
         difficulty_cells: The same by difficulty.
-        tables: All tables by name.
+        tables: All tables by name, the paper's main table aside.
+        grids: The paper's main table of each simulator.
     """
 
-    rollouts: Rollouts
-    grid: Grid
-    against_paper: bool
+    settings: Settings
     draws: int
-    call: str
+    rows: Rows
     notes: tuple[str, ...]
-    expected: dict[str, Expected]
-    outcomes: tuple[Outcomes, ...]
+    cubes: Mapping[str, Cube]
     effects: tuple[Effects, ...]
-    cells: list[Cell]
-    family_cells: list[Cell]
-    difficulty_cells: list[Cell]
-    tables: dict[str, Table]
+    cells: Sequence[Cell]
+    family_cells: Sequence[Cell]
+    difficulty_cells: Sequence[Cell]
+    tables: Mapping[str, Table]
+    grids: Sequence[Table]
 
 
-def score(
-    paths: Sequence[Path],
-    system: str | None = None,
-    lenient: bool = False,
-    grid: Grid = Grid.BENCHMARK,
-    against_paper: bool = False,
-    draws: int = DRAWS,
-) -> Score:
+def score(settings: Settings, draws: int = DRAWS) -> Score:
     """Score rows.
 
     Args:
-        paths: Folders of runs, CSVs and parquet files.
-        system: Name of the system of rows that name none.
-        lenient: Skip and count bad rows.
-        grid: Which episodes a complete cell has.
-        against_paper: Put the published rates beside ours.
+        settings: What is scored, and how.
         draws: Bootstrap samples.
 
     Raises:
-        BadRowsError: Rows are bad (see `read_rollouts`), or there are none.
+        BadRowsError: Rows are bad, or there are none; and more, see `rows.read_rows`.
     """
-    rollouts = read_rollouts(paths, system, lenient)
-    if not len(rollouts.packed) and rollouts.refused:
+    rows = read_rows(settings.rows, settings.system, settings.lenient)
+    if not len(rows):
+        where = f"in {', '.join(map(str, settings.rows))}"
         raise BadRowsError(
-            f"all {rollouts.refused:,} rows are bad; the first is {rollouts.refusals[0]}",
-            "Mend them: without any row there is nothing to score.",
+            f"all {rows.refused:,} rows {where} are bad; the first is {rows.refusals[0]}"
+            if rows.refused
+            else f"there are no rows {where}",
+            "Without any sound row there is nothing to score.",
         )
-    if not len(rollouts.packed):
-        raise BadRowsError(
-            f"no rows to score in {', '.join(map(str, paths))}",
-            "Give the folder of a run that has begun, or a file with rows.",
-        )
-    outcomes = tuple(outcomes_of(rollouts))
-    expected = expected_episodes(rollouts, outcomes, grid)
-    bases, notes = _bases(rollouts, outcomes)
-    effects = tuple(
-        effects_of(one, base, expected[one.simulator], draws)
-        for one, base in zip(outcomes, bases, strict=True)
+    cubes = cubes_of(rows, settings.grid)
+    effects, notes = [], []
+    for cube in cubes.values():
+        for system in cube.systems:
+            base = base_of(system)
+            if base not in cube.systems:
+                base = None
+            elif reason := _apart(rows, cube.simulator, system, base or ""):
+                base, notes = None, [*notes, reason]
+            effects.append(effects_of(cube, system, base, draws))
+    cells, family_cells, difficulty_cells = (
+        cells_of(cubes.values(), part) for part in ("", "family", "difficulty")
     )
-    cells = cells_by(outcomes, expected)
-    family_cells = cells_by(outcomes, expected, "family")
-    difficulty_cells = cells_by(outcomes, expected, "difficulty")
     tables = [
         rate_table(cells, "main", "Success by system and condition"),
         rate_table(family_cells, "family", "Success by family", "family"),
         rate_table(difficulty_cells, "difficulty", "Success by difficulty", "difficulty"),
         lift_table(effects),
         contrast_table(effects),
-        decay_table(outcomes, effects),
-        noise_table(outcomes),
-        coverage_table(outcomes, expected),
+        decay_table(effects),
+        noise_table(cubes.values()),
+        coverage_table(cubes.values()),
     ]
-    if against_paper:
+    if settings.against is Against.PAPER:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
-        whole = expected_episodes(rollouts, outcomes, Grid.BENCHMARK)
-        tables.append(paper_table(cells_by(outcomes, whole)))
+        whole = cells_of(cubes_of(rows, Grid.BENCHMARK).values())
+        tables.append(paper_table(whole))
+        notes += not_compared(whole)
     return Score(
-        rollouts,
-        grid,
-        against_paper,
+        settings,
         draws,
-        f"score({[str(path) for path in paths]}, system={system!r}, lenient={lenient}, "
-        f"grid={str(grid)!r}, against_paper={against_paper}, draws={draws})",
-        notes,
-        expected,
-        outcomes,
-        effects,
+        rows,
+        tuple(notes),
+        cubes,
+        tuple(effects),
         cells,
         family_cells,
         difficulty_cells,
         {table.name: table for table in tables},
+        main_grids(cells),
     )
 
 
-def _bases(
-    rollouts: Rollouts, outcomes: Sequence[Outcomes]
-) -> tuple[list[Outcomes | None], tuple[str, ...]]:
-    """Return the system without retrieval that each is paired with, and which are not paired.
+def _apart(rows: Rows, simulator: str, system: str, base: str) -> str | None:
+    """Say why a system is not paired with the one without retrieval; None if it is.
 
     Of a split that one names and the other does not, nobody knows that it is the same: released
     rows stand beside one's own, and are not paired with them.
     """
-    named = {(one.simulator, one.system): one for one in outcomes}
-    bases, notes = [], []
-    for one in outcomes:
-        base = named.get((one.simulator, base_of(one.system) or ""))
-        both = [one] if base is None else [one, base]
-        unpinned = [o.system for o in both if (o.simulator, o.system) in rollouts.unpinned]
-        if base is not None and len(unpinned) == 1:
-            notes.append(
-                f"{one.system} and {base.system} in {one.simulator} are not paired: the rows of "
-                f"{unpinned[0]} name no revision of a split, so their histories may differ"
-            )
-            base = None
-        bases.append(base)
-    return bases, tuple(notes)
+    unpinned = [one for one in (system, base) if (simulator, one) in rows.unpinned]
+    if len(unpinned) != 1:
+        return None
+    return (
+        f"{system} and {base} in {simulator} are not paired: the rows of {unpinned[0]} name no "
+        "revision of a split, so their histories may differ."
+    )
+
+
+def write_score(
+    score: Score, out: Path, export_to: Path | None = None, command: str | None = None
+) -> list[Path]:
+    """Write tables, figures and the report, each atomically and the report last.
+
+    What can be refused is refused before anything is written. Tables and figures of an earlier
+    score that this one does not have are removed; files of other names stay.
+
+    Args:
+        score: What is written.
+        out: Folder for `tables/`, `figures/` and `report.html`.
+        export_to: Folder for the rows in the released layout (see `export`); None writes none.
+        command: The command line that made the score, for the report.
+
+    Returns:
+        The exported files.
+
+    Raises:
+        MissingExtraError: matplotlib or jinja2 is not installed.
+        InvalidOptionError: The released layout cannot hold the rows (see `export`).
+    """
+    from robomme_interference_data.drawing import open_figure
+    from robomme_interference_data.evaluate.score.export import export
+    from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figures
+    from robomme_interference_data.evaluate.score.report import load_jinja2, write_report
+
+    with open_figure():
+        load_jinja2()
+    exported = [] if export_to is None else export(score.rows, export_to)
+    for name in TABLES:
+        for suffix in (".csv", ".md"):
+            path = out / "tables" / (name + suffix)
+            if name not in score.tables:
+                path.unlink(missing_ok=True)
+            elif suffix == ".csv":
+                write_text(path, score.tables[name].csv())
+            else:
+                shown = score.grids if name == "main" else [score.tables[name]]
+                write_text(path, "\n".join(table.markdown() for table in shown))
+    figures = draw_figures(score, out / "figures")
+    for kind in FIGURES:
+        for drawing in (out / "figures").glob(f"{kind}-*.svg"):
+            # A score draws both: a lone file of such a name is somebody else's.
+            picture = drawing.with_suffix(".png")
+            if drawing.stem not in figures and picture.exists():
+                picture.unlink()
+                drawing.unlink()
+    write_report(score, figures, out / "report.html", command)
+    return exported

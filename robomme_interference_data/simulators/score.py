@@ -12,7 +12,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.intervals import wilson
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.simulators.base import Simulator, Status
 from robomme_interference_data.simulators.registry import own_simulator
 from robomme_interference_data.workers import run_tasks

@@ -72,10 +72,7 @@ def open_figure() -> Iterator[Any]:
         import matplotlib.style
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtraError(
-            "drawing needs matplotlib",
-            'Install it: pip install "robomme-interference-data[score]"',
-        ) from error
+        raise MissingExtraError.needs("drawing", "matplotlib", "score") from error
     settings = {"svg.hashsalt": "robomme-interference", "image.composite_image": False}
     with (
         matplotlib.style.context("default"),
@@ -106,9 +103,10 @@ def save_figure(figure: Any, out: Path) -> None:
 
 def _check(out: Path) -> None:
     if out.suffix.lower() not in _METADATA:
-        raise InvalidOptionError(
-            f"a picture cannot be written to {str(out)!r}; expected a name that ends in "
-            f"{' or '.join(_METADATA)}",
+        raise InvalidOptionError.expected(
+            "picture",
+            str(out),
+            f"a name that ends in {' or '.join(_METADATA)}",
             f"For example: {out.with_suffix('.png') if out.name else out / 'strip.png'}",
         )
     if out.is_dir():
