@@ -118,7 +118,7 @@ class Dataset:
         """Yield the records of all episodes, by episode index."""
         if len(self._records) < len(self):
             where = self.files.describe()
-            for index, row in enumerate(self.lerobot.table.to_pylist()):
+            for index, row in enumerate(self.lerobot.all_rows()):
                 self._records[index] = from_dict(EpisodeRecord, row, where)
         return (self._records[index] for index in range(len(self)))
 

@@ -152,13 +152,14 @@ class Serial:
         worker = Worker(0)
         try:
             for task in tasks:
-                for attempt in range(1, attempts + 1):
-                    value, error, trace = _attempt(function, task, worker)
-                    if isinstance(error, WorkerRetiredError):
-                        raise error
-                    if not isinstance(error, again):
-                        break
-                yield Outcome(task, value, error, trace, attempt)
+                attempt = 1
+                result = _attempt(function, task, worker)
+                while isinstance(result[1], again) and attempt < attempts:
+                    attempt += 1
+                    result = _attempt(function, task, worker)
+                if isinstance(result[1], WorkerRetiredError):
+                    raise result[1]
+                yield Outcome(task, *result, attempt)
         finally:
             _close(function)
 

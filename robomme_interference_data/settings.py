@@ -30,7 +30,7 @@ _SETTING = "setting"
 def setting(
     default: Any = dataclasses.MISSING,
     *,
-    help: str,  # noqa: A002 - as typer has it
+    help: str,
     name: str | None = None,
     metavar: str | None = None,
     env: str | None = None,

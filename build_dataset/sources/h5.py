@@ -7,20 +7,26 @@ after action t.
 """
 
 import re
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robomme_interference_data.build_dataset.sources.base import Frame, SourceEpisode
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    SourceEpisode,
+    choose_cameras,
+)
 from robomme_interference_data.errors import MissingExtraError, SourceError
 from robomme_interference_data.ids import EpisodeId
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["RoboMMEH5Source", "identify"]
+__all__ = ["H5Source", "identify"]
 
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
@@ -82,7 +88,7 @@ def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
     return {number: EpisodeId(family, splits[number], number - first) for number in seeds}
 
 
-class RoboMMEH5Source:
+class H5Source:
     """A folder of `record_dataset_<Family>.h5` files.
 
     Args:
@@ -93,17 +99,15 @@ class RoboMMEH5Source:
         MissingExtraError: h5py is not installed.
     """
 
-    kind = "robomme-h5"
+    time_limit = 1800.0
+    whole = True
 
     def __init__(self, folder: Path):
         try:
             import h5py  # noqa: F401
         except ImportError:
-            raise MissingExtraError(
-                "reading RoboMME recordings needs h5py",
-                'Install it: pip install "robomme-interference-data[build]"',
-            ) from None
-        self.provenance: dict[str, Any] = {"kind": self.kind}
+            raise MissingExtraError.needs("reading RoboMME recordings", "h5py", "build") from None
+        self.provenance: dict[str, Any] = {"kind": "robomme-h5"}
         candidates = [folder] if folder.is_file() else sorted(folder.glob("*.h5"))
         self._files = {
             match["family"]: path for path in candidates if (match := _FILE.fullmatch(path.name))
@@ -116,93 +120,81 @@ class RoboMMEH5Source:
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes; see `Source.episodes`."""
-        import h5py
-
         found = []
         for family, path in self._files.items():
-            place = str(path)
-            try:
-                with h5py.File(path, "r") as file:
-                    numbers = _numbers(file, "episode_")
-                    if not numbers:
-                        raise SourceError(f"{path} holds no episode_<N> group")
-                    ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
-                    for number in numbers:
-                        place = f"{path}: episode_{number}"
-                        found.append(self._describe(ids[number], path, file, number))
-            except (OSError, KeyError, UnicodeDecodeError) as error:
-                raise SourceError(
-                    f"{place} is not a complete RoboMME recording: {error}", _AGAIN
-                ) from None
+            with _reading(path) as file:
+                numbers = _numbers(file, "episode_")
+                if not numbers:
+                    raise SourceError(f"{path} holds no episode_<N> group", _AGAIN)
+                ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
+            stat = path.stat()
+            state = (stat.st_size, stat.st_mtime_ns)
+            found += [SourceEpisode(ids[n], (str(path.resolve()), n, state)) for n in numbers]
         return sorted(found, key=lambda episode: episode.id)
 
-    def read(self, episode: SourceEpisode) -> Generator[Frame]:
-        """Stream an episode's frames; see `Source.read`."""
-        import h5py
-
-        path, number, first_step, *_ = episode.key
-        place = f"episode_{number}"
-        try:
-            with h5py.File(path, "r") as file:
-                for step in range(first_step, first_step + episode.raw_length):
-                    place = f"episode_{number}/timestep_{step}"
-                    yield _frame(file[place], episode)
-        except (OSError, KeyError, ValueError) as error:
-            raise SourceError(
-                f"{path}: {place} cannot be read: {error}",
-                "Record or download the file again, or leave the episode out: --episodes",
-            ) from None
-
-    def _describe(
-        self, identity: EpisodeId, path: Path, file: "h5py.File", number: int
-    ) -> SourceEpisode:
-        group = file[f"episode_{number}"]
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Open an episode; see `Source.read`."""
+        path, number, _ = episode.key
         where = f"{path}: episode_{number}"
-        steps = _numbers(group, "timestep_")
-        if not steps or steps != list(range(steps[0], steps[0] + len(steps))):
-            raise SourceError(f"{where} does not hold consecutive timestep_<T> groups", _AGAIN)
-        flags = [bool(group[f"timestep_{step}/info/is_video_demo"][()]) for step in steps]
-        length = flags.index(False) if False in flags else len(flags)
-        if any(flags[length:]):
-            raise SourceError(
-                f"{where}: demonstration frames come after live ones (is_video_demo is set again "
-                f"at timestep_{steps[0] + length + flags[length:].index(True)})",
-                "Only recordings that begin with their demonstration can be used.",
-            )
-        setup = group["setup"]
-        goals = tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()]))
-        observation = group[f"timestep_{steps[0]}/obs"]
-        cameras = {
-            camera: (observation[name].shape[0], observation[name].shape[1])
-            for camera, name in _CAMERAS.items()
-            if name in observation
-        }
-        if not goals or not cameras:
-            missing = " or ".join(_CAMERAS.values()) if goals else "task_goal"
-            raise SourceError(f"{where} has no {missing}", _AGAIN)
-        stat = path.stat()
-        return SourceEpisode(
-            id=identity,
-            goals=goals,
-            raw_length=len(steps),
-            demonstration_length=length,
-            seed=_seed(group),
-            difficulty=_text(setup["difficulty"][()]) if "difficulty" in setup else None,
-            simulator="robomme",
-            exact=True,
-            cameras=cameras,
-            key=(str(path.resolve()), number, steps[0], stat.st_size, stat.st_mtime_ns),
-        )
+        with _reading(path) as file:
+            group = file[f"episode_{number}"]
+            steps = _numbers(group, "timestep_")
+            if not steps or steps != list(range(steps[0], steps[0] + len(steps))):
+                raise SourceError(f"{where} does not hold consecutive timestep_<T> groups", _AGAIN)
+            setup, first = group["setup"], group[f"timestep_{steps[0]}/obs"]
+            goals = tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()]))
+            there = tuple(camera for camera, name in _CAMERAS.items() if name in first)
+            if not goals or not there:
+                missing = " or ".join(_CAMERAS.values()) if goals else "task_goal"
+                raise SourceError(f"{where} has no {missing}", _AGAIN)
+            chosen = choose_cameras(cameras, there, episode.id)
+            difficulty = _text(setup["difficulty"][()]) if "difficulty" in setup else None
+            seed = _seed(group)
+        frames = _frames(path, number, steps, chosen)
+        return Recording(goals, seed, difficulty, "robomme", True, frames)
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
-def _frame(step: "h5py.Group", episode: SourceEpisode) -> Frame:
+@contextmanager
+def _reading(path: str | Path) -> Iterator["h5py.File"]:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError, ValueError, UnicodeDecodeError) as error:
+        if isinstance(error, SourceError):
+            raise
+        raise SourceError(f"{path} is not a complete RoboMME recording: {error}", _AGAIN) from None
+
+
+def _frames(path: str, number: int, steps: list[int], cameras: tuple[str, ...]) -> Generator[Frame]:
+    live = False
+    with _reading(path) as file:
+        for step in steps:
+            place = f"episode_{number}/timestep_{step}"
+            if place not in file:
+                raise SourceError(f"{path} has no {place}", _AGAIN)
+            frame = _frame(file[place], cameras)
+            if live and frame.is_demonstration:
+                raise SourceError(
+                    f"{path}: {place} is a demonstration frame after live ones",
+                    "Only recordings that begin with their demonstration can be used.",
+                )
+            live = not frame.is_demonstration
+            yield frame
+
+
+def _frame(step: "h5py.Group", cameras: tuple[str, ...]) -> Frame:
     observation = step["obs"]
     # The gripper has two fingers that move alike; RoboMME's own loaders keep the first.
     # `gripper_state` is float64 for some families, `joint_action` for all.
     gripper = np.atleast_1d(observation["gripper_state"][()])[:1]
     state = np.concatenate([observation["joint_state"][()][:7], gripper])
     return Frame(
-        images={camera: observation[_CAMERAS[camera]][()] for camera in episode.cameras},
+        images={camera: observation[_CAMERAS[camera]][()] for camera in cameras},
         state=state.astype(np.float32),
         action=step["action/joint_action"][()].astype(np.float32),
         is_demonstration=bool(step["info/is_video_demo"][()]),

@@ -1,4 +1,4 @@
-"""Record a small made-up sample in the `frames` layout, to try everything without RoboMME's data.
+"""Source `sample`: made-up episodes, to try everything without recordings or a simulator.
 
 A gripper moves over a table with cubes; every family has its own table colour and path.
 The sample says nothing about any benchmark. Only integers and exact fractions are used, so that
@@ -6,89 +6,70 @@ every machine makes the same pixels.
 """
 
 import hashlib
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Generator
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.encode import RECORDING, VideoEncoder
-from robomme_interference_data.build_dataset.record import SCHEMA
-from robomme_interference_data.constants import FAMILIES, FPS
-from robomme_interference_data.errors import BuildError
-from robomme_interference_data.files import atomic_path
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    SourceEpisode,
+    choose_cameras,
+)
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["write_sample"]
+__all__ = ["SampleSource"]
 
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
-_DIFFICULTIES = ("easy", "medium", "hard")
+_EPISODES = {"train": 3, "test": 1}
+_FRAMES = 260
+_SHORT = 200
+"""Frames of the first family's train episode 1: too few for a unit, as some real ones have."""
 
 
-def write_sample(
-    folder: Path,
-    *,
-    families: tuple[str, ...] = FAMILIES,
-    train: int = 2,
-    test: int = 1,
-    size: int = 256,
-    frames: int = 260,
-    demonstration: int = 48,
-) -> Iterator[int]:
-    """Write a sample; yields the number of frames after each episode.
+class SampleSource:
+    """Three train episodes and a test episode of each family.
 
     Args:
-        folder: Where to write; must not exist or be empty.
-        families: Families to record.
-        train: Train episodes of each family.
-        test: Test episodes of each family.
+        families: Names of the families, which need not be the benchmark's.
         size: Height and width of the images in pixels, a multiple of 16.
-        frames: Frames of an episode. The first family's train episode 1 gets 200, too few for a
-            distractor unit, as some real episodes have.
-        demonstration: Frames of the demonstration; odd episodes have 16 more.
-
-    Raises:
-        BuildError: The folder holds something.
     """
-    if folder.exists() and any(folder.iterdir()):
-        raise BuildError(f"{folder} is not empty", "Choose another --out, or remove it first.")
-    columns: dict[str, list[object]] = {name: [] for name in SCHEMA.names}
-    ids = [
-        EpisodeId(family, split, index)
-        for family in families
-        for split, count in (("train", train), ("test", test))
-        for index in range(count)
-    ]
-    for episode in ids:
-        length = 200 if (episode.family, str(episode)[-7:]) == (families[0], "train/1") else frames
-        lesson = demonstration + 16 * (episode.index % 2)
-        scene = _Scene(episode, families.index(episode.family), size)
-        for camera, draw in (("front", scene.front), ("wrist", scene.wrist)):
-            path = folder / "videos" / camera / f"{episode}.mkv"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            encoder = VideoEncoder(path, RECORDING, FPS, size, size)
-            for step in range(length):
-                encoder.add(draw(step))
-            encoder.close()
-        for step in range(length):
-            row = {
-                "episode_id": str(episode),
-                "frame_index": step,
-                "state": scene.state(step),
-                "action": scene.state(step + 1),
-                "is_demo": step < lesson,
-                "goal": f"watch the video carefully, then do the {episode.family} task again",
-                "seed": scene.seed,
-                "difficulty": _DIFFICULTIES[episode.index % 3],
-                "simulator": "sample",
-            }
-            for name, value in row.items():
-                columns[name].append(value)
-        yield length
-    with atomic_path(folder / "frames.parquet") as partial:
-        pq.write_table(pa.table(columns, schema=SCHEMA), partial)
+
+    time_limit = 300.0
+    whole = True
+
+    def __init__(self, families: tuple[str, ...] = FAMILIES, size: int = 256):
+        self._families = families
+        self._size = size
+        self.provenance: dict[str, Any] = {"kind": "sample", "size": size}
+
+    def episodes(self) -> list[SourceEpisode]:
+        """List all episodes; see `Source.episodes`."""
+        ids = [
+            EpisodeId(family, split, index)
+            for family in self._families
+            for split, count in _EPISODES.items()
+            for index in range(count)
+        ]
+        return [SourceEpisode(one) for one in sorted(ids)]
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Make an episode up; see `Source.read`."""
+        name = episode.id
+        number = self._families.index(name.family)
+        scene = _Scene(name, number, self._size)
+        short = (number, name.split, name.index) == (0, "train", 1)
+        chosen = choose_cameras(cameras, ("front", "wrist"), name)
+        frames = scene.frames(_SHORT if short else _FRAMES, 48 + 16 * (name.index % 2), chosen)
+        goal = f"watch the video carefully, then do the {name.family} task again"
+        difficulty = DIFFICULTIES[name.index % 3]
+        return Recording((goal,), scene.seed, difficulty, "sample", True, frames)
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
 class _Scene:
@@ -105,6 +86,12 @@ class _Scene:
         shade = np.broadcast_to(rows // 4, (size, size))
         table = np.stack([90 + hue + shade // 2, 200 - hue + shade // 8, 150 + shade], axis=2)
         self._table = table.clip(0, 255)
+
+    def frames(self, length: int, lesson: int, cameras: tuple[str, ...]) -> Generator[Frame]:
+        """Yield the frames of an episode, `lesson` of them the demonstration."""
+        for step in range(length):
+            images = {camera: getattr(self, camera)(step) for camera in cameras}
+            yield Frame(images, self.state(step), self.state(step + 1), step < lesson)
 
     def _gripper(self, step: int) -> tuple[int, int]:
         """Column and row of the gripper at a step."""
@@ -128,11 +115,12 @@ class _Scene:
         column, row = (value * self.size // 256 for value in self._gripper(step))
         return np.roll(self.front(step), (self.size // 2 - row, self.size // 2 - column), (0, 1))
 
-    def state(self, step: int) -> list[float]:
+    def state(self, step: int) -> NDArray[np.float32]:
         """Return 7 joint positions and the gripper opening: exact multiples of 1/1024."""
         column, row = self._gripper(step)
         joints = [(column * (i + 1) - row * (7 - i)) / 1024 for i in range(7)]
-        return [*joints, 40 / 1024 if step % self._periods[0] < self._periods[0] // 2 else 0.0]
+        opening = 40 / 1024 if step % self._periods[0] < self._periods[0] // 2 else 0.0
+        return np.array([*joints, opening], np.float32)
 
     def _box(
         self,
