@@ -9,15 +9,14 @@ import re
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 
+from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
 from robomme_interference_data.errors import (
     HistoryTooLongError,
     InvalidIdError,
     InvalidOptionError,
     UnknownNameError,
-    nearest,
 )
-from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
 
 __all__ = [
     "PAPER_SYSTEMS",
@@ -26,7 +25,6 @@ __all__ = [
     "check_condition",
     "check_history",
     "display_name",
-    "get_system",
     "is_bound",
     "name_system",
 ]
@@ -46,7 +44,7 @@ class System:
         integration: How the memory enters the policy: `modulator`, `context`, `expert`,
             `subgoals`, or None.
         no_history: Whether `no-history` applies.
-        with_history: Whether `k0`, `k1`, … apply.
+        with_history: Whether the other conditions apply.
         subgoals: What a vision-language model in front of the policy writes:
             `simple_subgoal`, `grounded_subgoal`, or None where there is none.
         retrieval: Whether a retrieval step chooses what the memory gets.
@@ -134,17 +132,6 @@ SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS,
 """Name to system: the paper's, then the built-in policies. The order is that of tables."""
 
 
-def get_system(name: str) -> System:
-    """Return a system of the table.
-
-    Raises:
-        UnknownNameError: The table does not hold it.
-    """
-    if name not in SYSTEMS:
-        raise UnknownNameError(f"there is no system {name!r}", nearest(name, SYSTEMS))
-    return SYSTEMS[name]
-
-
 def name_system(name: str) -> System:
     """Return a system of the table, or one with a name of your own.
 
@@ -195,13 +182,11 @@ def check_condition(system: System, condition: str) -> None:
 
     Args:
         system: The system.
-        condition: `no-history`, `k0`, `k1`, …
+        condition: Its name.
 
     Raises:
-        InvalidIdError: The text is no condition.
         InvalidOptionError: The condition does not apply.
     """
-    condition_rank(condition)
     if condition == NO_HISTORY and not system.no_history:
         plain = system.name.removeprefix("retrieval-")
         plain = plain if plain in SYSTEMS else f"perceptual-{plain}"

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.stats import Interval, Resampler, mean
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.stats import wilson
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
 from robomme_interference_data.retrieval.select import Rule, pick
 from robomme_interference_data.retrieval.selector import lot_of, true_lesson
 from robomme_interference_data.sessions import Session
+from robomme_interference_data.stats import Interval, Resampler, mean, wilson
 
 __all__ = [
     "ALL",

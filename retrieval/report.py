@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.stats import Interval
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell, Grade
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import Choice
+from robomme_interference_data.stats import Interval
 from robomme_interference_data.tables import Column, Table, percent
 
 __all__ = [

@@ -11,34 +11,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    # intervals of rates and differences
-    "Z95",
-    "newcombe",
-    "newcombe_paired",
-    "wilson",
-    # tests and effect sizes
-    "cohens_h",
-    "holm",
-    "mcnemar",
-    "slope_weights",
-    # bootstrap
-    "DRAWS",
-    "LEAST",
-    "Interval",
-    "Resampler",
-    "Statistic",
-    "difference",
-    "enough",
-    "mean",
-    "paired_interval",
-    "retention",
-    "slope",
-]
+__all__ = ["Z95", "newcombe", "newcombe_paired", "wilson"]  # intervals in closed form
+__all__ += ["cohens_h", "holm", "mcnemar", "slope_weights"]  # tests and effect sizes
+__all__ += ["DRAWS", "LEAST", "Interval", "Resampler", "Statistic", "enough", "paired_interval"]
+__all__ += ["difference", "mean", "retention", "slope"]  # statistics of a bootstrap
 
 Floats = NDArray[np.float64]
 
@@ -91,9 +72,10 @@ def newcombe(
     With rates p, q and their Wilson intervals (l, u), (l', u'):
     (p − q) − √((p − l)² + (u' − q)²) to (p − q) + √((u − p)² + (q − l')²).
 
+    Without trials on either side the interval is `(−1, 1)`.
+
     Source: Newcombe (1998), Interval estimation for the difference between independent
-    proportions, Statistics in Medicine 17, 873–890, method 10. Without trials on either side the
-    interval is `(−1, 1)`.
+    proportions, Statistics in Medicine 17, 873–890, method 10.
     """
     if trials == 0 or other_trials == 0:
         return -1.0, 1.0
@@ -220,8 +202,7 @@ def slope_weights(ks: Sequence[int]) -> Floats:
 # --- bootstrap ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """An estimate with its interval; bounds are NaN where they cannot be had."""
 
     value: float
@@ -235,15 +216,14 @@ class Statistic:
 
     Attributes:
         columns: Places of the columns.
-        combine: From sums of these columns and the number of episodes, `(D, M + 1) float64`, to
-            the statistic, `(D,) float64`.
+        combine: From their means, `(D, M) float64`, to the statistic, `(D,) float64`.
     """
 
     columns: tuple[int, ...]
     combine: Callable[[Floats], Floats]
 
     def features(self, values: Floats) -> Floats:
-        """Return what is summed over episodes, `(E, M + 1) float64`; zeros for one that lacks."""
+        """Return what is summed over episodes: the columns and a one, `(E, M + 1) float64`."""
         chosen = values[:, list(self.columns)]
         chosen = np.concatenate([chosen, np.ones((len(chosen), 1))], axis=1)
         chosen[np.isnan(chosen).any(axis=1)] = 0.0
@@ -252,41 +232,38 @@ class Statistic:
     def of(self, sums: Floats) -> Floats:
         """Return the statistic of sums, rounded: what is exactly equal is so on any machine."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self.combine(sums).round(12)
+            return self.combine(sums[:, :-1] / sums[:, -1:]).round(12)
 
 
 def mean(column: int) -> Statistic:
-    """Return the mean of a column, over the episodes that have it."""
-    return Statistic((column,), lambda s: s[:, 0] / s[:, 1])
+    """Return the mean of a column."""
+    return Statistic((column,), lambda m: m[:, 0])
 
 
 def difference(first: int, second: int) -> Statistic:
-    """Return mean of column `second` − mean of column `first`, over episodes that have both."""
-    return Statistic((first, second), lambda s: (s[:, 1] - s[:, 0]) / s[:, 2])
+    """Return mean of column `second` − mean of column `first`."""
+    return Statistic((first, second), lambda m: m[:, 1] - m[:, 0])
 
 
 def retention(none: int, start: int, end: int) -> Statistic:
     """Return (end − none) / (start − none): what is left of the lift at the start.
 
-    With columns for k7, `no-history` and k0 it is (k7 − no-history) / (k0 − no-history): 1 if
-    nothing is lost, 0 if k7 is back at the rate without history.
+    1 if nothing is lost, 0 if the end is back at the rate without history.
     """
-    return Statistic((none, start, end), lambda s: (s[:, 2] - s[:, 0]) / (s[:, 1] - s[:, 0]))
+    return Statistic((none, start, end), lambda m: (m[:, 2] - m[:, 0]) / (m[:, 1] - m[:, 0]))
 
 
 def slope(columns: Sequence[int], weights: Floats) -> Statistic:
     """Return the weighted sum of the columns' means (see `slope_weights`)."""
-    return Statistic(tuple(columns), lambda s: s[:, :-1] @ weights / s[:, -1])
+    return Statistic(tuple(columns), lambda m: m @ weights)
 
 
 def enough(values: Floats) -> bool:
     """Whether what each episode adds to a comparison varies enough for a bootstrap interval.
 
     At least `LEAST` episodes must have another value than the commonest one, which for a paired
-    difference is most often 0: as many must differ between the two sides. With fewer, the
-    resampled means fall on a coarse lattice, a share of draws that is not small holds none of the
-    few episodes that matter, and intervals cover less than they promise, down to width zero
-    where all episodes agree.
+    difference is most often 0. With fewer, the resampled means fall on a coarse lattice, and
+    intervals cover less than they promise, down to width zero where all episodes agree.
 
     Args:
         values: A number for each episode, `(E,) float64`.

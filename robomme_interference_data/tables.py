@@ -3,9 +3,9 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self, cast
 
 __all__ = ["Column", "Kind", "Table", "percent", "points"]
 
@@ -43,6 +43,15 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[tuple[Any, ...], ...]
     note: str = ""
+
+    @classmethod
+    def of(
+        cls, name: str, title: str, columns: str, rows: Iterable[tuple[Any, ...]], note: str = ""
+    ) -> Self:
+        """Return a table whose columns are given as text, such as `system n:count rate:rate`."""
+        named = (column.partition(":") for column in columns.split())
+        found = tuple(Column(name, cast(Kind, kind or "text")) for name, _, kind in named)
+        return cls(name, title, found, tuple(rows), note)
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows by column name, NaN as None, for JSON."""

@@ -1,14 +1,13 @@
 """Rates of cells: system × condition, and the same by family and by difficulty."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Literal
 
 import numpy as np
 
-from robomme_interference_data.conditions import parse_condition
+from robomme_interference_data.conditions import in_order
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.evaluate.score.cube import STATUSES, Cube, Flags, success
 from robomme_interference_data.evaluate.systems import display_name, is_bound
@@ -17,9 +16,7 @@ from robomme_interference_data.records import Status
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Column, Table, percent
 
-__all__ = ["Cell", "Part", "cells_of", "coverage_table", "main_grids", "rate_table"]
-
-Part = Literal["", "family", "difficulty"]
+__all__ = ["Cell", "cells_of", "coverage_table", "main_grids", "rate_table"]
 
 _ERROR = STATUSES.index(Status.ERROR)
 _NOTE = (
@@ -74,23 +71,24 @@ class Cell:
         return wilson(self.rate * self.n if self.n else 0, self.n)
 
 
-def cells_of(cubes: Iterable[Cube], part: Part = "") -> list[Cell]:
+def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
     """Return the cells of every system and condition, in the order of tables.
 
-    Args:
-        cubes: By simulator.
-        part: `family` or `difficulty` for a cell of each; empty for all episodes together, where
-            expected cells without any rollout come as well. An expected episode of unknown
-            difficulty is missing in all three.
+    Each comes over all episodes, then, if it has rows, by family and by difficulty. An expected
+    episode of unknown difficulty is missing in all three.
     """
     cells = []
     for cube in cubes:
-        rates, parts = success(cube.status), _parts(cube, part)
+        rates = success(cube.status)
+        every, unknown = np.ones(len(cube.episodes), bool), cube.difficulty < 0
+        parts = [("", every, every)]  # name, its episodes, and those that are expected in it
+        parts += [(name, here, here) for name in FAMILIES if (here := cube.of_family(name)).any()]
+        for place, name in enumerate(DIFFICULTIES):
+            here = cube.difficulty == place
+            parts.append((name, here, here | unknown))
         for s, c in np.argwhere(cube.due).tolist():
-            if part and not cube.has_rows[s, c]:
-                continue
-            for name, here, wanted in parts:
-                if not (here & cube.there[s]).any() and not (wanted & cube.expected).any():
+            for name, here, wanted in parts if cube.has_rows[s, c] else parts[:1]:
+                if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
                     continue
                 known = rates[s, c][here & cube.counted[s, c]]
                 cells.append(
@@ -109,51 +107,36 @@ def cells_of(cubes: Iterable[Cube], part: Part = "") -> list[Cell]:
     return _ranked(cells)
 
 
-def _parts(cube: Cube, part: Part) -> list[tuple[str, Flags, Flags]]:
-    """Return name, episodes, and episodes that are expected in each part."""
-    if part == "family":
-        return [(f, here, here) for f in FAMILIES if (here := cube.of_family(f)).any()]
-    if part == "difficulty":
-        unknown = cube.difficulty < 0
-        parts = [(name, cube.difficulty == place) for place, name in enumerate(DIFFICULTIES)]
-        return [(name, here, here | unknown) for name, here in parts]
-    every = np.ones(len(cube.episodes), bool)
-    return [("", every, every)]
-
-
 def _ranked(cells: Sequence[Cell]) -> list[Cell]:
     rates: dict[tuple[str, str, str], list[float]] = {}
-    ranked = [cell.complete and not is_bound(cell.system) for cell in cells]
-    for cell, takes_part in zip(cells, ranked, strict=True):
-        if takes_part:
-            rates.setdefault((cell.simulator, cell.condition, cell.part), []).append(cell.rate)
+    places = []
+    for cell in cells:
+        group = rates.setdefault((cell.simulator, cell.condition, cell.part), [])
+        places.append(group if cell.complete and not is_bound(cell.system) else None)
+        group += [cell.rate] if places[-1] is not None else []
     return [
-        replace(cell, rank=1 + sum(rate > cell.rate for rate in rates[_group(cell)]))
-        if takes_part
-        else cell
-        for cell, takes_part in zip(cells, ranked, strict=True)
+        cell if group is None else replace(cell, rank=1 + sum(rate > cell.rate for rate in group))
+        for cell, group in zip(cells, places, strict=True)
     ]
 
 
-def _group(cell: Cell) -> tuple[str, str, str]:
-    return cell.simulator, cell.condition, cell.part
-
-
-def rate_table(cells: Sequence[Cell], name: str, title: str, part: Part = "") -> Table:
-    """Return cells as a table, a row each."""
-    columns = [Column("simulator"), Column("system"), Column("condition")]
-    columns += [Column(part)] if part else []
-    columns += [Column("n", "count")]
-    columns += [Column(bound, "rate") for bound in ("rate", "low", "high")]
-    columns += [Column(name, "count") for name in ("successes", "fails", "timeouts", "errors")]
-    columns += [Column("complete", "flag"), Column("missing", "count"), Column("rank", "count")]
+def rate_table(cells: Iterable[Cell], name: str, title: str, parts: Sequence[str] = ()) -> Table:
+    """Return cells as a table, a row each: of all episodes, or by the parts that give its name."""
     rows = []
     for cell in cells:
-        own = [cell.simulator, cell.system, cell.condition] + ([cell.part] if part else [])
-        bounds = cell.interval if cell.n else (math.nan, math.nan)
-        rates = (cell.n, cell.rate, *bounds, *cell.counts)
-        rows.append((*own, *rates, cell.complete, cell.missing, cell.rank))
-    return Table(name, title, tuple(columns), tuple(rows), _NOTE)
+        if cell.part in (parts or ("",)):
+            own = (cell.simulator, cell.system, cell.condition, *([cell.part] if parts else []))
+            bounds = cell.interval if cell.n else (math.nan, math.nan)
+            more = (cell.complete, cell.missing, cell.rank)
+            rows.append((*own, cell.n, cell.rate, *bounds, *cell.counts, *more))
+    return Table.of(
+        name,
+        title,
+        f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
+        "successes:count fails:count timeouts:count errors:count complete:flag missing:count rank:count",
+        rows,
+        _NOTE,
+    )
 
 
 def main_grids(cells: Sequence[Cell]) -> list[Table]:
@@ -163,33 +146,28 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
     the paper.
     """
     grids = []
-    for simulator, group in groupby(cells, lambda cell: cell.simulator):
+    whole = [cell for cell in cells if not cell.part]
+    for simulator, group in groupby(whole, lambda cell: cell.simulator):
         found = list(group)
-        conditions = sorted({c.condition for c in found}, key=lambda c: parse_condition(c).sort_key)
+        conditions = [one.name for one in in_order({cell.condition for cell in found})]
         at = {(cell.system, cell.condition): cell for cell in found}
         several = {c: sum(a.condition == c and a.complete for a in found) > 1 for c in conditions}
-        rows = tuple(
-            (
-                display_name(system),
-                *(_shown(at.get((system, c)), bold=several[c]) for c in conditions),
-            )
+        rows = (
+            (display_name(system), *(_shown(at.get((system, c)), several[c]) for c in conditions))
             for system in dict.fromkeys(cell.system for cell in found)
         )
+        errors = sum(cell.errors for cell in found)
+        bounds = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
+        note = _NOTE
+        note += f" Not ranked either, as they use no memory: {', '.join(bounds)}." * bool(bounds)
+        note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
         columns = (Column("system"), *map(Column, conditions))
         title = f"Success by system and condition, {simulator}"
-        grids.append(Table(simulator, title, columns, rows, _grid_note(found)))
+        grids.append(Table(simulator, title, columns, tuple(rows), note))
     return grids
 
 
-def _grid_note(cells: Sequence[Cell]) -> str:
-    """Return how the main table is to be read, and how many rollouts broke."""
-    errors = sum(cell.errors for cell in cells)
-    names = dict.fromkeys(display_name(cell.system) for cell in cells if is_bound(cell.system))
-    bounds = f" Not ranked either, as they use no memory: {', '.join(names)}." if names else ""
-    return _NOTE + bounds + (f" Rollouts that broke: {errors}." if errors else " No rollout broke.")
-
-
-def _shown(cell: Cell | None, *, bold: bool) -> str:
+def _shown(cell: Cell | None, bold: bool) -> str:
     if cell is None:
         return "–"
     errors = f", errors: {cell.errors}" if cell.errors else ""
@@ -206,15 +184,11 @@ def coverage_table(cubes: Iterable[Cube]) -> Table:
 
     Expected cells without any rollout are listed as well: they lack all episodes.
     """
-    columns = [Column(name) for name in ("simulator", "system", "condition", "family")]
-    columns += [Column(name, "count") for name in ("expected", "n", "errors")]
-    columns += [Column("complete", "flag"), Column("missing_episodes"), Column("error_episodes")]
-    columns += [Column("other_episodes")]
     rows = []
     for cube in cubes:
-        families = _parts(cube, "family")
+        families = [(name, here) for name in FAMILIES if (here := cube.of_family(name)).any()]
         for s, c in np.argwhere(cube.due).tolist():
-            for family, here, _ in families:
+            for family, here in families:
                 if not (here & (cube.expected | cube.there[s])).any():
                     continue
                 n, due = int((here & cube.counted[s, c]).sum()), int((here & cube.expected).sum())
@@ -224,11 +198,15 @@ def coverage_table(cubes: Iterable[Cube]) -> Table:
                 lists = (_numbers(cube.episodes, flags) for flags in (missing, errors > 0, other))
                 own = (cube.simulator, cube.systems[s], cube.conditions[c].name, family)
                 rows.append((*own, due, n, int(errors.sum()), complete, *lists))
-    note = (
+    return Table.of(
+        "coverage",
+        "Which episodes count",
+        "simulator system condition family expected:count n:count errors:count complete:flag "
+        "missing_episodes error_episodes other_episodes",
+        rows,
         "Episodes by split and index. An episode counts if one of its rollouts is no error. With "
-        "repeats, one that does not count with every model seed of the condition is missing."
+        "repeats, one that does not count with every model seed of the condition is missing.",
     )
-    return Table("coverage", "Which episodes count", tuple(columns), tuple(rows), note)
 
 
 def _numbers(episodes: Sequence[EpisodeId], chosen: Flags) -> str:

@@ -9,12 +9,12 @@ import numpy as np
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score import Grid
-from robomme_interference_data.evaluate.score.cube import Cube, Statuses, cubes_of, success
-from robomme_interference_data.evaluate.score.pairs import Pairs, pair, paired_table
+from robomme_interference_data.evaluate.score.cube import Cube, cubes_of, success
+from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.stats import Resampler, difference, wilson
-from robomme_interference_data.tables import Column, Table, percent
+from robomme_interference_data.stats import Resampler, difference, holm, wilson
+from robomme_interference_data.tables import Table, percent
 
 __all__ = ["Comparison", "compare"]
 
@@ -56,39 +56,43 @@ def compare(
         InvalidOptionError: They have no simulator, system, condition or episode in common.
         BadRowsError: Rows are bad.
     """
-    one, other = (
-        read_rows([p], s, lenient) for p, s in zip((first, second), systems, strict=True)
-    )
-    met = list(_met(one, other))
-    notes, found = list(_differing(one, other)), []
+    one, other = (read_rows([p], s, lenient) for p, s in zip((first, second), systems, strict=True))
+    sides = [list(_sides(rows)) for rows in (one, other)]
+    met = list(_met(*sides))
+    notes, own, found = list(_differing(one, other)), [], []
     for a, b in met:
         conditions = [c for c in a.conditions if c in b.conditions]
         pairs = {(part, c): _pairs(a, b, c, part) for part in ("", *FAMILIES) for c in conditions}
         for (part, condition), here in pairs.items():
             if here.n:
-                own = (a.cube.simulator, a.system, b.system, part or "all", condition)
-                found.append((own, here, ()))
-        if a.system == b.system and _same_histories(a.cube.simulator, one, other):
+                own.append((a.cube.simulator, a.system, b.system, part or "all", condition))
+                found.append(here)
+        same = one.revisions.get(a.cube.simulator) == other.revisions.get(a.cube.simulator)
+        if a.system == b.system and same:
             notes += _noise(a, b, {c: pairs["", c] for c in conditions})
     if not found:
         raise InvalidOptionError(
             f"{first} and {second} have no episode under a common condition that counts in both",
             "Compare runs over the same episodes.",
         )
-    notes += _left_out("a", one, met) + _left_out("b", other, [(b, a) for a, b in met])
-    table = paired_table(
+    notes += _left_out("a", sides[0], dict(met))
+    notes += _left_out("b", sides[1], {b: a for a, b in met})
+    table = Table.of(
         "compare",
         "Two runs compared",
-        [Column(n) for n in ("simulator", "system_a", "system_b", "family", "condition")],
-        found,
+        "simulator system_a system_b family condition n:count rate_a:rate rate_b:rate "
+        f"difference:points {COLUMNS}",
+        (
+            (*names, pairs.n, pairs.first, pairs.second, *pairs.tested, p)
+            for names, pairs, p in zip(own, found, holm([one.p for one in found]), strict=True)
+        ),
         f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
-        "b − a, gained and lost are from a to b.",
-        {"rate_a": "first", "rate_b": "second"},
+        f"b − a, gained and lost are from a to b. {how_to_read(found)}",
     )
     return Comparison(table, tuple(notes), (one, other))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Side:
     """One system in one simulator of a run."""
 
@@ -99,13 +103,9 @@ class _Side:
     def conditions(self) -> list[str]:
         return self.cube.ran(self.system)
 
-    def status(self, condition: str, episodes: Sequence[EpisodeId]) -> Statuses:
-        place = {one: at for at, one in enumerate(self.cube.episodes)}
-        return self.cube.status[self.cube.cell(self.system, condition)][
-            [place[one] for one in episodes]
-        ]
-
     def counted(self, condition: str) -> set[EpisodeId]:
+        if condition not in self.conditions:
+            return set()
         counts = self.cube.counted[self.cube.cell(self.system, condition)]
         return {self.cube.episodes[at] for at in np.flatnonzero(counts)}
 
@@ -115,25 +115,24 @@ def _sides(rows: Rows) -> Iterator[_Side]:
         yield from (_Side(cube, system) for system in cube.systems)
 
 
-def _met(one: Rows, other: Rows) -> Iterator[tuple[_Side, _Side]]:
+def _met(one: Sequence[_Side], other: Sequence[_Side]) -> Iterator[tuple[_Side, _Side]]:
     """Yield what is compared, simulator by simulator, in the order of tables."""
-    simulators, systems = (
-        [rows.names(column) for rows in (one, other)] for column in ("simulator", "system")
-    )
+    simulators = [list(dict.fromkeys(s.cube.simulator for s in sides)) for sides in (one, other)]
+    systems = [list(dict.fromkeys(s.system for s in sides)) for sides in (one, other)]
     if set(simulators[0]).isdisjoint(simulators[1]):
         raise InvalidOptionError(
             f"the rows are of different simulators: {' and '.join(map(', '.join, simulators))}",
             "Only rows of one simulator can be compared.",
         )
-    common = [system for system in systems[0] if system in systems[1]]
+    common = {system: system for system in systems[0] if system in systems[1]}
     if not common and max(map(len, systems)) > 1:
         raise InvalidOptionError(
             f"no system is in both: {' and '.join(map(', '.join, systems))}",
             "Compare runs of the same systems, or of one system each.",
         )
-    partners = {one: one for one in common} or {systems[0][0]: systems[1][0]}
-    there = {(side.cube.simulator, side.system): side for side in _sides(other)}
-    for a in _sides(one):
+    partners = common or {systems[0][0]: systems[1][0]}
+    there = {(side.cube.simulator, side.system): side for side in other}
+    for a in one:
         b = there.get((a.cube.simulator, partners.get(a.system, "")))
         if b is not None:
             _check_scenes(a.cube, b.cube)
@@ -153,34 +152,27 @@ def _check_scenes(a: Cube, b: Cube) -> None:
 
 def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
     """Compare two sides under a condition, over all shared episodes or those of a family."""
-    shared = set(b.cube.episodes)
-    episodes = [e for e in a.cube.episodes if e in shared and family in ("", e.family)]
-    first, second = (side.status(condition, episodes) for side in (a, b))
+    places = [{one: at for at, one in enumerate(side.cube.episodes)} for side in (a, b)]
+    shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
+    first, second = (
+        side.cube.status[side.cube.cell(side.system, condition)][[at[one] for one in shared]]
+        for side, at in zip((a, b), places, strict=True)
+    )
     values = np.stack([success(first), success(second)], axis=1)
     values = values[~np.isnan(values).any(axis=1)]
     (drawn,) = Resampler(values, a.cube.simulator).intervals([difference(0, 1)])
-    return pair(first, second, drawn, _matched(a.cube.model_seeds, b.cube.model_seeds))
-
-
-def _matched(a: Sequence[int], b: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Match the model seeds of two runs; if they share none, the lowest with the lowest."""
-    shared = [seed for seed in a if seed in b]
-    if shared:
-        return [a.index(seed) for seed in shared], [b.index(seed) for seed in shared]
-    places = list(range(min(len(a), len(b))))
-    return places, places
-
-
-def _same_histories(simulator: str, one: Rows, other: Rows) -> bool:
-    """Whether the runs name one revision of a split, or neither names any."""
-    return one.revisions.get(simulator) == other.revisions.get(simulator)
+    # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
+    seeds = a.cube.model_seeds, b.cube.model_seeds
+    matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]
+    matched = matched or [(place, place) for place in range(min(map(len, seeds)))]
+    return pair(first, second, drawn, matched)
 
 
 def _differing(one: Rows, other: Rows) -> Iterator[str]:
     for simulator in one.names("simulator"):
-        if simulator not in other.names("simulator") or _same_histories(simulator, one, other):
-            continue
         revisions = [rows.revisions.get(simulator) for rows in (one, other)]
+        if simulator not in other.names("simulator") or revisions[0] == revisions[1]:
+            continue
         if None in revisions:
             yield (
                 f"Only one of the runs names the revision of its split of {simulator}: the "
@@ -193,7 +185,7 @@ def _differing(one: Rows, other: Rows) -> Iterator[str]:
             )
 
 
-def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
+def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
     """Say how many episodes flip between two runs of the same system: the noise floor."""
     shares = []
     for condition, here in pairs.items():
@@ -203,38 +195,24 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> Iterator[str]:
                 f"{condition} {percent(here.flips)} of {here.pairs} "
                 f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
             )
-    if shares:
-        same = not set(a.cube.model_seeds).isdisjoint(b.cube.model_seeds)
-        seeds = "the same model seeds" if same else "other model seeds"
-        yield (
-            f"{a.system} ran in both, with {seeds}, in {a.cube.simulator}. If nothing else "
-            "differs, this share of episodes flips by itself, which is the noise floor: "
-            f"{', '.join(shares)}."
-        )
+    other = "other" if set(a.cube.model_seeds).isdisjoint(b.cube.model_seeds) else "the same"
+    note = (
+        f"{a.system} ran in both, with {other} model seeds, in {a.cube.simulator}. If nothing else "
+        "differs, this share of episodes flips by itself, which is the noise floor: "
+        f"{', '.join(shares)}."
+    )
+    return [note] if shares else []
 
 
-def _left_out(name: str, rows: Rows, met: Sequence[tuple[_Side, _Side]]) -> list[str]:
+def _left_out(name: str, sides: Sequence[_Side], met: Mapping[_Side, _Side]) -> list[str]:
     """Say what one run has and the comparison leaves out, nothing if that is nothing."""
     parts = []
-    compared = {(a.cube.simulator, a.system) for a, _ in met}
-    sides = [(side.cube.simulator, side.system) for side in _sides(rows)]
-    if alone := [f"{system} in {sim}" for sim, system in sides if (sim, system) not in compared]:
-        parts.append(_counted("system", alone))
-    for a, b in met:
-        only = [c for c in a.conditions if c not in b.conditions]
-        found = [_counted("condition", only)] if only else []
-        under: dict[int, list[str]] = {}
-        for condition in (c for c in a.conditions if c in b.conditions):
-            lone = len(a.counted(condition) - b.counted(condition))
-            under.setdefault(lone, []).append(condition)
-        found += [
-            f"{lone:,} episode{'s' * (lone > 1)} under {', '.join(conditions)}"
-            for lone, conditions in under.items()
-            if lone
-        ]
-        parts += [f"of {a.system} in {a.cube.simulator} {' and '.join(found)}"] if found else []
-    return [f"Only in {name}, and left out: {'; '.join(parts)}."] if parts else []
-
-
-def _counted(what: str, names: Sequence[str]) -> str:
-    return f"{len(names)} {what}{'s' * (len(names) > 1)} ({', '.join(names)})"
+    for side in sides:
+        other = met.get(side)
+        counts = {
+            condition: len(side.counted(condition) - (other.counted(condition) if other else set()))
+            for condition in side.conditions
+        }
+        if lone := ", ".join(f"{c} ({count:,})" for c, count in counts.items() if count):
+            parts.append(f"{side.system} in {side.cube.simulator}, {lone}")
+    return [f"Only in {name}, and left out (episodes): {'; '.join(parts)}."] if parts else []

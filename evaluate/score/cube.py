@@ -10,7 +10,7 @@ from robomme_interference_data.conditions import (
     DEFAULT_CONDITIONS,
     NO_HISTORY,
     Condition,
-    parse_condition,
+    in_order,
 )
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
 from robomme_interference_data.evaluate.score import Grid
@@ -142,7 +142,7 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
     systems = sorted(rows.names("system"), key=_table_order)
     given = rows.names("condition")
     due = given if grid is Grid.GIVEN else DEFAULT_CONDITIONS
-    conditions = sorted({parse_condition(one) for one in (*given, *due)}, key=lambda c: c.sort_key)
+    conditions = in_order({*given, *due})
     model_seeds = sorted(rows.names("model_seed"))
 
     # An episode is a number in the canonical order.
@@ -172,7 +172,7 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
     return Cube(
         simulator,
         tuple(systems),
-        tuple(conditions),
+        conditions,
         tuple(_episode(one, width) for one in episodes.tolist()),
         tuple(model_seeds),
         status,

@@ -1,148 +1,233 @@
-"""What the figures of one simulator show, and the curves, axes and legends that they share."""
+"""How systems look in figures, and the curves, axes and legends that figures share.
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+Systems are told apart without colour, too, and in print.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
-from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
+from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_condition
+from robomme_interference_data.drawing import INK, tidy
+from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import base_of
-from robomme_interference_data.evaluate.score.looks import (
-    INCOMPLETE,
-    PUBLISHED,
-    Look,
-    inches,
-    looks_of,
-)
 from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.page import INK, tidy
+from robomme_interference_data.evaluate.systems import SYSTEMS
 
-__all__ = ["Cells", "Data", "as_published", "curve", "dodged", "explain", "keys"]
-__all__ += ["legend", "published_curves", "set_axes", "short"]
+__all__ = [
+    "Data",
+    "Look",
+    "curve",
+    "dodged",
+    "explained",
+    "label_ends",
+    "legend",
+    "looks_of",
+    "set_axes",
+    "short",
+    "spread",
+]
 
-Cells = Mapping[tuple[str, str, str], Cell]
-"""System, condition and part to the cell, of one simulator."""
+# Okabe and Ito's colours, safe for the colour-blind: one for what the memory is made of.
+_COLOURS = {
+    "none": "#767676",
+    "frames": "#0072B2",
+    "tokens": "#56B4E9",
+    "hidden state": "#009E73",
+    "text": "#E69F00",
+    "text with points": "#D55E00",
+    "text with points and key frames": "#CC79A7",
+    "all frames": "#009E73",
+    "last frames": "#E69F00",
+}
+_OWN = ("#CC79A7", "#009E73", "#E69F00", "#56B4E9", "#D55E00", "#0072B2")
+# Marker and line: one for how it enters the policy.
+_SHAPES = {
+    "modulator": ("o", "-"),
+    "context": ("s", "--"),
+    "expert": ("^", ":"),
+    "subgoals": ("D", "-."),
+}
+_LINES = ("-", "--", "-.", ":")
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a system is drawn.
+
+    Attributes:
+        label: Its name.
+        colour: As `#rrggbb`.
+        marker: matplotlib's marker.
+        line: matplotlib's line style.
+        width: Line width in points.
+    """
+
+    label: str
+    colour: str
+    marker: str
+    line: Any
+    width: float = 1.6
+
+    @property
+    def point(self) -> dict[str, Any]:
+        """How matplotlib draws its points; an outline is all there is of a dash."""
+        size, edge = {"*": (8, 1), "_": (10, 2)}.get(self.marker, (4.5, 1))
+        style = {"marker": self.marker, "color": self.colour}
+        return style | {"markersize": size, "markeredgewidth": edge}
+
+
+# Of those that share no shape with the paper's, each has its own pair of marker and line.
+_FREE = [(marker, line) for line in _LINES for marker in "vPX<>dph"]
+_TABLE = {
+    system.name: Look(
+        system.display,
+        _COLOURS[system.representation],
+        *(_SHAPES.get(system.integration or "") or _FREE.pop(0)),
+    )
+    for system in SYSTEMS.values()
+    if not system.retrieval
+}
+
+
+def looks_of(names: Sequence[str]) -> dict[str, Look]:
+    """Return the looks of systems; those of the table look the same in every figure.
+
+    A system with retrieval is a black star; several are stars in the colours of what they are
+    without it. Systems that are not in the table differ from each other and from the rest by
+    marker or line, up to two dozen; beyond that colours tell them apart.
+    """
+    looks: dict[str, Look] = {}
+    retrieving = [name for name in names if name in SYSTEMS and SYSTEMS[name].retrieval]
+    own = [name for name in names if name not in SYSTEMS]
+    for name in names:
+        if name in own:
+            number = own.index(name)
+            colour = _OWN[(number + number // len(_FREE)) % len(_OWN)]
+            looks[name] = Look(name, colour, *_FREE[number % len(_FREE)])
+        elif name in retrieving:
+            system, number = SYSTEMS[name], retrieving.index(name)
+            colour = _COLOURS[system.representation] if len(retrieving) > 1 else "#000000"
+            looks[name] = Look(system.display, colour, "*", _LINES[number % len(_LINES)], 2.2)
+        else:
+            looks[name] = _TABLE[name]
+    return looks
 
 
 class Data:
-    """What the figures of one simulator show."""
+    """What the figures of one simulator show.
+
+    Attributes:
+        cells: System, condition and part to what is drawn: cells with rows, and published rates,
+            whose systems are named `<system>, published`.
+        systems: Those that have rows.
+        absent: Published ones without rows here, behind a retrieval step that has: drawn in full.
+        beside: Published ones of systems with rows: dashes beside their points.
+        looks: Of all of them.
+        conditions: Of all of them, in the order of tables.
+        lift: Each condition's lift.
+    """
 
     def __init__(self, score: Score, simulator: str):
-        def mine(cells: Sequence[Cell]) -> dict[tuple[str, str, str], Cell]:
-            found = [c for c in cells if c.simulator == simulator and c.n]
-            return {(c.system, c.condition, c.part): c for c in found}
-
         self.simulator = simulator
-        self.all, self.families = mine(score.cells), mine(score.family_cells)
-        self.difficulty = mine(score.difficulty_cells)
-        self.systems = list(dict.fromkeys(system for system, _, _ in self.all))
-        self.own_conditions = sorted({c for _, c, _ in self.all}, key=condition_rank)
-        self.lift = [c for one in score.effects for c in one.lift if c.simulator == simulator]
-        self.published: list[Published] = []
-        if score.against_paper:
-            self.published = [one for one in published() if one.simulator == simulator]
-        shown = {one.condition for one in self.published} if self.published else set()
-        self.conditions = sorted({*self.own_conditions, *shown}, key=condition_rank)
-        self.bases = [b for s in self.systems if (b := base_of(s)) is not None]
-        self.looks = looks_of([*self.systems, *(b for b in self.bases if b not in self.systems)])
+        found = [one for one in score.cells if one.simulator == simulator and one.n]
+        known = [one for one in published() if one.simulator == simulator]
+        known = known if score.settings.against is Against.PAPER else []
+        self.systems = list(dict.fromkeys(one.system for one in found))
+        self.lift = [c for c in score.contrasts if c.simulator == simulator and c.is_lift]
+        bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
+        self.looks = looks_of([*self.systems, *bases])
+        self.cells: dict[tuple[str, str, str], Cell | Published] = {
+            (one.system, one.condition, one.part): one for one in found
+        }
+        self.absent, self.beside = list[str](), list[str]()
+        for one in known:
+            if one.system in self.looks:
+                name = f"{one.system}, published"
+                names = self.absent if one.system in bases else self.beside
+                names += [name] if name not in names else []
+                look, line = self.looks[one.system], (0, (4, 2)) if one.system in bases else "none"
+                self.looks[name] = Look(f"{look.label}, published", look.colour, "_", line, 1.2)
+                self.cells[name, one.condition, ""] = one
+        conditions = {condition for _, condition, _ in self.cells}
+        self.conditions = [one.name for one in in_order(conditions)] if conditions else []
 
     def x(self, condition: str) -> float:
-        """Place on the x axis: evenly, with a gap after no-history, which is no small k."""
+        """Place on the x axis: evenly, with a gap before another kind, which is no greater k."""
+        kinds = [parse_condition(one).kind.name for one in self.conditions]
         place = self.conditions.index(condition)
-        return place - (0.3 if condition == NO_HISTORY else 0.0)
+        return place + 0.3 * len({*kinds[: place + 1]})
+
+    def parts(self, names: Sequence[str]) -> list[str]:
+        """Return those of some parts that any cell is of."""
+        return [name for name in names if any(part == name for _, _, part in self.cells)]
+
+    def shown(self, systems: Sequence[str]) -> list[str]:
+        """Return the conditions that any cell of some systems is of."""
+        found = {condition for system, condition, _ in self.cells if system in systems}
+        return [condition for condition in self.conditions if condition in found]
 
 
-def dodged(systems: Sequence[str]) -> Iterator[tuple[float, str]]:
+def dodged(systems: Sequence[str]) -> Iterator[tuple[str, float]]:
     """Yield systems, each with its shift on the x axis, so that intervals do not overlap."""
     for place, system in enumerate(systems):
-        yield (place - (len(systems) - 1) / 2) * min(0.09, 0.5 / len(systems)), system
+        yield system, (place - (len(systems) - 1) / 2) * min(0.09, 0.5 / len(systems))
 
 
 def curve(
-    axes: Any, data: Data, cells: Cells, system: str, part: str, shift: float, *, bars: bool = True
-) -> float:
-    """Draw a system's rates over the conditions; return the last one, NaN if there is none.
+    axes: Any, data: Data, system: str, part: str, shift: float, *, bars: bool = True
+) -> list[tuple[float, Look]]:
+    """Draw a system's rates over the conditions.
 
     Points of incomplete cells are hollow. no-history is joined by a thin line: it is the rate
     without memory, not a smaller k.
-    """
-    look = data.looks[system]
-    found = [c for name in data.conditions if (c := cells.get((system, name, part)))]
-    if not found:
-        return math.nan
-    xs = [data.x(cell.condition) + shift for cell in found]
-    ys = [100 * cell.rate for cell in found]
-    start = int(found[0].condition == NO_HISTORY)
-    if start == len(found) > 0 and len(data.conditions) > 1:  # a system without memory: the floor
-        axes.axhline(ys[0], color=look.colour, linewidth=0.8, linestyle="--", zorder=0)
-    axes.plot(xs[start:], ys[start:], look.line, color=look.colour, linewidth=look.width)
-    axes.plot(xs[: start + 1], ys[: start + 1], ":", color=look.colour, linewidth=0.7)
-    for x, y, cell in zip(xs, ys, found, strict=True):
-        if bars:
-            low, high = cell.interval
-            axes.plot((x, x), (100 * low, 100 * high), color=look.colour, linewidth=0.9, alpha=0.7)
-        face = look.colour if cell.complete else "white"
-        style = {"color": look.colour, "markerfacecolor": face, "markersize": look.size}
-        axes.plot(x, y, look.marker, **style, clip_on=False, zorder=3)  # whole at 0 and at 100%
-    return ys[-1]
-
-
-def as_published(look: Look) -> Look:
-    """Return the look of a published curve: short dashes as points, a dashed line."""
-    return Look(f"{look.label}, published", look.colour, "_", (0, (4, 2)), 1.2)
-
-
-def keys(cells: Cells, *, published: bool) -> list[Look]:
-    """Return what a legend has to explain beside the systems, as far as it is drawn.
 
     Args:
-        cells: Those that the figure draws.
-        published: Whether it draws published rates.
+        axes: Where to draw.
+        data: Of the simulator.
+        system: One of its systems.
+        part: Family or difficulty; empty for all episodes.
+        shift: On the x axis.
+        bars: Whether to draw intervals.
+
+    Returns:
+        The last rate in percent, and the system's look; nothing without any rate.
     """
-    incomplete = any(not cell.complete for cell in cells.values())
-    return [INCOMPLETE] * incomplete + [PUBLISHED] * published
+    look = data.looks[system]
+    found = [c for name in data.conditions if (c := data.cells.get((system, name, part)))]
+    if not found:
+        return []
+    points = [(c.condition, data.x(c.condition) + shift, 100 * c.rate) for c in found]
+    for kind, group in groupby(points, lambda point: parse_condition(point[0]).kind):
+        _, xs, ys = zip(*group, strict=True)
+        if kind.counted:
+            axes.plot(xs, ys, linestyle=look.line, color=look.colour, linewidth=look.width)
+    if points[0][0] == NO_HISTORY and look.line != "none":
+        if len(points) > 1:
+            _, xs, ys = zip(*points[:2], strict=True)
+            axes.plot(xs, ys, ":", color=look.colour, linewidth=0.7)
+        elif len(data.conditions) > 1:  # without memory: the floor
+            axes.axhline(points[0][2], color=look.colour, linewidth=0.8, linestyle="--", zorder=0)
+    for (_, x, y), cell in zip(points, found, strict=True):
+        if bars:
+            bounds = [100 * bound for bound in cell.interval]
+            axes.plot((x, x), bounds, color=look.colour, linewidth=0.9, alpha=0.7)
+        face = look.colour if cell.complete else "white"
+        # Not clipped: whole at 0 and at 100%.
+        axes.plot(x, y, **look.point, markerfacecolor=face, clip_on=False, zorder=3)
+    return [(points[-1][2], look)]
 
 
-def published_curves(
-    axes: Any, data: Data, shifts: Mapping[str, float]
-) -> list[tuple[float, Look]]:
-    """Draw published rates at the systems' shifts; return the ends of curves and their looks.
-
-    Points are short dashes. Those of a system whose rows are not here, but stand behind a
-    retrieval step, are joined to a curve.
-    """
-    ends = []
-    for system, shift in shifts.items():
-        known = {one.condition: one for one in data.published if one.system == system}
-        found = [known[c] for c in data.conditions if c in known]
-        if not found:
-            continue
-        look = as_published(data.looks[system])
-        xs = [data.x(one.condition) + shift for one in found]
-        ys = [100 * one.rate for one in found]
-        absent = system not in data.systems
-        start = int(found[0].condition == NO_HISTORY)
-        if absent:
-            axes.plot(xs[start:], ys[start:], linestyle=look.line, color=look.colour, linewidth=1.2)
-            for x, one in zip(xs, found, strict=True):
-                bounds = [100 * bound for bound in one.interval]
-                axes.plot((x, x), bounds, color=look.colour, linewidth=0.9, alpha=0.7)
-            ends.append((ys[-1], look))
-        axes.plot(
-            xs,
-            ys,
-            look.marker,
-            color=look.colour,
-            markersize=look.size,
-            markeredgewidth=look.edge,
-        )
-    return ends
+# --- axes, labels and legends ------------------------------------------------------------------
 
 
-def set_axes(axes: Any, data: Data, conditions: Sequence[str], ylabel: str) -> None:
-    """Name the conditions, start at zero, and take away what carries nothing."""
+def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None:
+    """Name the conditions of some systems, start at zero, and take away what carries nothing."""
     tidy(axes)
+    conditions = data.shown(systems)
     places = [data.x(condition) for condition in conditions]
     axes.set_xticks(places, [short(condition) for condition in conditions])
     axes.set_xlim(places[0] - 0.4, places[-1] + 0.4)
@@ -151,50 +236,80 @@ def set_axes(axes: Any, data: Data, conditions: Sequence[str], ylabel: str) -> N
         axes.set_ylabel(ylabel, size=8, color=INK)
 
 
-def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
-    """Lay out the panels above a legend."""
-    widest = 0.7 + inches(max((look.label for look in looks), key=len))
-    columns = max(1, min(len(looks), int(figure.get_figwidth() / widest)))
-    rows = -(-len(looks) // columns)
-    height = (0.2 * rows + 0.3) / figure.get_figheight()
-    figure.tight_layout(rect=(0, height, 1, 1))
-    explain(figure, looks, note, columns)
-
-
-def explain(figure: Any, looks: Sequence[Look], note: str = "", columns: int = 2) -> None:
-    """Write a legend at the foot of a figure, and a note under it."""
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=look.colour,
-            marker=look.marker,
-            linestyle=look.line,
-            markerfacecolor="white" if look.hollow else look.colour,
-            markersize=look.size,
-            markeredgewidth=look.edge,
-            linewidth=look.width,
-        )
-        for look in looks
-    ]
-    if looks:
-        figure.legend(
-            handles,
-            [look.label for look in looks],
-            loc="lower center",
-            ncols=columns,
-            fontsize=8,
-            frameon=False,
-            handlelength=3.2,  # long enough for a line's dashes to be seen
-            bbox_to_anchor=(0.5, (0.16 if note else 0.02) / figure.get_figheight()),
-        )
-    if note:
-        place = 0.06 / figure.get_figheight()
-        figure.text(0.5, place, note, size=7.5, color=INK, ha="center", va="bottom")
-
-
 def short(condition: str) -> str:
     """Return a condition as axes name it."""
     return "none" if condition == NO_HISTORY else condition
+
+
+def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: str) -> str:
+    """Return in words what the points of some cells mean, as far as it needs to be said."""
+    drawn = [c for (s, _, part), c in data.cells.items() if s in systems and part in parts]
+    hollow = any(not one.complete for one in drawn)
+    dashes = any(isinstance(one, Published) for one in drawn)
+    said = ["hollow: cell not complete"] * hollow + ["dashes: published rates"] * dashes
+    return "; ".join([*said, *filter(None, notes)])
+
+
+def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
+    """Write a legend at the foot of a figure, under a note."""
+    from matplotlib.lines import Line2D
+
+    if looks or note:
+        widest = 0.7 + 0.066 * max((len(look.label) for look in looks), default=0)
+        figure.legend(
+            [Line2D([], [], linestyle=k.line, linewidth=k.width, **k.point) for k in looks],
+            [look.label for look in looks],
+            title=note or None,
+            title_fontsize=7.5,
+            loc="outside lower center",
+            ncols=max(1, min(len(looks), int(figure.get_figwidth() / widest))),
+            fontsize=8,
+            frameon=False,
+            handlelength=3.2,  # long enough for a line's dashes to be seen
+        )
+
+
+def label_ends(axes: Any, ends: Sequence[tuple[float, Look]], gap: float) -> None:
+    """Write labels at the right ends of lines, moved apart to at least `gap` on the y axis.
+
+    Each stands behind the system's marker, in ink: not all colours can be read as letters.
+
+    Args:
+        axes: The axes, with their final limits.
+        ends: Where lines end on the y axis, and how they look.
+        gap: On the y axis.
+    """
+    from matplotlib.transforms import ScaledTranslation
+
+    def beside(inches: float) -> Any:  # from the right edge, y in data
+        scale = axes.figure.dpi_scale_trans
+        return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, scale)
+
+    ordered = sorted(ends, key=lambda end: end[0])
+    heights = spread([value for value, _ in ordered], gap)
+    for (value, look), height in zip(ordered, heights, strict=True):
+        axes.annotate(
+            "",
+            (1, value),
+            (1, height),
+            xycoords=beside(0),
+            textcoords=beside(0.16),
+            arrowprops={"arrowstyle": "-", "color": look.colour, "linewidth": 0.5, "shrinkA": 0},
+        )
+        axes.plot(1, height, **look.point, clip_on=False, transform=beside(0.23))
+        axes.text(1, height, look.label, color=INK, size=8, va="center", transform=beside(0.33))
+
+
+def spread(values: Sequence[float], gap: float) -> list[float]:
+    """Return ascending values moved as little as need be to lie at least `gap` apart.
+
+    Those that are too close form a stack around their mean; stacks that meet become one.
+    """
+    stacks: list[tuple[float, int]] = []  # mean and size
+    for value in values:
+        mean, size = value, 1
+        while stacks and mean - stacks[-1][0] < gap * (size + stacks[-1][1]) / 2:
+            before, count = stacks.pop()
+            mean, size = (mean * size + before * count) / (size + count), size + count
+        stacks.append((mean, size))
+    return [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]

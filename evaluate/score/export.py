@@ -12,23 +12,10 @@ from robomme_interference_data.records import Status
 
 __all__ = ["RELEASED_COLUMNS", "export"]
 
-RELEASED_COLUMNS = (
-    "family",
-    "condition",
-    "episode",
-    "seed",
-    "difficulty",
-    "status",
-    "success",
-    "steps",
-    "retrieval_model",
-    "retrieval_selected_lesson_fraction",
-    "retrieval_selected_filler_fraction",
-    "retrieval_selected_query_fraction",
-)
+RELEASED_COLUMNS = ("family", "condition", "episode", "seed", "difficulty", "status", "success")
+RELEASED_COLUMNS += ("steps", "retrieval_model", "retrieval_selected_lesson_fraction")
+RELEASED_COLUMNS += ("retrieval_selected_filler_fraction", "retrieval_selected_query_fraction")
 """The columns of the released retrieval rows, in their order. They name no system."""
-
-_SUCCESS = {True: 1, False: 0, None: None}
 
 
 def export(rows: Rows, folder: Path) -> list[Path]:
@@ -50,41 +37,33 @@ def export(rows: Rows, folder: Path) -> list[Path]:
         InvalidOptionError: The layout cannot tell the rows apart: there are repeats with several
             model seeds, or episodes that are not `test`. Or bad rows were left out.
     """
-    _check(rows)
-    columns = [rows.list(name) for name in ("simulator", "system", *RELEASED_COLUMNS)]
-    written: dict[tuple[str, str], Path] = {}
+    seeds = len(rows.names("model_seed"))
+    other = int((rows.places("episode_split", ["test"]) < 0).sum())
+    wrong = [f"{seeds} model seeds"] * (seeds > 1)
+    wrong += [f"{other:,} rows of train or val episodes"] * (other > 0)
+    wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)
+    if wrong:
+        raise InvalidOptionError(
+            f"rows to export: {', '.join(wrong)}; expected sound rows of test episodes and of one "
+            "model seed",
+            "The released layout has no column for more: export such rows only.",
+        )
+    values = {name: rows.values[name] for name in RELEASED_COLUMNS}
+    values["success"] = [{True: 1, False: 0}.get(one) for one in values["success"]]
+    values["status"] = [
+        Status.ONGOING if one == Status.TIMEOUT else one for one in values["status"]
+    ]
+    columns = [[found[code] for code in rows.codes[n].tolist()] for n, found in values.items()]
+    written: dict[Path, Any] = {}
     with ExitStack() as stack:
-        writers: dict[tuple[str, str], Any] = {}
-        for simulator, system, *values in zip(*columns, strict=True):
-            key = (simulator, system)
+        names = zip(rows.list("simulator"), rows.list("system"), strict=True)
+        for (simulator, system), row in zip(names, zip(*columns, strict=True), strict=True):
+            path = folder / f"{system}-{simulator}_rollouts.csv"
             more = [] if simulator == RELEASED_SIMULATOR else [simulator]
-            if key not in writers:
-                written[key] = folder / f"{system}-{simulator}_rollouts.csv"
-                partial = stack.enter_context(atomic_path(written[key]))
+            if path not in written:
+                partial = stack.enter_context(atomic_path(path))
                 file = stack.enter_context(partial.open("w", newline="", encoding="utf-8"))
-                writers[key] = csv.writer(file)  # with CRLF, as released
-                writers[key].writerow((*RELEASED_COLUMNS, *(["simulator"] if more else [])))
-            row = dict(zip(RELEASED_COLUMNS, values, strict=True))
-            row["success"] = _SUCCESS[row["success"]]
-            row["status"] = "ongoing" if row["status"] == Status.TIMEOUT else row["status"]
-            writers[key].writerow((*row.values(), *more))
-    return sorted(written.values())
-
-
-def _check(rows: Rows) -> None:
-    if len(seeds := rows.names("model_seed")) > 1:
-        raise InvalidOptionError(
-            f"the rows have {len(seeds)} model seeds, and the released layout has no column for "
-            "them",
-            "Export the run of each seed by itself.",
-        )
-    if other := sum(split != "test" for split in rows.list("episode_split")):
-        raise InvalidOptionError(
-            f"{other:,} rows are of train or val episodes, and the released layout has no column "
-            "for that",
-            "Export rows of test episodes only.",
-        )
-    if rows.refused:
-        raise InvalidOptionError(
-            f"{rows.refused:,} rows are bad", "Mend them first: only sound rows are exported."
-        )
+                written[path] = csv.writer(file)  # with CRLF, as released
+                written[path].writerow((*RELEASED_COLUMNS, *(["simulator"] if more else [])))
+            written[path].writerow((*row, *more))
+    return sorted(written)

@@ -23,7 +23,7 @@ def headline(score: Score, simulator: str) -> str:
     others are named. A system that only bounds what a memory can reach leads where there is no
     other.
     """
-    found = [cell for cell in score.cells if cell.simulator == simulator]
+    found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_bound(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
     if complete:
@@ -119,12 +119,11 @@ def _beside_base(score: Score, contrast: Contrast) -> list[str]:
 
 def _last_contrast(score: Score, leader: Cell) -> Contrast | None:
     found = [
-        contrast
-        for effects in score.effects
-        for contrast in effects.contrasts
-        if (contrast.simulator, contrast.system) == (leader.simulator, leader.system)
-        and contrast.against == (leader.system, START)
-        and contrast.pairs.n
+        one
+        for one in score.contrasts
+        if (one.simulator, one.system) == (leader.simulator, leader.system)
+        and one.against == (leader.system, START)
+        and one.pairs.n
     ]
     return max(found, key=lambda contrast: parse_condition(contrast.condition).k, default=None)
 

@@ -1,17 +1,21 @@
 """Two sides of a comparison, paired over the episodes that count on both."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robomme_interference_data.evaluate.score.cube import Statuses, counting, success
-from robomme_interference_data.stats import LEAST, Interval, holm, mcnemar, paired_interval
-from robomme_interference_data.tables import Column, Table
+from robomme_interference_data.stats import LEAST, Interval, mcnemar, paired_interval
 
-__all__ = ["Pairs", "pair", "paired_table"]
+__all__ = ["COLUMNS", "Pairs", "how_to_read", "pair"]
+
+COLUMNS = (
+    "low:points high:points interval pairs:count gained:count lost:count flips:rate p:p p_holm:p"
+)
+"""Columns of a table of comparisons, after the difference: `Pairs.tested`, and p corrected."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +53,18 @@ class Pairs:
         """Two-sided p-value of McNemar's exact test, NaN without pairs."""
         return mcnemar(self.gained, self.lost) if self.pairs else math.nan
 
+    @property
+    def tested(self) -> tuple[Any, ...]:
+        """The difference, and the values of `COLUMNS` but for the last."""
+        counts = (self.pairs, self.gained, self.lost, self.flips, self.p)
+        return (*self.change, self.interval, *counts)
+
 
 def pair(
     first: Statuses,
     second: Statuses,
     drawn: Interval,
-    matched: tuple[Sequence[int], Sequence[int]] | None = None,
+    matched: Sequence[tuple[int, int]] | None = None,
 ) -> Pairs:
     """Compare two sides over the same episodes.
 
@@ -62,8 +72,8 @@ def pair(
         first: Outcomes by episode and model seed, `(E, M) int8`.
         second: The same of the second side, `(E, N) int8`.
         drawn: Mean of second − first with its bootstrap interval.
-        matched: Places of the model seeds of each side that are paired, in the order in which a
-            pair is looked for; None for all.
+        matched: Places of model seeds that are paired, of the first and the second side, in the
+            order in which a pair is looked for; None for equal places.
     """
     values = np.stack([success(first), success(second)], axis=1)
     known = ~np.isnan(values).any(axis=1)
@@ -71,72 +81,37 @@ def pair(
     once = all((counting(side[known]).sum(-1) == 1).all() for side in (first, second))
     change, interval = paired_interval(values, once, drawn)
     if matched is not None:
-        first, second = first[:, matched[0]], second[:, matched[1]]
+        one, other = zip(*matched, strict=True)
+        first, second = first[:, one], second[:, other]
     both = counting(first) & counting(second)
     found = np.flatnonzero(both.any(-1))
     seed = both[found].argmax(-1)
     before, after = (side[found, seed] == 0 for side in (first, second))
     return Pairs(
         len(values),
-        *(values.mean(axis=0).tolist() if len(values) else (math.nan, math.nan)),
-        change,
-        interval,
-        len(found),
-        int((after & ~before).sum()),
-        int((before & ~after).sum()),
+        *(float(side.mean()) if len(values) else math.nan for side in values.T),
+        change=change,
+        interval=interval,
+        pairs=len(found),
+        gained=int((after & ~before).sum()),
+        lost=int((before & ~after).sum()),
     )
 
 
-def paired_table(
-    name: str,
-    title: str,
-    columns: Sequence[Column],
-    found: Sequence[tuple[tuple[Any, ...], Pairs, tuple[Any, ...]]],
-    note: str,
-    rates: Mapping[str, str],
-    change: str = "difference",
-    more: Sequence[Column] = (),
-) -> Table:
-    """Return a table of paired comparisons, with p-values corrected for their number.
-
-    Args:
-        name: Of its files.
-        title: What it shows.
-        columns: Of what is compared.
-        found: What is compared, the comparison, and what more is said of it.
-        note: How to read it; what is said of all such tables comes after.
-        rates: Columns with the rates of the sides, each to the side: `first` or `second`.
-        change: What the difference is called.
-        more: Columns after those of the comparison.
-    """
-    p_values = [one.p for _, one, _ in found]
-    rows = [
-        (
-            *(*own, one.n, *(getattr(one, side) for side in rates.values())),
-            *(one.change.value, one.change.low, one.change.high, one.interval, one.pairs, one.gained, one.lost, one.flips),
-            *(one.p, corrected, *rest),
-        )
-        for (own, one, rest), corrected in zip(found, holm(p_values), strict=True)
-    ]
-    whole = (
-        *(*columns, Column("n", "count"), *(Column(name, "rate") for name in rates)),
-        *(Column(change, "points"), Column("low", "points"), Column("high", "points")),
-        *(Column("interval"), Column("pairs", "count"), Column("gained", "count")),
-        *(Column("lost", "count"), Column("flips", "rate"), Column("p", "p")),
-        *(Column("p_holm", "p"), *more),
+def how_to_read(found: Iterable[Pairs]) -> str:
+    """Return how a table of comparisons is to be read."""
+    note = (
+        "95% intervals: bca, BCa bootstrap clustered by episode, where at least "
+        f"{LEAST} episodes differ; newcombe, Newcombe's paired score interval, where fewer do and "
+        "each has one rollout a side; none where fewer do with repeats. pairs: one an episode, of "
+        "the lowest model seed that counts on both sides; gained and lost: pairs whose outcome "
+        "differs, flips: their share; p: McNemar's exact test on them; p_holm: corrected for the "
+        "number of tests in this table."
     )
-    note += (
-        f" 95% intervals: bca, BCa bootstrap clustered by episode, where at least {LEAST} episodes "
-        "differ; newcombe, Newcombe's paired score interval, where fewer do and each has one "
-        "rollout a side; none where fewer do with repeats. pairs: one an episode, of the lowest "
-        "model seed that counts on both sides; gained and lost: pairs whose outcome differs, "
-        "flips: their share; p: McNemar's exact test on them; p_holm: corrected for the number of "
-        "tests in this table."
-    )
-    if fewer := sum(one.pairs < one.n for _, one, _ in found):
+    if fewer := sum(one.pairs < one.n for one in found):
         note += (
             f" In {fewer} row{'s' * (fewer > 1)} the test leaves out a part of the n episodes, in "
             "which no model seed counts on both sides: difference and p are not over the same "
             "episodes."
         )
-    return Table(name, title, whole, tuple(rows), note)
+    return note

@@ -3,40 +3,40 @@
 import base64
 import json
 import math
+import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import metadata, resources
-from itertools import islice
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import numpy as np
+
+from robomme_interference_data.conditions import NO_HISTORY, Condition, in_order
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.evaluate.rows import condition_rank
-from robomme_interference_data.evaluate.score.cells import MainGrid, main_grids, main_note
-from robomme_interference_data.evaluate.score.episodes import episode_rows
+from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.cube import STATUSES, success
 from robomme_interference_data.evaluate.score.figures import FIGURES
-from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.read import Source
+from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.sources import Source
 from robomme_interference_data.evaluate.systems import display_name
-from robomme_interference_data.files import atomic_path, sha256_file
+from robomme_interference_data.files import sha256_file, write_text
 from robomme_interference_data.tables import Table
 
-__all__ = ["load_jinja2", "write_report"]
-
-MOST_EPISODES = 20_000
-"""So many rows of single episodes a page holds at most."""
+__all__ = ["flips", "load_jinja2", "write_report"]
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 
-_RUN_FIELDS = (
-    *("status", "command", "identity", "split", "revision", "simulator", "system", "policy"),
-    *("versions", "git", "machine", "planned", "counts"),
-)
+_RUN_FIELDS = ("status", "command", "identity", "split", "revision", "simulator", "system")
+_RUN_FIELDS += ("policy", "versions", "git", "machine", "planned", "counts")
 """What is shown of a run's `run.json`, as far as it is there."""
+
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
     Grid.GIVEN: "those that any of the given rows is of",
@@ -62,20 +62,18 @@ def write_report(
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    conditions = [c.name for c in in_order({c for u in score.cubes.values() for c in u.conditions})]
     html = environment.from_string(template.read_text(encoding="utf-8")).render(
-        simulators=[{"name": s, "headline": headline(score, s)} for s in score.expected],
-        grids=[_grid(grid) for grid in main_grids(score.cells)],
-        note=main_note(score.cells),
+        simulators=[{"name": s, "headline": headline(score, s)} for s in score.cubes],
+        grids=[_grid(grid) for grid in score.grids],
         tables=[_table(table) for table in score.tables.values()],
         figures=[_figure(name, path) for name, path in figures.items()],
-        conditions=_conditions(score),
-        episodes=_episodes(score, out.parent),
-        most=MOST_EPISODES,
-        sources=[_source(source) for source in score.rollouts.sources],
+        conditions=conditions,
+        episodes=_episodes(score, conditions, out.parent),
+        sources=[_source(source) for source in score.rows.sources],
         facts=_facts(score, command),
     )
-    with atomic_path(out) as partial:
-        partial.write_text(html, encoding="utf-8", newline="\n")
+    write_text(out, html)
 
 
 def load_jinja2() -> Any:
@@ -87,20 +85,18 @@ def load_jinja2() -> Any:
     try:
         import jinja2
     except ImportError as error:
-        raise MissingExtraError(
-            "the report needs jinja2",
-            'Install it: pip install "robomme-interference-data[score]"',
-        ) from error
+        raise MissingExtraError.needs("the report", "jinja2", "score") from error
     return jinja2
 
 
-def _grid(grid: MainGrid) -> dict[str, Any]:
-    """Return the main table of a simulator: of each cell its text, and whether it is the best."""
+def _grid(grid: Table) -> dict[str, Any]:
+    """Return a main table: of each cell its text, and whether it is the best."""
     rows = [
         (system, [(text.replace("**", ""), text.startswith("**")) for text in shown])
-        for system, shown in grid.rows
+        for system, *shown in grid.rows
     ]
-    return {"simulator": grid.simulator, "conditions": grid.conditions, "rows": rows}
+    heads = [column.name for column in grid.columns[1:]]
+    return {"simulator": grid.name, "conditions": heads, "rows": rows, "note": grid.note}
 
 
 def _table(table: Table) -> dict[str, Any]:
@@ -145,44 +141,98 @@ def _figure(name: str, path: Path) -> dict[str, str]:
     }
 
 
-def _conditions(score: Score) -> list[str]:
-    return sorted({c for one in score.outcomes for c in one.conditions}, key=condition_rank)
+# --- single episodes ---------------------------------------------------------------------------
 
 
-def _episodes(score: Score, folder: Path) -> dict[str, Any]:
-    """Return the rows of single episodes as JSON that is safe inside a script element."""
-    rows = islice(episode_rows(score.outcomes, score.rollouts, folder), MOST_EPISODES)
-    conditions = _conditions(score)
-    data = [
-        [
-            *(row.simulator, display_name(row.system), *row.episode.split("/", 1), row.difficulty),
-            [row.outcomes.get(condition, "") for condition in conditions],
-            row.flips,
-            [row.videos.get(condition, "") for condition in conditions],
-        ]
-        for row in rows
+def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
+    """Return what came of each episode as JSON that is safe inside a script element.
+
+    A row for each system and episode: simulator, system, family, the rest of the id, difficulty,
+    the outcome under each condition, where it flips, and the address of a video, from the page's
+    folder, under each.
+    """
+    videos = _videos(score.rows)
+    rows = []
+    for cube in score.cubes.values():
+        names = [one.name for one in cube.conditions]
+        at = [names.index(one) if one in names else None for one in conditions]
+        for place, system in enumerate(cube.systems):
+            counts = cube.counts[place].transpose(1, 0, 2).tolist()
+            rates = success(cube.status[place]).T.tolist()
+            for number in np.flatnonzero(cube.there[place]).tolist():
+                episode, hard = cube.episodes[number], int(cube.difficulty[number])
+                found = [videos.get((cube.simulator, system, c, str(episode))) for c in conditions]
+                row = (
+                    *(cube.simulator, display_name(system), episode.family),
+                    *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
+                    ["" if one is None else _outcome(counts[number][one]) for one in at],
+                    flips(cube.conditions, rates[number]),
+                    ["" if one is None else _address(one, folder) for one in found],
+                )
+                rows.append(row)
+    text = json.dumps(rows, ensure_ascii=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _address(video: Path, folder: Path) -> str:
+    return quote(Path(os.path.relpath(video, folder)).as_posix())
+
+
+def flips(conditions: Sequence[Condition], rates: Sequence[float]) -> str:
+    """Return where an outcome changes between conditions of a kind, as `k3 lost, k7 gained`.
+
+    Args:
+        conditions: In the order of tables; `no-history`, which is no smaller k, is left out.
+        rates: Mean success under each; NaN, which is left out, where nothing counts.
+    """
+    known = [
+        (condition, rate)
+        for condition, rate in zip(conditions, rates, strict=True)
+        if condition.name != NO_HISTORY and not math.isnan(rate)
     ]
-    text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
-    return {"json": text, "total": sum(len(one.episodes) for one in score.outcomes)}
+    return ", ".join(
+        f"{condition} {'gained' if rate > before else 'lost'}"
+        for (last, before), (condition, rate) in pairwise(known)
+        if rate != before and last.kind == condition.kind
+    )
 
 
-@dataclass(frozen=True)
-class _Fact:
-    """Something about how a score or a run was made; code may be copied, a line each."""
+def _outcome(counts: Sequence[int]) -> str:
+    if sum(counts) == 1:
+        return STATUSES[counts.index(1)]
+    won, *others, errors = counts
+    scored = won + sum(others)
+    return f"{won}/{scored}" if scored else "error" if errors else ""
 
-    name: str
-    lines: Sequence[str]
-    code: bool = False
+
+def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
+    """Return the videos that are there, by simulator, system, condition and episode.
+
+    Of repeats it is the one with the lowest model seed among those that have one.
+    """
+    chosen = rows.chosen(rows.places("video", [None]) < 0)
+    names = ("model_seed", "simulator", "system", "condition", "family", "episode_split", "episode")
+    columns = (chosen.list(name) for name in (*names, "video"))
+    found: dict[tuple[str, ...], Path] = {}
+    for _, *cell, family, split, index, video in sorted(zip(*columns, strict=True)):
+        key = (*cell, f"{family}/{split}/{index}")
+        if key not in found and video.is_file():
+            found[key] = video
+    return found
+
+
+# --- how it was made ---------------------------------------------------------------------------
 
 
 def _source(source: Source) -> dict[str, Any]:
-    facts = [_Fact("SHA-256", [sha256_file(source.path)])]
+    header = source.header or {}
+    facts = {"SHA-256": [sha256_file(source.path)]}
     for name in _RUN_FIELDS:
-        value = source.record.get(name)
-        if name == "command" and value:  # a list of command lines: a joined run has several
-            facts.append(_Fact(name, value, code=True))
+        value = header.get(name)
+        if name == "command" and isinstance(value, list):  # a joined run has several
+            facts[name] = value
         elif value not in (None, "", {}, []):
-            facts.append(_Fact(name, [_told(value)]))
+            facts[name] = [_told(value)]
     return {"path": str(source.path), "facts": facts}
 
 
@@ -192,23 +242,20 @@ def _told(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _facts(score: Score, command: str | None) -> list[_Fact]:
-    rollouts = score.rollouts
-    versions = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
+def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
+    rows, settings = score.rows, score.settings
+    libraries = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
+    call = {"command": command} if command else {"call": f"score({settings}, draws={score.draws})"}
+    seeds = rows.names("model_seed")
     told = {
-        "scored with": ", ".join([f"Python {platform.python_version()}", *versions]),
-        "rows": f"{len(rollouts.packed):,}",
-        "episodes of a complete cell": _GRIDS[score.grid],
+        **call,
+        "scored with": ", ".join([f"Python {platform.python_version()}", *libraries]),
+        "rows": f"{len(rows):,}",
+        "episodes of a complete cell": _GRIDS[settings.grid],
         "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
+        "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
+        **{f"revision of the split, {name}": rev for name, rev in sorted(rows.revisions.items())},
+        "note": " ".join(score.notes),
+        "bad rows left out": f"{rows.refused:,}: {'; '.join(rows.refusals)}" * bool(rows.refused),
     }
-    if len(rollouts.model_seeds) > 1:
-        told["model seeds"] = ", ".join(map(str, rollouts.model_seeds[:20]))
-    for simulator, revision in rollouts.revisions.items():
-        told[f"revision of the split, {simulator}"] = revision
-    if score.notes:
-        told["note"] = "; ".join(score.notes)
-    if rollouts.refused:
-        named = "; ".join(map(str, rollouts.refusals))
-        told["bad rows left out"] = f"{rollouts.refused:,}: {named}"
-    made = _Fact("command" if command else "call", [command or score.call], code=True)
-    return [made, *(_Fact(name, [text]) for name, text in told.items())]
+    return {name: [text] for name, text in told.items() if text}

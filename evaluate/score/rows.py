@@ -1,9 +1,8 @@
 """Rows of rollouts, checked: each by itself, and against those of the same episode or rollout."""
 
-import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -46,14 +45,22 @@ RELEASED_SIMULATOR = "robomme"
 _SHOWN = 10
 """So many bad rows are named; the others are counted."""
 
-_WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")
-_SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
-"""Names of files hold it, so no `/`. A simulator of one's own is `module:function` in rows."""
-
-_WORDS: dict[str, bool | None] = {"": None, "none": None, "nan": None}
-_WORDS |= dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 _EPISODE = ("simulator", "family", "episode_split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
+
+_NAMES = {"family": FAMILIES, "episode_split": SPLITS, "status": FINAL, "difficulty": DIFFICULTIES}
+_NUMBERS = {
+    **dict.fromkeys(("episode", "model_seed", "seed"), (0, 10**18 - 1)),  # as in episode ids
+    "steps": (0, MAX_STEPS),
+    "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION),
+}
+_WORDS = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
+_FRACTIONS = {name for name in COLUMNS if name.endswith("_fraction")}
+_OPTIONAL = {"seed", "difficulty", "steps", "success", "video", "retrieval_model", *_FRACTIONS}
+
+_WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # programs save some whole numbers as floats
+_SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
+"""Names of files hold it, so no `/`. A simulator of one's own is `module:function` in rows."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +69,7 @@ class Rows:
 
     Attributes:
         codes: Column to the place of each row's value in `values`, `(N,) int64`.
-        values: Column to its distinct values; None is an empty cell.
-        source: Place of each row's file in `sources`, `(N,) int64`.
+        values: Column to its distinct values; None is an empty cell. Videos are paths.
         sources: The files that were read.
         revisions: Simulator to the revision of its split, where rows name one.
         unpinned: Simulator and system of rows that name no revision, as released ones.
@@ -73,7 +79,6 @@ class Rows:
 
     codes: dict[str, Codes]
     values: dict[str, list[Any]]
-    source: Codes
     sources: tuple[Source, ...]
     revisions: dict[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
@@ -81,7 +86,7 @@ class Rows:
     refused: int = 0
 
     def __len__(self) -> int:
-        return len(self.source)
+        return len(self.codes["status"])
 
     def names(self, column: str) -> list[Any]:
         """Return the values of a column that occur, sorted."""
@@ -95,9 +100,8 @@ class Rows:
     def places(self, column: str, order: Sequence[Any]) -> Codes:
         """Return the place of each row's value among others, −1 for none, `(N,) int64`."""
         at = {value: place for place, value in enumerate(order)}
-        return np.array([at.get(one, -1) for one in self.values[column]], np.int64)[
-            self.codes[column]
-        ]
+        places = np.array([at.get(one, -1) for one in self.values[column]], np.int64)
+        return places[self.codes[column]]
 
     def numbers(self, column: str) -> Codes:
         """Return the number of each row, −1 for none, `(N,) int64`."""
@@ -106,8 +110,7 @@ class Rows:
 
     def chosen(self, rows: NDArray[Any]) -> "Rows":
         """Return some of the rows: their numbers, or a flag for each."""
-        codes = {name: found[rows] for name, found in self.codes.items()}
-        return replace(self, codes=codes, source=self.source[rows])
+        return replace(self, codes={name: codes[rows] for name, codes in self.codes.items()})
 
 
 def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = False) -> Rows:
@@ -126,50 +129,30 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
         InvalidIdError, UnknownNameError: `system` is no name of a system; see `name_system`.
         InvalidOptionError: Some rows of a system name the revision of their split, others none.
         MissingFileError: There is no such file.
-        FormatError: A file cannot be read, lacks columns, or has some of a type that does not fit.
+        FormatError: A file cannot be read, or lacks columns; see `sources.read_part`.
     """
     if system is not None:
         name_system(system)
-    sources = find_sources(paths)
     reader = _Reader(system)
-    for source in sources:
+    for source in find_sources(paths):
         reader.add(source, read_part(source, with_system=system is not None))
-    rows, refusals = reader.rows()
-    if refusals and not lenient:
-        more = len(refusals) - _SHOWN
-        shown = [*refusals[:_SHOWN], *([f"… and {more:,} more"] if more > 0 else [])]
-        raise BadRowsError(
-            "\n".join([f"{len(refusals):,} bad row{'s' * (len(refusals) > 1)}:", *shown]),
-            "Mend them, or leave them out with --lenient.",
-        )
-    shown = tuple(refusals[:_SHOWN])
-    unpinned = _unpinned(rows)
-    return replace(rows, unpinned=unpinned, refusals=shown, refused=len(refusals))
-
-
-def _unpinned(rows: Rows) -> frozenset[tuple[str, str]]:
-    """Return simulator and system of rows that name no revision.
-
-    Rows of one system whose histories may differ are not joined (protocol, rule 5).
-    """
-    named = rows.places("revision", [None]) < 0
-    names = [rows.values[column] for column in ("simulator", "system")]
-    sizes = (*map(len, names), 2)
-    codes = (rows.codes["simulator"], rows.codes["system"], named.astype(int))
-    pairs = np.unravel_index(np.unique(np.ravel_multi_index(codes, sizes)), sizes)
-    found = [
-        (names[0][one], names[1][other], known)
-        for one, other, known in zip(*(part.tolist() for part in pairs), strict=True)
-    ]
-    unpinned = {(one, other) for one, other, known in found if not known}
-    for one, other, known in sorted(found):
-        if known and (one, other) in unpinned:
+    rows = reader.checked()
+    if rows.refused and not lenient:
+        more = rows.refused - len(rows.refusals)
+        lines = [f"{rows.refused:,} bad row{'s' * (rows.refused > 1)}:", *rows.refusals]
+        lines += [f"… and {more:,} more"] if more else []
+        raise BadRowsError("\n".join(lines), "Mend them, or leave them out with --lenient.")
+    named = {*zip(*(rows.list(name) for name in ("simulator", "system", "revision")), strict=True)}
+    unpinned = frozenset((simulator, one) for simulator, one, revision in named if revision is None)
+    revisions = {simulator: revision for simulator, _, revision in named if revision is not None}
+    for simulator, one, revision in named:
+        if revision is not None and (simulator, one) in unpinned:  # protocol, rule 5
             raise InvalidOptionError(
-                f"some rows of {other} in {one} are of the split with revision "
-                f"{rows.revisions[one]}, others name no revision, as released rows do",
+                f"some rows of {one} in {simulator} are of the split with revision {revision}, "
+                "others name no revision, as released rows do",
                 "Their histories may differ: score the files apart, or compare them.",
             )
-    return frozenset(unpinned)
+    return replace(rows, revisions=revisions, unpinned=unpinned)
 
 
 class _Reader:
@@ -181,66 +164,62 @@ class _Reader:
             **{"model_seed": 0, "protocol_version": PROTOCOL_VERSION},
         }
         self._parts: list[tuple[Source, Part]] = []
-        self._codes: dict[str, list[Codes]] = {name: [] for name in COLUMNS}
-        self._places: dict[str, dict[Any, int]] = {name: {} for name in COLUMNS}
         self._starts = [0]  # of parts
+        self._codes: dict[str, list[Codes]] = {name: [np.zeros(0, np.int64)] for name in COLUMNS}
+        self._places: dict[str, dict[Any, int]] = {name: {} for name in COLUMNS}
         self._reasons: dict[int, str] = {}
 
     def add(self, source: Source, part: Part) -> None:
         """Take the rows of a file, and judge each value by itself."""
+        start = self._starts[-1]
+        self._reasons |= {start + row: reason for row, reason in part.malformed.items()}
         for name in COLUMNS:
-            places = self._places[name]
-            if name not in part.columns:
-                code = places.setdefault(self._default.get(name), len(places))
-                self._codes[name].append(np.full(part.count, code, np.int64))
-                continue
-            codes, values = part.columns[name]
+            default = np.zeros(len(part.lines), np.int64), [self._default.get(name)]
+            codes, values = part.columns.get(name, default)
             known, reasons = np.full(len(values), -1, np.int64), {}
             for code, value in enumerate(values):
                 try:
-                    parsed = _PARSERS[name](value)
-                    known[code] = places.setdefault(parsed, len(places))
+                    parsed = _parsed(name, value) if name in part.columns else value
+                    if name == "video" and parsed:  # of a file by itself nobody knows where it lies
+                        parsed = None if source.header is None else source.path.parent / parsed
+                    known[code] = self._places[name].setdefault(parsed, len(self._places[name]))
                 except InterferenceError as error:
                     reasons[code] = f"{error.message}. {error.hint or ''}".strip()
                 except ValueError as error:
                     reasons[code] = f"{name} {_shown(value)}; expected {error}"
             self._codes[name].append(known[codes])
             for row in np.flatnonzero(known[codes] < 0).tolist():
-                self._reasons.setdefault(self._starts[-1] + row, reasons[int(codes[row])])
+                self._reasons.setdefault(start + row, reasons[int(codes[row])])
         self._parts.append((source, part))
-        self._starts.append(self._starts[-1] + part.count)
+        self._starts.append(start + len(part.lines))
 
-    def rows(self) -> tuple[Rows, list[str]]:
+    def checked(self) -> Rows:
         """Return the rows that are sound, beside each other too, and what is against the others."""
-        empty = np.zeros(0, np.int64)
         rows = Rows(
-            {name: np.concatenate([empty, *found]) for name, found in self._codes.items()},
+            {name: np.concatenate(codes) for name, codes in self._codes.items()},
             {name: list(places) for name, places in self._places.items()},
-            np.repeat(np.arange(len(self._parts)), [part.count for _, part in self._parts]),
             tuple(source for source, _ in self._parts),
         )
         self._check_success(rows)
-        revisions = self._check_revisions(rows)
-        self._check_scenes(rows)
+        self._check_alike(rows, "revision", ("simulator",), "rows of different splits do not mix")
+        for name in ("difficulty", "seed"):
+            self._check_alike(rows, name, _EPISODE, "an episode has one")
         self._check_repeats(rows)
-        found = [(*self._where(row), reason) for row, reason in self._reasons.items()]
-        for number, (_, part) in enumerate(self._parts):
-            found += [(number, line, reason) for line, reason in part.malformed]
-        refusals = [
-            f"{self._parts[number][0].place(line)}: {reason}"
-            for number, line, reason in sorted(found)
-        ]
-        return replace(rows.chosen(self._sound(rows)), revisions=revisions), refusals
+        bad = sorted(self._reasons)
+        refusals = tuple(f"{self._place(row)}: {self._reasons[row]}" for row in bad[:_SHOWN])
+        return replace(rows.chosen(self._sound(rows)), refusals=refusals, refused=len(bad))
 
     def _sound(self, rows: Rows) -> Codes:
         sound = np.ones(len(rows), bool)
         sound[list(self._reasons)] = False
         return np.flatnonzero(sound)
 
-    def _where(self, row: int) -> tuple[int, int]:
-        """Return the file of a row by its number, and its line there."""
+    def _place(self, row: int) -> str:
+        """Return file and line of a row."""
         number = bisect_right(self._starts, row) - 1
-        return number, self._parts[number][1].line(row - self._starts[number])
+        source, part = self._parts[number]
+        what = "row" if source.path.suffix.lower() == ".parquet" else "line"
+        return f"{source.path}, {what} {part.lines[row - self._starts[number]]}"
 
     def _check_success(self, rows: Rows) -> None:
         sound = self._sound(rows)
@@ -253,36 +232,16 @@ class _Reader:
                 f"success {_shown(given[success[at]])} contradicts status {names[status[at]]!r}"
             )
 
-    def _check_revisions(self, rows: Rows) -> dict[str, str]:
-        """Return the one revision of each simulator: that of its first row."""
+    def _check_alike(self, rows: Rows, name: str, of: Sequence[str], why: str) -> None:
+        """Hold a value against that of the first row with the same values in other columns."""
+        values = rows.values[name]
         sound = self._sound(rows)
-        names, known = rows.values["revision"], {}
-        simulator, revision = (rows.codes[name][sound] for name in ("simulator", "revision"))
-        for code, name in enumerate(rows.values["simulator"]):
-            here = np.flatnonzero((simulator == code) & (revision != _code(names, None)))
-            if not len(here):
-                continue
-            known[name] = names[revision[here[0]]]
-            for at in here[revision[here] != revision[here[0]]].tolist():
-                self._reasons[int(sound[at])] = (
-                    f"revision {names[revision[at]]!r} beside {known[name]!r}: rows of different "
-                    "splits do not mix"
-                )
-        return dict(sorted(known.items()))
-
-    def _check_scenes(self, rows: Rows) -> None:
-        """Hold seed and difficulty against what the first row of the same episode says."""
-        for name in ("difficulty", "seed"):
-            sound, values = self._sound(rows), rows.values[name]
-            sound = sound[rows.codes[name][sound] != _code(values, None)]
-            codes = rows.codes[name][sound]
-            key = _joint(rows, _EPISODE, sound)
-            _, first, group = np.unique(key, return_index=True, return_inverse=True)
-            for at in np.flatnonzero(codes != codes[first][group]).tolist():
-                self._reasons[int(sound[at])] = (
-                    f"{name} {values[codes[at]]!r} differs from that of other rows of the same "
-                    "episode"
-                )
+        sound = sound[rows.places(name, [None])[sound] < 0]
+        codes = rows.codes[name][sound]
+        _, first, group = np.unique(_joint(rows, of, sound), return_index=True, return_inverse=True)
+        for at in np.flatnonzero(codes != codes[first][group]).tolist():
+            found, known = (values[code] for code in (codes[at], codes[first][group][at]))
+            self._reasons[int(sound[at])] = f"{name} {found!r} beside {known!r}: {why}"
 
     def _check_repeats(self, rows: Rows) -> None:
         """Leave one row of each rollout, and none where its rows contradict each other.
@@ -298,9 +257,8 @@ class _Reader:
         contradicted = np.isin(group, group[status[sound] != status[first]])
         other = np.where(begins, np.roll(sound, -1), first)
         for at in np.flatnonzero(~begins | contradicted).tolist():
-            number, line = self._where(int(other[at]))
             more = "; its rows contradict each other" if contradicted[at] else ""
-            place = self._parts[number][0].place(line)
+            place = self._place(int(other[at]))
             self._reasons[int(sound[at])] = f"the same rollout as {place}{more}"
 
 
@@ -310,114 +268,48 @@ def _joint(rows: Rows, columns: Sequence[str], chosen: Codes) -> Codes:
     return np.ravel_multi_index(tuple(rows.codes[name][chosen] for name in columns), sizes)
 
 
-def _code(values: Sequence[Any], value: Any) -> int:
-    return values.index(value) if value in values else -1
-
-
 # --- values ------------------------------------------------------------------------------------
 
 
-def _shown(value: Any) -> str:
-    return "(empty)" if value is None else repr(value)
+def _parsed(name: str, value: Any) -> Any:
+    """Return a value of a column as rows have it.
+
+    Raises:
+        InterferenceError, ValueError: It is none; the latter says what was expected.
+    """
+    text = "" if value is None or value != value else str(value)  # noqa: PLR0124 - NaN
+    if name in _OPTIONAL and text.lower() in ("", "nan", "none"):
+        return None
+    if name in _NUMBERS:
+        match = _WHOLE.fullmatch(text)
+        if not match or not _NUMBERS[name][0] <= int(match[1]) <= _NUMBERS[name][1]:
+            raise ValueError("a whole number from {} to {}".format(*_NUMBERS[name]))
+        return int(match[1])
+    if name in _NAMES:
+        # Released rows call a timeout what it is before the last step.
+        text = str(Status.TIMEOUT) if text == Status.ONGOING else text
+        if text not in _NAMES[name]:
+            raise InvalidOptionError.one_of(name, text, _NAMES[name])
+    elif name in _CHECKS:
+        _CHECKS[name](text)
+    elif name == "revision" and not text:
+        raise ValueError("the revision of a split")
+    elif name == "success":
+        if text.lower() not in _WORDS:
+            raise ValueError("1, 0, true, false or nothing")
+        return _WORDS[text.lower()]
+    return float(text) if name in _FRACTIONS else text
 
 
-def _simulator(value: Any) -> str:
-    name = str(value or "")
+def _check_simulator(name: str) -> None:
     if name not in SIMULATORS and name.lower() in SIMULATORS:
         raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
     if not _SIMULATOR.fullmatch(name):
         raise ValueError("up to 128 letters, digits, '.', '_', '-' and ':'")
-    return name
 
 
-def _named(column: str, known: Sequence[str], *, optional: bool = False) -> Callable[[Any], Any]:
-    def parse(value: Any) -> str | None:
-        if optional and not value:
-            return None
-        if value not in known:
-            raise InvalidOptionError.one_of(column, str(value or ""), known)
-        return str(value)
-
-    return parse
+_CHECKS = {"system": name_system, "condition": parse_condition, "simulator": _check_simulator}
 
 
-def _status(value: Any) -> str:
-    # The released rows call a timeout what it is before the last step.
-    return str(_named("status", FINAL)("timeout" if value == Status.ONGOING else value))
-
-
-def _success(value: Any) -> bool | None:
-    word = str(value).lower()
-    if word not in _WORDS:
-        raise ValueError("1, 0, true, false or nothing")
-    return _WORDS[word]
-
-
-def _revision(value: Any) -> str:
-    if not value:
-        raise ValueError("the revision of a split")
-    return str(value)
-
-
-def _protocol(value: Any) -> int:
-    if whole_number(value) != PROTOCOL_VERSION:
-        raise ValueError(PROTOCOL_VERSION)
-    return PROTOCOL_VERSION
-
-
-def _whole(most: int | None = None, *, optional: bool = False) -> Callable[[Any], Any]:
-    def parse(value: Any) -> int | None:
-        if optional and (value is None or value != value):  # noqa: PLR0124 - NaN
-            return None
-        number = whole_number(value)
-        if number is None or (most is not None and number > most):
-            raise ValueError("a whole number from 0" + (f" to {most}" if most else ""))
-        return number
-
-    return parse
-
-
-def whole_number(value: Any) -> int | None:
-    """Return a number of a column as an integer, None where it is no whole number from 0 to 10¹⁸.
-
-    Programs save whole numbers beside missing ones as floats, so `630000.0` is one.
-    """
-    if isinstance(value, str):
-        match = _WHOLE.fullmatch(value)
-        return int(match[1]) if match else None
-    if isinstance(value, bool) or value is None or not 0 <= value < 10**18 or value % 1 != 0:
-        return None
-    return int(value)
-
-
-def _fraction(value: Any) -> float | None:
-    try:
-        number = math.nan if value in (None, "") else float(value)
-    except ValueError:
-        raise ValueError("a number") from None
-    return None if math.isnan(number) else number
-
-
-def _text(value: Any) -> str | None:
-    return None if value is None else str(value)
-
-
-_PARSERS: dict[str, Callable[[Any], Any]] = {
-    **dict.fromkeys(COLUMNS, _fraction),
-    "system": lambda value: name_system(str(value or "")).name,
-    "simulator": _simulator,
-    "revision": _revision,
-    "family": _named("family", FAMILIES),
-    "condition": lambda value: parse_condition(str(value or "")).name,
-    "episode_split": _named("episode_split", SPLITS),
-    "episode": _whole(),
-    "model_seed": _whole(),
-    "protocol_version": _protocol,
-    "seed": _whole(optional=True),
-    "difficulty": _named("difficulty", DIFFICULTIES, optional=True),
-    "status": _status,
-    "success": _success,
-    "steps": _whole(MAX_STEPS, optional=True),
-    "video": _text,
-    "retrieval_model": _text,
-}
+def _shown(value: Any) -> str:
+    return "(empty)" if value is None else repr(value)

@@ -4,26 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import BadRowsError
-from robomme_interference_data.evaluate.score import Against, Grid, Settings
-from robomme_interference_data.evaluate.score.cells import (
-    Cell,
-    cells_of,
-    coverage_table,
-    main_grids,
-    rate_table,
-)
+from robomme_interference_data.evaluate.score import Against, Grid, Settings, cells, effects, paper
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
-from robomme_interference_data.evaluate.score.effects import (
-    Effects,
-    base_of,
-    contrast_table,
-    decay_table,
-    effects_of,
-    lift_table,
-    noise_table,
-)
-from robomme_interference_data.evaluate.score.paper import not_compared, paper_table
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.files import write_text
 from robomme_interference_data.stats import DRAWS
@@ -31,10 +15,7 @@ from robomme_interference_data.tables import Table
 
 __all__ = ["TABLES", "Score", "score", "write_score"]
 
-TABLES = (
-    *("main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage"),
-    "paper",
-)
+TABLES = ("main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage", "paper")
 """Every table that a score may have."""
 
 
@@ -48,10 +29,8 @@ class Score:
         rows: The rows.
         notes: What a reader must know, such as that two systems are not paired.
         cubes: What came of the rollouts, by simulator.
-        effects: Of each system in each simulator, in the order of tables.
-        cells: System × condition.
-        family_cells: The same by family.
-        difficulty_cells: The same by difficulty.
+        contrasts: Lifts and effects of all systems, in the order of tables.
+        cells: System × condition, over all episodes, by family and by difficulty.
         tables: All tables by name, the paper's main table aside.
         grids: The paper's main table of each simulator.
     """
@@ -61,10 +40,8 @@ class Score:
     rows: Rows
     notes: tuple[str, ...]
     cubes: Mapping[str, Cube]
-    effects: tuple[Effects, ...]
-    cells: Sequence[Cell]
-    family_cells: Sequence[Cell]
-    difficulty_cells: Sequence[Cell]
+    contrasts: Sequence[effects.Contrast]
+    cells: Sequence[cells.Cell]
     tables: Mapping[str, Table]
     grids: Sequence[Table]
 
@@ -89,45 +66,43 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             "Without any sound row there is nothing to score.",
         )
     cubes = cubes_of(rows, settings.grid)
-    effects, notes = [], []
+    contrasts, decays, notes = [], [], []
     for cube in cubes.values():
         for system in cube.systems:
-            base = base_of(system)
+            base = effects.base_of(system)
             if base not in cube.systems:
                 base = None
             elif reason := _apart(rows, cube.simulator, system, base or ""):
                 base, notes = None, [*notes, reason]
-            effects.append(effects_of(cube, system, base, draws))
-    cells, family_cells, difficulty_cells = (
-        cells_of(cubes.values(), part) for part in ("", "family", "difficulty")
-    )
+            found, decay = effects.effects_of(cube, system, base, draws)
+            contrasts += found
+            decays += [decay] if decay else []
+    every = cells.cells_of(cubes.values())
     tables = [
-        rate_table(cells, "main", "Success by system and condition"),
-        rate_table(family_cells, "family", "Success by family", "family"),
-        rate_table(difficulty_cells, "difficulty", "Success by difficulty", "difficulty"),
-        lift_table(effects),
-        contrast_table(effects),
-        decay_table(effects),
-        noise_table(cubes.values()),
-        coverage_table(cubes.values()),
+        cells.rate_table(every, "main", "Success by system and condition"),
+        cells.rate_table(every, "family", "Success by family", FAMILIES),
+        cells.rate_table(every, "difficulty", "Success by difficulty", DIFFICULTIES),
+        effects.lift_table(contrasts),
+        effects.contrast_table(contrasts),
+        effects.decay_table(decays),
+        effects.noise_table(cubes.values()),
+        cells.coverage_table(cubes.values()),
     ]
     if settings.against is Against.PAPER:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
-        whole = cells_of(cubes_of(rows, Grid.BENCHMARK).values())
-        tables.append(paper_table(whole))
-        notes += not_compared(whole)
+        whole = cells.cells_of(cubes_of(rows, Grid.BENCHMARK).values())
+        tables.append(paper.paper_table(whole))
+        notes += paper.not_compared(whole)
     return Score(
         settings,
         draws,
         rows,
         tuple(notes),
         cubes,
-        tuple(effects),
-        cells,
-        family_cells,
-        difficulty_cells,
+        contrasts,
+        every,
         {table.name: table for table in tables},
-        main_grids(cells),
+        cells.main_grids(every),
     )
 
 
@@ -168,30 +143,25 @@ def write_score(
         InvalidOptionError: The released layout cannot hold the rows (see `export`).
     """
     from robomme_interference_data.drawing import open_figure
-    from robomme_interference_data.evaluate.score.export import export
-    from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figures
-    from robomme_interference_data.evaluate.score.report import load_jinja2, write_report
+    from robomme_interference_data.evaluate.score import export, figures, report
 
     with open_figure():
-        load_jinja2()
-    exported = [] if export_to is None else export(score.rows, export_to)
-    for name in TABLES:
-        for suffix in (".csv", ".md"):
-            path = out / "tables" / (name + suffix)
-            if name not in score.tables:
-                path.unlink(missing_ok=True)
-            elif suffix == ".csv":
-                write_text(path, score.tables[name].csv())
-            else:
-                shown = score.grids if name == "main" else [score.tables[name]]
-                write_text(path, "\n".join(table.markdown() for table in shown))
-    figures = draw_figures(score, out / "figures")
-    for kind in FIGURES:
+        report.load_jinja2()
+    exported = [] if export_to is None else export.export(score.rows, export_to)
+    texts = {f"{name}.csv": table.csv() for name, table in score.tables.items()}
+    texts |= {f"{name}.md": table.markdown() for name, table in score.tables.items()}
+    texts["main.md"] = "\n".join(grid.markdown() for grid in score.grids)
+    for name, text in texts.items():
+        write_text(out / "tables" / name, text)
+    drawn = figures.draw_figures(score, out / "figures")
+    for name in {f"{table}{suffix}" for table in TABLES for suffix in (".csv", ".md")} - {*texts}:
+        (out / "tables" / name).unlink(missing_ok=True)
+    for kind in figures.FIGURES:
         for drawing in (out / "figures").glob(f"{kind}-*.svg"):
             # A score draws both: a lone file of such a name is somebody else's.
             picture = drawing.with_suffix(".png")
-            if drawing.stem not in figures and picture.exists():
+            if drawing.stem not in drawn and picture.exists():
                 picture.unlink()
                 drawing.unlink()
-    write_report(score, figures, out / "report.html", command)
+    report.write_report(score, drawn, out / "report.html", command)
     return exported

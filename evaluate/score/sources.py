@@ -1,24 +1,20 @@
 """Find files of rollout rows and read their columns, whatever wrote them; nothing is judged here.
 
-Columns come as codes and distinct values: pyarrow would import pandas, where that is installed,
-to make arrays of its own or to give them away, which takes seconds.
+Columns come as codes and distinct values: where pandas is installed, pyarrow would import it,
+which takes seconds, to make arrays of its own or to give them away as numpy's.
 """
 
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
@@ -29,7 +25,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.files import read_json
-from robomme_interference_data.parquet import reading
+from robomme_interference_data.parquet import open_parquet, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.rows import arrow_schema
 
@@ -37,21 +33,16 @@ __all__ = ["COLUMNS", "Codes", "Part", "Source", "find_sources", "read_part"]
 
 Codes = NDArray[np.int64]
 
-_SCHEMA = arrow_schema(Rollout)
+_KNOWN = arrow_schema(Rollout).names
 _NEEDED = ("family", "condition", "episode", "status", "success")
 _RUN_ONLY = {"split", "revision", "episode_split", "model_seed", "protocol_version"}
 """Key columns of a run's rows. The released layout is without them, and without `simulator`,
 which exported rows of other simulators have as one column more."""
-_FRACTIONS = tuple(name for name in _SCHEMA.names if name.endswith("_fraction"))
-COLUMNS = tuple(
-    name
-    for name in _SCHEMA.names
-    if name in {*KEY_COLUMNS, *_NEEDED, "seed", "difficulty", "steps", "video"} - {"split"}
-    or name in {"retrieval_model", *_FRACTIONS}
-)
-"""What scoring reads of a file, as far as it is there."""
-
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
+
+_READ = {*KEY_COLUMNS, *_NEEDED, "seed", "difficulty", "steps", "video", "retrieval_model"}
+COLUMNS = tuple(n for n in _KNOWN if n in _READ - {"split"} or n.endswith("_fraction"))
+"""What scoring reads of a file, as far as it is there."""
 
 
 @dataclass(frozen=True)
@@ -60,35 +51,27 @@ class Source:
 
     Attributes:
         path: The file: `.jsonl`, `.parquet` or `.csv`.
-        folder: The folder of its run; None for a file that was given by itself.
-        header: What `run.json` says about the run; empty without.
+        header: What `run.json` says about its run; None for a file that was given by itself.
     """
 
     path: Path
-    folder: Path | None
-    header: Mapping[str, Any]
-
-    def place(self, line: int) -> str:
-        """Return a place in the file in words."""
-        return f"{self.path}, {'row' if self.path.suffix.lower() == '.parquet' else 'line'} {line}"
+    header: Mapping[str, Any] | None
 
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of one file.
+    """The N rows of one file.
 
     Attributes:
-        columns: Of each column that is read and is there, under our name: the place of each row's
-            value among the distinct ones, `(N,) int64`, and these, None for an empty cell.
-        count: How many rows.
-        line: From the number of a row, from 0, to its line; in parquet to its row, from 1.
-        malformed: Line and reason of what is no row.
+        columns: Of each of `COLUMNS` that is there: the place of each row's value among the
+            distinct ones, `(N,) int64`, and these, None for an empty cell.
+        lines: Where each row begins; in parquet its number, from 1.
+        malformed: Number from 0, and reason, of what is no row.
     """
 
     columns: Mapping[str, tuple[Codes, Sequence[Any]]]
-    count: int
-    line: Callable[[int], int]
-    malformed: Sequence[tuple[int, str]] = ()
+    lines: Sequence[int]
+    malformed: Mapping[int, str] = field(default_factory=dict)
 
 
 def find_sources(paths: Sequence[Path]) -> list[Source]:
@@ -110,19 +93,17 @@ def find_sources(paths: Sequence[Path]) -> list[Source]:
 def _source(path: Path) -> Source:
     if path.is_dir():
         path = path / RUN_RECORD
-        if not path.is_file():
-            raise MissingFileError(
-                f"{path.parent} holds no {RUN_RECORD}", "Give the folder of a run, or a file."
-            )
-    elif not path.is_file():
-        raise MissingFileError(f"there is no file or folder {path}", "Check the path.")
+    if not path.is_file():
+        raise MissingFileError(
+            f"there is no file {path}", "Give folders of runs, or .csv, .parquet or .jsonl files."
+        )
     run = path.parent / RUN_HEADER
     if path.name not in (RUN_RECORD, *RUN_TABLES) or not run.is_file():
-        return Source(path, path.parent if path.name == RUN_RECORD else None, {})
+        return Source(path, None)
     header = read_json(run)
     if header.get("format_version") != FORMAT_VERSION:
         raise FormatError.version(run, header.get("format_version"), FORMAT_VERSION)
-    return Source(path, path.parent, header)
+    return Source(path, header)
 
 
 def read_part(source: Source, with_system: bool) -> Part:
@@ -133,34 +114,34 @@ def read_part(source: Source, with_system: bool) -> Part:
         with_system: Whether a name is at hand for rows that name no system.
 
     Raises:
-        FormatError: The file cannot be read, lacks columns, has one that reads like another or
-            two of one name, or one of a type that does not fit.
+        FormatError: The file cannot be read, lacks columns, or has one that reads like another,
+            two of one name, or one of nested values.
     """
-    readers = {".jsonl": _read_record, ".parquet": _read_parquet, ".csv": _read_csv}
-    reader = readers.get(source.path.suffix.lower())
-    if reader is None:
-        raise FormatError(
-            f"{source.path} is no {' or '.join(readers)} file",
-            "Give the folder of a run, or a file of rows.",
-        )
-    with reading(source.path):
-        return reader(source.path, with_system)
+    path = source.path
+    suffix = path.suffix.lower()
+    with reading(path):
+        if suffix == ".parquet":
+            return _read_parquet(path, with_system)
+        if suffix == ".csv":
+            return _read_lines(path, _csv_rows(path), with_system)
+        if suffix == ".jsonl":
+            return _read_lines(path, _record_rows(path), with_system)
+    raise FormatError(f"{path} is no .csv, .parquet or .jsonl file", "Give a file of rows.")
 
 
 def _match(path: Path, names: Sequence[str], with_system: bool) -> dict[str, str]:
     """Return which of our columns is which of the file's."""
     ours = {_ALIASES.get(name, name): name for name in names}
-    known = [*_SCHEMA.names, *_ALIASES]
     for name in names:
+        known = [*_KNOWN, *_ALIASES]
         near = [] if name in known else get_close_matches(name, known, n=1, cutoff=0.8)
         if near:
             raise FormatError(f"{path} has the column {name!r}", f"Did you mean {near[0]!r}?")
         if names.count(name) > 1:
             raise FormatError(f"{path} has two columns {name!r}", "Rename one of them.")
     ran = "simulator" in ours and not _RUN_ONLY.isdisjoint(ours)
-    needed = (*KEY_COLUMNS, *_NEEDED) if ran else _NEEDED
-    missing = [name for name in dict.fromkeys(needed) if name not in ours]
-    if missing:
+    needed = dict.fromkeys((*KEY_COLUMNS, *_NEEDED) if ran else _NEEDED)
+    if missing := [name for name in needed if name not in ours]:
         raise FormatError(
             f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(names)}",
             "Expected the rows of a run, or of the released CSVs (docs/score.md).",
@@ -174,144 +155,76 @@ def _match(path: Path, names: Sequence[str], with_system: bool) -> dict[str, str
     return {name: ours[name] for name in COLUMNS if name in ours}
 
 
-# --- parquet -----------------------------------------------------------------------------------
-
-
 def _read_parquet(path: Path, with_system: bool) -> Part:
-    with pq.ParquetFile(path) as file:
-        chosen = _match(path, file.schema_arrow.names, with_system)
-        for name, there in chosen.items():
-            _check_type(path, name, file.schema_arrow.field(there))
-        table = file.read(columns=list(chosen.values()))
-    columns = {name: _encoded(table[there]) for name, there in chosen.items()}
-    return Part(columns, len(table), lambda row: row + 1)
+    columns = {}
+    with open_parquet(path) as file:
+        for name, there in _match(path, file.schema_arrow.names, with_system).items():
+            column = file.read(columns=[there])[there]
+            kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+            if pa.types.is_nested(kind):
+                raise FormatError.damaged(path, f"the column {there!r} holds {kind}, no values")
+            kind = pa.string() if pa.types.is_null(kind) else kind
+            array = column.cast(kind).combine_chunks().dictionary_encode("encode")
+            codes = np.from_dlpack(array.indices).astype(np.int64)
+            columns[name] = codes, array.dictionary.to_pylist()
+        return Part(columns, range(1, file.metadata.num_rows + 1))
 
 
-def _check_type(path: Path, name: str, found: Any) -> None:
-    """Refuse a column that holds neither text nor what it should."""
-    kind, wanted = found.type, _SCHEMA.field(name).type
-    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
-    sound = kind in (pa.string(), pa.large_string(), pa.null())
-    expected = "text"
-    if not pa.types.is_string(wanted):
-        sound |= pa.types.is_integer(kind) or kind in (pa.float32(), pa.float64())
-        expected = "numbers"
-    if pa.types.is_boolean(wanted):
-        sound |= pa.types.is_boolean(kind)
-        expected = "true and false"
-    if not sound:
-        raise FormatError(
-            f"{path}: the column {found.name!r} holds {kind}; expected {expected}",
-            "Write the file again with plain values in that column.",
-        )
+def _read_lines(path: Path, rows: Iterator[tuple[int, Sequence[Any]]], with_system: bool) -> Part:
+    """Encode rows that come with the lines on which they begin; the first one names the columns."""
+    names = [str(name) for name in next(rows, (0, []))[1]]
+    chosen = {names.index(there): n for n, there in _match(path, names, with_system).items()}
+    codes: dict[int, list[int]] = {at: [] for at in chosen}
+    values: dict[int, dict[Any, int]] = {at: {} for at in chosen}
+    lines, malformed = [], {}
+    for line, found in rows:
+        row = found
+        if len(row) != len(names):
+            reason = f"the line has {len(row)} fields; expected {len(names)}"
+            malformed[len(lines)] = reason if row else "the line holds no row"
+            row = [None] * len(names)
+        lines.append(line)
+        for at, known in values.items():
+            codes[at].append(known.setdefault(row[at] or None, len(known)))
+    columns = {n: (np.array(codes[at], np.int64), list(values[at])) for at, n in chosen.items()}
+    return Part(columns, lines, malformed)
 
 
-def _encoded(column: Any) -> tuple[Codes, list[Any]]:
-    if pa.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)
-    if pa.types.is_null(column.type):
-        return np.zeros(len(column), np.int64), [None]
-    array = column.combine_chunks().dictionary_encode("encode")
-    return np.from_dlpack(array.indices).astype(np.int64), array.dictionary.to_pylist()
-
-
-# --- CSV ---------------------------------------------------------------------------------------
-
-
-def _read_csv(path: Path, with_system: bool) -> Part:
-    data = path.read_bytes()
+def _csv_rows(path: Path) -> Iterator[tuple[int, Sequence[Any]]]:
+    reader = csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline=""))
+    line = 1
     try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        # From a line with too few fields, pyarrow would show a traceback of its own.
-        raise FormatError.damaged(path, f"byte {error.start} is not UTF-8 text") from None
-    names = next(csv.reader(io.StringIO(text, newline="")), [])
-    chosen = _match(path, names, with_system) if names else {}
-    skipped: dict[int, str] = {}  # number of a record, the header is 1
-
-    def note(row: Any) -> str:
-        skipped[row.number] = (
-            f"the line has {row.actual_columns} fields; expected {row.expected_columns}"
-        )
-        return "skip"
-
-    table = pa_csv.read_csv(
-        pa.BufferReader(data),
-        read_options=pa_csv.ReadOptions(use_threads=False),  # else it says no numbers
-        parse_options=pa_csv.ParseOptions(
-            ignore_empty_lines=False, newlines_in_values=True, invalid_row_handler=note
-        ),
-        # Everything is text at first: what a number should be is judged row by row.
-        convert_options=pa_csv.ConvertOptions(
-            column_types=dict.fromkeys(chosen.values(), pa.string()),
-            include_columns=list(chosen.values()),
-            strings_can_be_null=True,
-            null_values=[""],
-        ),
-    )
-
-    @cache
-    def lines() -> list[int]:  # of all records, from the first after the header
-        return _lines(text)
-
-    @cache
-    def kept() -> list[int]:  # lines of those that are rows
-        return [line for number, line in enumerate(lines(), 2) if number not in skipped]
-
-    return Part(
-        {name: _encoded(table[there]) for name, there in chosen.items()},
-        len(table),
-        lambda row: kept()[row],
-        [(lines()[number - 2], reason) for number, reason in skipped.items()],
-    )
+        for row in reader:
+            yield line, row
+            line = reader.line_num + 1  # quoted text may hold line breaks
+    except csv.Error as error:
+        raise FormatError.damaged(path, f"line {line}: {error}") from None
 
 
-def _lines(text: str) -> list[int]:
-    """Return the line on which each record after the header begins: quoted text may hold lines."""
-    ends, reader = [], csv.reader(io.StringIO(text, newline=""))
-    with suppress(csv.Error):  # a cell longer than the module reads: what follows is uncertain
-        ends += [reader.line_num for _ in reader]
-    last = ends[-1] if ends else 1
-    return [end + 1 for end in ends] + list(range(last + 2, last + text.count("\n") + 3))
-
-
-# --- records of runs ---------------------------------------------------------------------------
-
-
-def _read_record(path: Path, with_system: bool) -> Part:
-    """Read a run's record: of a rollout that broke and was run again, the last row counts."""
-    rows: list[tuple[int, dict[str, Any]]] = []
-    latest: dict[tuple[Any, ...], int] = {}
-    malformed = []
+def _record_rows(path: Path) -> Iterator[tuple[int, Sequence[Any]]]:
+    """Yield the rows of a run's record, as text: of one that broke and ran again, the last."""
+    names = (*COLUMNS, "split")
+    rows: list[tuple[int, Sequence[Any]]] = []
+    broken: dict[tuple[Any, ...], int] = {}
     lines = path.read_bytes().split(b"\n")
     for line, data in enumerate(lines, 1):
         try:
-            row = json.loads(data)
+            value = json.loads(data)
         except (ValueError, RecursionError):
-            row = None
-        if not isinstance(row, dict):
-            if line < len(lines):  # a crash can leave a part of the last one
-                malformed.append((line, "the line is no row of a rollout"))
-            continue
-        row = {name: _plain(value) for name, value in row.items()}
-        key = tuple(row.get(name) for name in KEY_COLUMNS)
-        place = latest.get(key)
-        if place is not None and rows[place][1].get("status") == Status.ERROR:
-            rows[place] = (line, row)
-        else:
-            latest[key] = len(rows)
-            rows.append((line, row))
-    if not rows:
-        return Part({}, 0, int, malformed)
-    names = list(dict.fromkeys(name for _, row in rows for name in row))
-    columns = {}
-    for name, there in _match(path, names, with_system).items():
-        places: dict[Any, int] = {}  # True is 1 to a dict
-        found = [row.get(there) for _, row in rows]
-        codes = [places.setdefault((type(one), one), len(places)) for one in found]
-        columns[name] = np.array(codes, np.int64), [one for _, one in places]
-    return Part(columns, len(rows), lambda row: rows[row][0], malformed)
+            value = None
+        if isinstance(value, dict):
+            row = {name: _text(value.get(name)) for name in names}
+            key = tuple(row[name] for name in KEY_COLUMNS)
+            if key in broken:
+                rows[broken.pop(key)] = (0, ())
+            if row["status"] == Status.ERROR:
+                broken[key] = len(rows)
+            rows.append((line, tuple(row.values())))
+        elif line < len(lines):  # a crash can leave a part of the last one
+            rows.append((line, ()))
+    yield 0, names
+    yield from (row for row in rows if row[0])
 
 
-def _plain(value: Any) -> Any:
-    return repr(value) if isinstance(value, list | dict) else value
+def _text(value: Any) -> str | None:
+    return value if value is None or isinstance(value, str) else str(value).lower()
