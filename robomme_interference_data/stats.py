@@ -346,7 +346,7 @@ class Resampler:
 
 
 def _interval(statistic: Statistic, features: Floats, drawn: Floats) -> Interval:
-    every = np.ones(len(features))
+    every: Floats = np.ones(len(features))
     whole = every @ features
     value = float(statistic.of(whole[None])[0])
     drawn = drawn[np.isfinite(drawn)]

@@ -80,7 +80,8 @@ def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
     cells = []
     for cube in cubes:
         rates = success(cube.status)
-        every, unknown = np.ones(len(cube.episodes), bool), cube.difficulty < 0
+        every: Flags = np.ones(len(cube.episodes), bool)
+        unknown: Flags = cube.difficulty < 0
         parts = [("", every, every)]  # name, its episodes, and those that are expected in it
         parts += [(name, here, here) for name in FAMILIES if (here := cube.of_family(name)).any()]
         for place, name in enumerate(DIFFICULTIES):
@@ -95,7 +96,7 @@ def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
                     Cell(
                         cube.simulator,
                         cube.systems[s],
-                        cube.conditions[c].name,
+                        cube.conditions[c],
                         name,
                         len(known),
                         float(known.sum() / len(known)) if len(known) else math.nan,
@@ -133,7 +134,8 @@ def rate_table(cells: Iterable[Cell], name: str, title: str, parts: Sequence[str
         name,
         title,
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
-        "successes:count fails:count timeouts:count errors:count complete:flag missing:count rank:count",
+        "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
+        "rank:count",
         rows,
         _NOTE,
     )
@@ -196,7 +198,7 @@ def coverage_table(cubes: Iterable[Cube]) -> Table:
                 missing, other = cube.missing[s, c] & here, cube.other[s, c] & here
                 complete = n > 0 and not (missing | other).any()
                 lists = (_numbers(cube.episodes, flags) for flags in (missing, errors > 0, other))
-                own = (cube.simulator, cube.systems[s], cube.conditions[c].name, family)
+                own = (cube.simulator, cube.systems[s], cube.conditions[c], family)
                 rows.append((*own, due, n, int(errors.sum()), complete, *lists))
     return Table.of(
         "coverage",

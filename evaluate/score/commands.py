@@ -1,13 +1,12 @@
 """The commands `score` and `compare`."""
 
-import shlex
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.console import MESSAGES, AsJson, print_json
+from robomme_interference_data.console import MESSAGES, AsJson, command_line, print_json
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.settings import with_settings
 
@@ -42,12 +41,9 @@ def score(
     from robomme_interference_data.evaluate.score.scoring import write_score
 
     found = compute(settings)
-    _tell_refused(found.rows)
-    for note in found.notes:
-        MESSAGES.print(note)
+    _tell([found.rows], found.notes)
     with MESSAGES.status("Drawing the figures"):
-        command = shlex.join(["robomme-interference", *sys.argv[1:]])
-        exported = write_score(found, out, export_to, command)
+        exported = write_score(found, out, export_to, command_line())
     for path in exported:
         MESSAGES.print(f"{path} written")
     if as_json:
@@ -91,10 +87,7 @@ def compare(
     from robomme_interference_data.evaluate.score.compare import compare as compute
 
     found = compute(run_a, run_b, (system_a, system_b), lenient)
-    for rows in found.runs:
-        _tell_refused(rows)
-    for note in found.notes:
-        MESSAGES.print(note)
+    _tell(found.runs, found.notes)
     if as_json:
         bad = [rows.refused for rows in found.runs]
         print_json({"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()})
@@ -102,8 +95,11 @@ def compare(
         typer.echo(found.table.text())
 
 
-def _tell_refused(rows: "Rows") -> None:
-    for refusal in rows.refusals:
-        MESSAGES.print(f"left out: {refusal}")
-    if rows.refused:
-        MESSAGES.print(f"{rows.refused:,} bad rows left out")
+def _tell(found: "Sequence[Rows]", notes: Sequence[str]) -> None:
+    for rows in found:
+        for refusal in rows.refusals:
+            MESSAGES.print(f"left out: {refusal}")
+        if rows.refused:
+            MESSAGES.print(f"{rows.refused:,} bad rows left out")
+    for note in notes:
+        MESSAGES.print(note)

@@ -57,6 +57,7 @@ def compare(
         BadRowsError: Rows are bad.
     """
     one, other = (read_rows([p], s, lenient) for p, s in zip((first, second), systems, strict=True))
+    _check_scenes(one, other)
     sides = [list(_sides(rows)) for rows in (one, other)]
     met = list(_met(*sides))
     notes, own, found = list(_differing(one, other)), [], []
@@ -135,17 +136,25 @@ def _met(one: Sequence[_Side], other: Sequence[_Side]) -> Iterator[tuple[_Side, 
     for a in one:
         b = there.get((a.cube.simulator, partners.get(a.system, "")))
         if b is not None:
-            _check_scenes(a.cube, b.cube)
             yield a, b
 
 
-def _check_scenes(a: Cube, b: Cube) -> None:
+def _check_scenes(one: Rows, other: Rows) -> None:
     """Check that the two runs' scenes are the same: an episode's seed is one."""
-    seeds = dict(zip(b.episodes, b.seed.tolist(), strict=True))
-    for episode, seed in zip(a.episodes, a.seed.tolist(), strict=True):
-        if seed >= 0 and seeds.get(episode, -1) not in (-1, seed):
+    names = ("simulator", "family", "episode_split", "episode", "seed")
+    known, found = (
+        {
+            row[:-1]: row[-1]
+            for row in zip(*map(rows.list, names), strict=True)
+            if row[-1] is not None
+        }
+        for rows in (one, other)
+    )
+    for key, seed in known.items():
+        if found.get(key, seed) != seed:
             raise InvalidOptionError(
-                f"{episode} has the seed {seed} in one run and {seeds[episode]} in the other",
+                f"{'/'.join(map(str, key[1:]))} has the seed {seed} in one run and {found[key]} in "
+                "the other",
                 "Different scenes cannot be paired: compare runs over the same episodes.",
             )
 

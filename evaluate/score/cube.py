@@ -6,13 +6,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.conditions import (
-    DEFAULT_CONDITIONS,
-    NO_HISTORY,
-    Condition,
-    in_order,
-)
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, NO_HISTORY, in_order
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.systems import SYSTEMS
@@ -43,31 +38,28 @@ class Cube:
         model_seeds: Seeds that policies were given, ascending.
         status: Place in `STATUSES` of each rollout, −1 where there is none, `(S, C, E, M) int8`.
         difficulty: Place of each episode's in `DIFFICULTIES`, −1 unknown, `(E,) int64`.
-        seed: Seed of each episode's scene, −1 unknown, `(E,) int64`.
         expected: The episodes of a complete cell, `(E,) bool`.
         due: The cells that are expected or have rows, `(S, C) bool`.
     """
 
     simulator: str
     systems: tuple[str, ...]
-    conditions: tuple[Condition, ...]
+    conditions: tuple[str, ...]
     episodes: tuple[EpisodeId, ...]
     model_seeds: tuple[int, ...]
     status: Statuses
     difficulty: NDArray[np.int64]
-    seed: NDArray[np.int64]
     expected: Flags
     due: Flags
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
-        names = [one.name for one in self.conditions]
-        return self.systems.index(system), names.index(condition)
+        return self.systems.index(system), self.conditions.index(condition)
 
     def ran(self, system: str) -> list[str]:
         """Return the conditions under which a system has rows."""
         there = self.has_rows[self.systems.index(system)]
-        return [one.name for one, has in zip(self.conditions, there, strict=True) if has]
+        return [condition for condition, has in zip(self.conditions, there, strict=True) if has]
 
     def of_family(self, family: str) -> Flags:
         """Whether each episode is of a family, `(E,) bool`."""
@@ -94,15 +86,10 @@ class Cube:
         return np.asarray(counting(self.status).any(-1))
 
     @cached_property
-    def whole(self) -> Flags:
-        """Whether an episode counts with every model seed of its cell, `(S, C, E) bool`."""
-        seeds = (self.status >= 0).any(axis=2)
-        return self.counted & (counting(self.status).sum(-1) == seeds.sum(-1)[..., None])
-
-    @cached_property
     def missing(self) -> Flags:
-        """Expected episodes that do not count with every model seed, `(S, C, E) bool`."""
-        return self.expected & ~self.whole
+        """Expected episodes that do not count with every seed of the cell, `(S, C, E) bool`."""
+        seeds = (self.status >= 0).any(axis=2).sum(-1)[..., None]
+        return self.expected & (~self.counted | (counting(self.status).sum(-1) < seeds))
 
     @cached_property
     def other(self) -> Flags:
@@ -133,59 +120,41 @@ def success(status: Statuses) -> NDArray[np.float64]:
 def cubes_of(rows: Rows, grid: Grid) -> dict[str, Cube]:
     """Return simulator to the outcomes in it, by name, with the cells that are expected."""
     places = rows.places("simulator", names := rows.names("simulator"))
-    return {
-        name: _cube(rows.chosen(places == place), name, grid) for place, name in enumerate(names)
-    }
+    parts = [rows.chosen(places == place) for place in range(len(names))]
+    return {name: _cube(part, name, grid) for name, part in zip(names, parts, strict=True)}
 
 
 def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
-    systems = sorted(rows.names("system"), key=_table_order)
-    given = rows.names("condition")
+    systems = tuple(sorted(rows.names("system"), key=_table_order))
+    given, model_seeds = rows.names("condition"), tuple(rows.names("model_seed"))
     due = given if grid is Grid.GIVEN else DEFAULT_CONDITIONS
-    conditions = in_order({*given, *due})
-    model_seeds = sorted(rows.names("model_seed"))
-
-    # An episode is a number in the canonical order.
-    index = rows.numbers("episode")
-    width = max(int(index.max()) + 1, TEST_EPISODES)
-    group = rows.places("family", FAMILIES) * len(SPLITS) + rows.places("episode_split", SPLITS)
-    number = group * width + index
-    wanted = np.unique(number)
+    conditions = tuple(one.name for one in in_order({*given, *due}))
+    ids = list(zip(*map(rows.list, ("family", "episode_split", "episode")), strict=True))
+    wanted = {*ids}
     if grid is Grid.BENCHMARK:
-        group = np.arange(len(FAMILIES)) * len(SPLITS) + SPLITS.index("test")
-        wanted = (group[:, None] * width + np.arange(TEST_EPISODES)).ravel()
-    episodes = np.union1d(number, wanted)
-    at = np.searchsorted(episodes, number)
+        wanted = {(family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)}
+    episodes = sorted((EpisodeId(*one) for one in {*ids, *wanted}), key=lambda one: one.sort_key)
+    places = {(one.family, one.split, one.index): place for place, one in enumerate(episodes)}
+    at = np.array([places[one] for one in ids])
 
     shape = (len(systems), len(conditions), len(episodes), len(model_seeds))
-    status = np.full(shape, -1, np.int8)
-    names = [one.name for one in conditions]
-    axes = (rows.places("system", systems), rows.places("condition", names), at)
+    status, difficulty = np.full(shape, -1, np.int8), np.full(len(episodes), -1)
+    axes = (rows.places("system", systems), rows.places("condition", conditions), at)
     status[(*axes, rows.places("model_seed", model_seeds))] = rows.places("status", STATUSES)
-    known = {name: np.full(len(episodes), -1, np.int64) for name in ("difficulty", "seed")}
-    for name, found in (
-        ("difficulty", rows.places("difficulty", DIFFICULTIES)),
-        ("seed", rows.numbers("seed")),
-    ):
-        known[name][at[found >= 0]] = found[found >= 0]
-    applies = np.array([[_applies(s, c) and c in due for c in names] for s in systems])
+    found = rows.places("difficulty", DIFFICULTIES)
+    difficulty[at[found >= 0]] = found[found >= 0]
+    applies = np.array([[_applies(s, c) and c in due for c in conditions] for s in systems])
     return Cube(
         simulator,
-        tuple(systems),
+        systems,
         conditions,
-        tuple(_episode(one, width) for one in episodes.tolist()),
-        tuple(model_seeds),
+        tuple(episodes),
+        model_seeds,
         status,
-        **known,
-        expected=np.isin(episodes, wanted),
+        difficulty,
+        expected=np.array([key in wanted for key in places]),
         due=applies | (status >= 0).any(axis=(2, 3)),
     )
-
-
-def _episode(number: int, width: int) -> EpisodeId:
-    group, index = divmod(number, width)
-    family, split = divmod(group, len(SPLITS))
-    return EpisodeId(FAMILIES[family], SPLITS[split], index)
 
 
 def _table_order(system: str) -> tuple[int, str]:
@@ -194,7 +163,5 @@ def _table_order(system: str) -> tuple[int, str]:
 
 
 def _applies(system: str, condition: str) -> bool:
-    found = SYSTEMS.get(system)
-    if found is None:
-        return True
-    return found.no_history if condition == NO_HISTORY else found.with_history
+    known = SYSTEMS.get(system)
+    return known is None or (known.no_history if condition == NO_HISTORY else known.with_history)

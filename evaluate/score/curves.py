@@ -17,19 +17,8 @@ from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS
 
-__all__ = [
-    "Data",
-    "Look",
-    "curve",
-    "dodged",
-    "explained",
-    "label_ends",
-    "legend",
-    "looks_of",
-    "set_axes",
-    "short",
-    "spread",
-]
+__all__ = ["Data", "Look", "curve", "dodged", "explained", "label_ends", "legend", "looks_of"]
+__all__ += ["set_axes", "short", "spread"]
 
 # Okabe and Ito's colours, safe for the colour-blind: one for what the memory is made of.
 _COLOURS = {

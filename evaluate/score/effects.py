@@ -7,42 +7,20 @@ episode is what is drawn in the bootstrap.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from robomme_interference_data import stats
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair
 from robomme_interference_data.evaluate.systems import SYSTEMS
-from robomme_interference_data.stats import (
-    LEAST,
-    Floats,
-    Interval,
-    Resampler,
-    Statistic,
-    cohens_h,
-    difference,
-    enough,
-    holm,
-    retention,
-    slope,
-    slope_weights,
-    wilson,
-)
+from robomme_interference_data.stats import LEAST, Floats, Interval
 from robomme_interference_data.tables import Table
 
-__all__ = [
-    "START",
-    "SURE",
-    "Contrast",
-    "Decay",
-    "base_of",
-    "contrast_table",
-    "decay_table",
-    "effects_of",
-    "lift_table",
-    "noise_table",
-]
+__all__ = ["START", "SURE", "Contrast", "base_of", "contrast_table", "decay_table", "effects_of"]
+__all__ += ["lift_table", "noise_table"]
 
 START = "k0"
 """The condition that retention and contrasts begin at."""
@@ -79,27 +57,6 @@ class Contrast:
         return self.against[1] == NO_HISTORY != self.condition
 
 
-@dataclass(frozen=True)
-class Decay:
-    """Change of a system's rate with each doubling of the sessions in the buffer.
-
-    Attributes:
-        simulator: Name of the simulator.
-        system: Name of the system.
-        conditions: Those that it is computed from.
-        n: Episodes that count in all of them.
-        slope: With its interval, where at least ten episodes add to it (see `stats.enough`).
-        complete: Whether all these cells are complete.
-    """
-
-    simulator: str
-    system: str
-    conditions: tuple[str, ...]
-    n: int
-    slope: Interval
-    complete: bool
-
-
 def base_of(system: str) -> str | None:
     """Return the system without the retrieval step, None for one that has none."""
     if system not in SYSTEMS or not SYSTEMS[system].retrieval:
@@ -110,7 +67,7 @@ def base_of(system: str) -> str | None:
 
 def effects_of(
     cube: Cube, system: str, base: str | None, draws: int
-) -> tuple[list[Contrast], Decay | None]:
+) -> tuple[list[Contrast], list[tuple[Any, ...]]]:
     """Compare a system's conditions with each other, all intervals from the same draws.
 
     Each `k<n>` is compared with `no-history` and with k0, and under each condition a system with
@@ -124,7 +81,7 @@ def effects_of(
         draws: Bootstrap samples.
 
     Returns:
-        The comparisons, and the decay over all `k<n>`, None of fewer than two.
+        The comparisons, and the row of `decay_table`, if there are at least two `k<n>`.
     """
     own = cube.ran(system)
     cells = [(system, c) for c in own] + ([(base, c) for c in cube.ran(base)] if base else [])
@@ -144,16 +101,16 @@ def effects_of(
     ends = (at[floor], at[system, START]) if floor and starts else ()
     kept = {c: (*ends, at[system, c]) for c in ks if ends and c != START}
     falling = [at[system, c] for c in ks] if len(ks) > 1 else []
-    weights = slope_weights([parse_condition(c).k for c in ks]) if falling else np.zeros(0)
+    weights = stats.slope_weights([parse_condition(c).k for c in ks]) if falling else np.zeros(0)
 
-    statistics: list[Statistic] = [difference(*two) for two in places]
-    statistics += [retention(*three) for three in kept.values()]
-    statistics += [slope(falling, weights)] if falling else []
-    drawn = iter(Resampler(values, cube.simulator, draws).intervals(statistics))
+    statistics: list[stats.Statistic] = [stats.difference(*two) for two in places]
+    statistics += [stats.retention(*three) for three in kept.values()]
+    statistics += [stats.slope(falling, weights)] if falling else []
+    drawn = iter(stats.Resampler(values, cube.simulator, draws).intervals(statistics))
     tested = [pair(sides[one], sides[other], next(drawn)) for one, other in places]
     retained = {c: _retained(_together(values, three), next(drawn)) for c, three in kept.items()}
     # A lift that is not above zero beyond doubt is nothing to have a share of.
-    lift = dict(zip(compared, tested, strict=True)).get((START, floor))
+    lift = dict(zip(compared, tested, strict=True)).get((START, floor)) if floor else None
     if lift is None or not (lift.change.value > 0 and lift.p < SURE):
         retained = {}
     nothing = Interval(math.nan)
@@ -170,12 +127,12 @@ def effects_of(
         for (c, there), pairs, (one, other) in zip(compared, tested, places, strict=True)
     ]
     if not falling:
-        return contrasts, None
+        return contrasts, []
     changing = _together(values, falling)
     fall = next(drawn)
-    fall = fall if enough(changing @ weights) else Interval(fall.value)
+    fall = fall if stats.enough(changing @ weights) else Interval(fall.value)
     whole = all(complete[place] for place in falling)
-    return contrasts, Decay(cube.simulator, system, tuple(ks), len(changing), fall, whole)
+    return contrasts, [(cube.simulator, system, " ".join(ks), len(changing), *fall, whole)]
 
 
 def _together(values: Floats, places: Sequence[int]) -> Floats:
@@ -191,7 +148,7 @@ def _retained(values: Floats, drawn: Interval) -> Interval:
     nothing.
     """
     pairs = [values[:, i] - values[:, j] for i, j in ((1, 0), (2, 0), (2, 1))]
-    sound = all(map(enough, pairs)) and drawn.low < drawn.high
+    sound = all(map(stats.enough, pairs)) and drawn.low < drawn.high
     return drawn if sound else Interval(drawn.value)
 
 
@@ -207,7 +164,7 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
             *(c.pairs.n, c.pairs.second, c.pairs.first, *c.pairs.tested, p),
             *(*c.retention, c.complete),
         )
-        for c, p in zip(found, holm([one.pairs.p for one in found]), strict=True)
+        for c, p in zip(found, stats.holm([one.pairs.p for one in found]), strict=True)
     ]
     return Table.of(
         "lift",
@@ -231,9 +188,9 @@ def contrast_table(contrasts: Iterable[Contrast]) -> Table:
         (
             *(c.simulator, c.system, c.condition, *c.against),
             *(c.pairs.n, c.pairs.second, c.pairs.first, *c.pairs.tested, p),
-            *(cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
+            *(stats.cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
         )
-        for c, p in zip(found, holm([one.pairs.p for one in found]), strict=True)
+        for c, p in zip(found, stats.holm([one.pairs.p for one in found]), strict=True)
     ]
     return Table.of(
         "effects",
@@ -245,16 +202,13 @@ def contrast_table(contrasts: Iterable[Contrast]) -> Table:
     )
 
 
-def decay_table(decays: Iterable[Decay]) -> Table:
-    """Return each system's log-linear decay over the sessions in the buffer."""
+def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:
+    """Return each system's log-linear decay over the sessions in the buffer (see `effects_of`)."""
     return Table.of(
         "decay",
         "Decay over sessions",
         "simulator system conditions n:count slope:points low:points high:points complete:flag",
-        (
-            (one.simulator, one.system, " ".join(one.conditions), one.n, *one.slope, one.complete)
-            for one in decays
-        ),
+        rows,
         "slope: change of the success rate with each doubling of the sessions in the buffer, the "
         "lesson included: the least-squares line over log2(k + 1). 95% BCa bootstrap interval, "
         f"clustered by episode, where at least {LEAST} episodes add to the slope.",
@@ -273,8 +227,8 @@ def noise_table(cubes: Iterable[Cube]) -> Table:
             if pairs := int(repeated.sum()):
                 one, other = (((order == n) & (status == 0)).any(axis=-1) for n in (1, 2))
                 flips = int((one != other)[repeated].sum())
-                cell = (cube.simulator, cube.systems[s], cube.conditions[c].name)
-                rows.append((*cell, pairs, flips, flips / pairs, *wilson(flips, pairs)))
+                cell = (cube.simulator, cube.systems[s], cube.conditions[c])
+                rows.append((*cell, pairs, flips, flips / pairs, *stats.wilson(flips, pairs)))
     return Table.of(
         "noise",
         "Flips between repeats",

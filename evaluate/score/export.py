@@ -12,9 +12,11 @@ from robomme_interference_data.records import Status
 
 __all__ = ["RELEASED_COLUMNS", "export"]
 
-RELEASED_COLUMNS = ("family", "condition", "episode", "seed", "difficulty", "status", "success")
-RELEASED_COLUMNS += ("steps", "retrieval_model", "retrieval_selected_lesson_fraction")
-RELEASED_COLUMNS += ("retrieval_selected_filler_fraction", "retrieval_selected_query_fraction")
+RELEASED_COLUMNS = (
+    *("family", "condition", "episode", "seed", "difficulty", "status", "success", "steps"),
+    *("retrieval_model", "retrieval_selected_lesson_fraction"),
+    *("retrieval_selected_filler_fraction", "retrieval_selected_query_fraction"),
+)
 """The columns of the released retrieval rows, in their order. They name no system."""
 
 

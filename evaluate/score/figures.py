@@ -12,16 +12,8 @@ import numpy as np
 from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.drawing import GREY, INK, ink_on, open_figure, save_figure, tidy
-from robomme_interference_data.evaluate.score.curves import (
-    Data,
-    curve,
-    dodged,
-    explained,
-    label_ends,
-    legend,
-    set_axes,
-    short,
-)
+from robomme_interference_data.evaluate.score import curves
+from robomme_interference_data.evaluate.score.curves import Data, curve, explained, legend
 from robomme_interference_data.evaluate.score.effects import SURE, base_of
 from robomme_interference_data.evaluate.score.scoring import Score
 
@@ -80,7 +72,7 @@ def draw_figure(kind: str, figure: Any, data: Data) -> bool:
 
 def _success(figure: Any, data: Data) -> bool:
     few = len(data.systems) <= _FEW
-    shifts = dict(dodged([*data.systems, *data.absent]))
+    shifts = dict(curves.dodged([*data.systems, *data.absent]))
     figure.set_size_inches(7.5, 4.2 if few else 5.5)
     axes = figure.subplots()
     ends = [end for name in shifts for end in curve(axes, data, name, "", shifts[name])]
@@ -88,8 +80,8 @@ def _success(figure: Any, data: Data) -> bool:
     beside = data.beside if few else []
     for name in beside:
         curve(axes, data, name, "", shifts[name.removesuffix(", published")], bars=False)
-    set_axes(axes, data, [*shifts, *beside], "success, %")
-    label_ends(axes, ends, axes.get_ylim()[1] * (0.05 if few else 0.04))
+    curves.set_axes(axes, data, [*shifts, *beside], "success, %")
+    curves.label_ends(axes, ends, axes.get_ylim()[1] * (0.05 if few else 0.04))
     note = "published rates: in the table" if len(beside) < len(data.beside) else ""
     legend(figure, [], explained(data, [*shifts, *beside], [""], note))
     title = f"Success by condition, {data.simulator}, with 95% Wilson intervals"
@@ -142,13 +134,13 @@ def _panels(
     panels = figure.subplots(rows, wide, sharex=True, sharey=True, squeeze=False)
     bars = len(systems) <= _FEW
     for axes, part in zip(panels.flat, parts, strict=False):
-        for system, shift in dodged(systems):
+        for system, shift in curves.dodged(systems):
             curve(axes, data, system, part, shift, bars=bars)
         weight = "normal" if part else "bold"
         axes.set_title(part or "All families", size=9, color=INK, weight=weight)
     for number, axes in enumerate(panels.flat):
         if number < len(parts):
-            set_axes(axes, data, systems, "" if number % wide else "success, %")
+            curves.set_axes(axes, data, systems, "" if number % wide else "success, %")
         else:
             axes.set_axis_off()
     note = f"95% {'Wilson intervals' if bars else 'intervals: in the table'}"
@@ -213,7 +205,7 @@ def _heatmap(figure: Any, data: Data) -> bool:
                 ink = ink_on(to_hex(colours(cell.rate / highest if highest else 0.0)))
                 axes.text(x, y, text, ha="center", va="center", size=7, color=ink)
         axes.imshow(rates, cmap=colours, vmin=0, vmax=highest, aspect="auto")
-        axes.set_xticks(range(len(conditions)), [short(c) for c in conditions], size=7)
+        axes.set_xticks(range(len(conditions)), [curves.short(c) for c in conditions], size=7)
         axes.set_yticks(range(len(names)), names, size=7)
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)

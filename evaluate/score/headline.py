@@ -40,24 +40,24 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
     """Say what the best system reaches at k0 and how far it falls, or the best rate there is."""
     best = _best(complete, START) or _best(complete, _best(complete)[0].condition)
     leader, others = best[0], best[1:]
-    contrast = _last_contrast(score, leader) if leader.condition == START else None
-    if contrast is None:
+    own = (leader.simulator, leader.system, (leader.system, START))
+    falls = [c for c in score.contrasts if (c.simulator, c.system, c.against) == own and c.pairs.n]
+    if leader.condition != START or not falls:
         first = (
             f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} "
             f"episodes under {_named(leader.condition)} (95% interval {_interval(leader)})."
         )
         return [first, *_alike(others)]
-    sentences = [_from_start(leader, contrast), *_alike(others)]
-    if contrast.complete:
-        best = _best(complete, contrast.condition)
+    fall = max(falls, key=lambda one: parse_condition(one.condition).k)
+    sentences = [_from_start(leader, fall), *_alike(others)]
+    if fall.complete:
+        best = _best(complete, fall.condition)
         if all(cell.system != leader.system for cell in best):
-            sentences.append(
-                f"The highest rate at {contrast.condition} is {percent(best[0].rate)}, of "
-                f"{_listed(best)}."
-            )
+            rate = percent(best[0].rate)
+            sentences.append(f"The highest rate at {fall.condition} is {rate}, of {_listed(best)}.")
         else:
             sentences += _alike([cell for cell in best if cell.system != leader.system])
-    return sentences + _beside_base(score, contrast)
+    return sentences + _beside_base(score, fall)
 
 
 def _alike(others: Sequence[Cell]) -> list[str]:
@@ -105,27 +105,14 @@ def _from_start(leader: Cell, contrast: Contrast) -> str:
 
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     """Say how a system with retrieval stands to the published one without, if that is wanted."""
-    base = base_of(contrast.system)
-    known = {(o.simulator, o.system, o.condition): o for o in published()}
-    end = known.get((contrast.simulator, base or "", contrast.condition))
-    start = known.get((contrast.simulator, base or "", START))
-    if score.settings.against is not Against.PAPER or start is None or end is None:
+    own = (contrast.simulator, base_of(contrast.system))
+    rates = {one.condition: one.rate for one in published() if (one.simulator, one.system) == own}
+    if score.settings.against is not Against.PAPER or not {START, contrast.condition} <= {*rates}:
         return []
     return [
-        f"Without retrieval, {display_name(end.system)} falls from {percent(start.rate)} to "
-        f"{percent(end.rate)} (published)."
+        f"Without retrieval, {display_name(own[1] or '')} falls from {percent(rates[START])} to "
+        f"{percent(rates[contrast.condition])} (published)."
     ]
-
-
-def _last_contrast(score: Score, leader: Cell) -> Contrast | None:
-    found = [
-        one
-        for one in score.contrasts
-        if (one.simulator, one.system) == (leader.simulator, leader.system)
-        and one.against == (leader.system, START)
-        and one.pairs.n
-    ]
-    return max(found, key=lambda contrast: parse_condition(contrast.condition).k, default=None)
 
 
 def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:

@@ -87,15 +87,9 @@ def pair(
     found = np.flatnonzero(both.any(-1))
     seed = both[found].argmax(-1)
     before, after = (side[found, seed] == 0 for side in (first, second))
-    return Pairs(
-        len(values),
-        *(float(side.mean()) if len(values) else math.nan for side in values.T),
-        change=change,
-        interval=interval,
-        pairs=len(found),
-        gained=int((after & ~before).sum()),
-        lost=int((before & ~after).sum()),
-    )
+    rates = [float(side.mean()) if len(values) else math.nan for side in values.T]
+    gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
+    return Pairs(len(values), rates[0], rates[1], change, interval, len(found), gained, lost)
 
 
 def how_to_read(found: Iterable[Pairs]) -> str:

@@ -64,7 +64,8 @@ def published() -> tuple[Published, ...]:
     file = resources.files(__package__).joinpath("data", "published.csv")
     _, *rows = csv.reader(file.read_text(encoding="utf-8").splitlines())
     return tuple(
-        Published(int(table), *names, float(percent), int(n)) for table, *names, percent, n in rows
+        Published(int(table), simulator, system, condition, float(rate), int(n))
+        for table, simulator, system, condition, rate, n in rows
     )
 
 

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from robomme_interference_data.conditions import NO_HISTORY, Condition, in_order
+from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.score import Grid
@@ -23,18 +23,18 @@ from robomme_interference_data.evaluate.score.figures import FIGURES
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.sources import Source
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import sha256_file, write_text
-from robomme_interference_data.tables import Table
 
 __all__ = ["flips", "load_jinja2", "write_report"]
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 
-_RUN_FIELDS = ("status", "command", "identity", "split", "revision", "simulator", "system")
-_RUN_FIELDS += ("policy", "versions", "git", "machine", "planned", "counts")
+_RUN_FIELDS = (
+    *("status", "command", "identity", "split", "revision", "simulator", "system", "policy"),
+    *("versions", "git", "machine", "planned", "counts"),
+)
 """What is shown of a run's `run.json`, as far as it is there."""
 
 _GRIDS = {
@@ -62,15 +62,18 @@ def write_report(
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    conditions = [c.name for c in in_order({c for u in score.cubes.values() for c in u.conditions})]
+    cubes = score.cubes.values()
+    conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
     html = environment.from_string(template.read_text(encoding="utf-8")).render(
-        simulators=[{"name": s, "headline": headline(score, s)} for s in score.cubes],
-        grids=[_grid(grid) for grid in score.grids],
-        tables=[_table(table) for table in score.tables.values()],
-        figures=[_figure(name, path) for name, path in figures.items()],
+        headlines={simulator: headline(score, simulator) for simulator in score.cubes},
+        grids=score.grids,
+        tables=score.tables.values(),
+        display_name=display_name,
+        figures={name: _data(path) for name, path in figures.items()},
+        titles=FIGURES,
         conditions=conditions,
         episodes=_episodes(score, conditions, out.parent),
-        sources=[_source(source) for source in score.rows.sources],
+        sources={str(path): _source(path, run) for path, run in score.rows.sources.items()},
         facts=_facts(score, command),
     )
     write_text(out, html)
@@ -89,56 +92,8 @@ def load_jinja2() -> Any:
     return jinja2
 
 
-def _grid(grid: Table) -> dict[str, Any]:
-    """Return a main table: of each cell its text, and whether it is the best."""
-    rows = [
-        (system, [(text.replace("**", ""), text.startswith("**")) for text in shown])
-        for system, *shown in grid.rows
-    ]
-    heads = [column.name for column in grid.columns[1:]]
-    return {"simulator": grid.name, "conditions": heads, "rows": rows, "note": grid.note}
-
-
-def _table(table: Table) -> dict[str, Any]:
-    """Return what the page needs of a table: shown cells, and values to sort by."""
-    rows = []
-    for row in table.rows:
-        shown = table.cells(row)
-        for place, column in enumerate(table.columns):
-            if column.name.endswith("system") or column.name == "no_history_of":
-                shown[place] = display_name(row[place])
-            elif column.name == "complete" and not row[place]:
-                shown[place] += "†"
-        cells = [(text, _sortable(value)) for text, value in zip(shown, row, strict=True)]
-        rows.append({"cells": cells, "incomplete": any(text == "no†" for text in shown)})
-    return {
-        "name": table.name,
-        "title": table.title,
-        "note": table.note,
-        "columns": [
-            {"name": c.name.replace("_", " "), "number": c.kind not in ("text", "flag")}
-            for c in table.columns
-        ],
-        "rows": rows,
-    }
-
-
-def _sortable(value: Any) -> str | None:
-    """Return a number to sort by; None where the text itself is what sorts."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None if value is not None else ""
-    return "" if math.isnan(value) else repr(value)
-
-
-def _figure(name: str, path: Path) -> dict[str, str]:
-    kind, _, simulator = name.partition("-")
-    data = base64.b64encode(path.read_bytes()).decode()
-    return {
-        "name": name,
-        "title": f"{FIGURES[kind]}, {simulator}",
-        "note": "†: the cell is not complete." if kind == "heatmap" else "",
-        "source": f"data:image/svg+xml;base64,{data}",
-    }
+def _data(path: Path) -> str:
+    return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 # --- single episodes ---------------------------------------------------------------------------
@@ -154,8 +109,8 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     videos = _videos(score.rows)
     rows = []
     for cube in score.cubes.values():
-        names = [one.name for one in cube.conditions]
-        at = [names.index(one) if one in names else None for one in conditions]
+        known = cube.conditions
+        at = [known.index(one) if one in known else None for one in conditions]
         for place, system in enumerate(cube.systems):
             counts = cube.counts[place].transpose(1, 0, 2).tolist()
             rates = success(cube.status[place]).T.tolist()
@@ -178,22 +133,18 @@ def _address(video: Path, folder: Path) -> str:
     return quote(Path(os.path.relpath(video, folder)).as_posix())
 
 
-def flips(conditions: Sequence[Condition], rates: Sequence[float]) -> str:
+def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:
     """Return where an outcome changes between conditions of a kind, as `k3 lost, k7 gained`.
 
     Args:
-        conditions: In the order of tables; `no-history`, which is no smaller k, is left out.
+        conditions: In the order of tables.
         rates: Mean success under each; NaN, which is left out, where nothing counts.
     """
-    known = [
-        (condition, rate)
-        for condition, rate in zip(conditions, rates, strict=True)
-        if condition.name != NO_HISTORY and not math.isnan(rate)
-    ]
+    known = [(c, r) for c, r in zip(conditions, rates, strict=True) if not math.isnan(r)]
     return ", ".join(
         f"{condition} {'gained' if rate > before else 'lost'}"
         for (last, before), (condition, rate) in pairwise(known)
-        if rate != before and last.kind == condition.kind
+        if rate != before and parse_condition(last).kind == parse_condition(condition).kind
     )
 
 
@@ -224,16 +175,15 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
 # --- how it was made ---------------------------------------------------------------------------
 
 
-def _source(source: Source) -> dict[str, Any]:
-    header = source.header or {}
-    facts = {"SHA-256": [sha256_file(source.path)]}
+def _source(path: Path, run: Mapping[str, Any] | None) -> dict[str, list[str]]:
+    facts = {"SHA-256": [sha256_file(path)]}
     for name in _RUN_FIELDS:
-        value = header.get(name)
+        value = (run or {}).get(name)
         if name == "command" and isinstance(value, list):  # a joined run has several
             facts[name] = value
         elif value not in (None, "", {}, []):
             facts[name] = [_told(value)]
-    return {"path": str(source.path), "facts": facts}
+    return facts
 
 
 def _told(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 import re
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,6 @@ from robomme_interference_data.evaluate.score.sources import (
     COLUMNS,
     Codes,
     Part,
-    Source,
     find_sources,
     read_part,
 )
@@ -70,7 +69,7 @@ class Rows:
     Attributes:
         codes: Column to the place of each row's value in `values`, `(N,) int64`.
         values: Column to its distinct values; None is an empty cell. Videos are paths.
-        sources: The files that were read.
+        sources: The files that were read (see `sources.find_sources`).
         revisions: Simulator to the revision of its split, where rows name one.
         unpinned: Simulator and system of rows that name no revision, as released ones.
         refusals: The first bad rows that were left out: place and reason.
@@ -79,7 +78,7 @@ class Rows:
 
     codes: dict[str, Codes]
     values: dict[str, list[Any]]
-    sources: tuple[Source, ...]
+    sources: Mapping[Path, Mapping[str, Any] | None]
     revisions: dict[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
     refusals: tuple[str, ...] = ()
@@ -102,11 +101,6 @@ class Rows:
         at = {value: place for place, value in enumerate(order)}
         places = np.array([at.get(one, -1) for one in self.values[column]], np.int64)
         return places[self.codes[column]]
-
-    def numbers(self, column: str) -> Codes:
-        """Return the number of each row, −1 for none, `(N,) int64`."""
-        values = [-1 if one is None else one for one in self.values[column]]
-        return np.array(values, np.int64)[self.codes[column]]
 
     def chosen(self, rows: NDArray[Any]) -> "Rows":
         """Return some of the rows: their numbers, or a flag for each."""
@@ -133,9 +127,9 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     """
     if system is not None:
         name_system(system)
-    reader = _Reader(system)
-    for source in find_sources(paths):
-        reader.add(source, read_part(source, with_system=system is not None))
+    reader, sources = _Reader(system), find_sources(paths)
+    for path, header in sources.items():
+        reader.add(read_part(path, with_system=system is not None), in_run=header is not None)
     rows = reader.checked()
     if rows.refused and not lenient:
         more = rows.refused - len(rows.refusals)
@@ -152,7 +146,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
                 "others name no revision, as released rows do",
                 "Their histories may differ: score the files apart, or compare them.",
             )
-    return replace(rows, revisions=revisions, unpinned=unpinned)
+    return replace(rows, sources=sources, revisions=revisions, unpinned=unpinned)
 
 
 class _Reader:
@@ -163,13 +157,13 @@ class _Reader:
             **{"simulator": RELEASED_SIMULATOR, "system": system, "episode_split": "test"},
             **{"model_seed": 0, "protocol_version": PROTOCOL_VERSION},
         }
-        self._parts: list[tuple[Source, Part]] = []
+        self._parts: list[Part] = []
         self._starts = [0]  # of parts
         self._codes: dict[str, list[Codes]] = {name: [np.zeros(0, np.int64)] for name in COLUMNS}
         self._places: dict[str, dict[Any, int]] = {name: {} for name in COLUMNS}
         self._reasons: dict[int, str] = {}
 
-    def add(self, source: Source, part: Part) -> None:
+    def add(self, part: Part, in_run: bool) -> None:
         """Take the rows of a file, and judge each value by itself."""
         start = self._starts[-1]
         self._reasons |= {start + row: reason for row, reason in part.malformed.items()}
@@ -180,8 +174,8 @@ class _Reader:
             for code, value in enumerate(values):
                 try:
                     parsed = _parsed(name, value) if name in part.columns else value
-                    if name == "video" and parsed:  # of a file by itself nobody knows where it lies
-                        parsed = None if source.header is None else source.path.parent / parsed
+                    if name == "video" and parsed:  # its path is from the run's folder
+                        parsed = part.path.parent / parsed if in_run else None
                     known[code] = self._places[name].setdefault(parsed, len(self._places[name]))
                 except InterferenceError as error:
                     reasons[code] = f"{error.message}. {error.hint or ''}".strip()
@@ -190,7 +184,7 @@ class _Reader:
             self._codes[name].append(known[codes])
             for row in np.flatnonzero(known[codes] < 0).tolist():
                 self._reasons.setdefault(start + row, reasons[int(codes[row])])
-        self._parts.append((source, part))
+        self._parts.append(part)
         self._starts.append(start + len(part.lines))
 
     def checked(self) -> Rows:
@@ -198,7 +192,7 @@ class _Reader:
         rows = Rows(
             {name: np.concatenate(codes) for name, codes in self._codes.items()},
             {name: list(places) for name, places in self._places.items()},
-            tuple(source for source, _ in self._parts),
+            {},
         )
         self._check_success(rows)
         self._check_alike(rows, "revision", ("simulator",), "rows of different splits do not mix")
@@ -217,9 +211,8 @@ class _Reader:
     def _place(self, row: int) -> str:
         """Return file and line of a row."""
         number = bisect_right(self._starts, row) - 1
-        source, part = self._parts[number]
-        what = "row" if source.path.suffix.lower() == ".parquet" else "line"
-        return f"{source.path}, {what} {part.lines[row - self._starts[number]]}"
+        part, line = self._parts[number], self._parts[number].lines[row - self._starts[number]]
+        return f"{part.path}, {'row' if part.path.suffix.lower() == '.parquet' else 'line'} {line}"
 
     def _check_success(self, rows: Rows) -> None:
         sound = self._sound(rows)

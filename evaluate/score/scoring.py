@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import BadRowsError
@@ -66,7 +67,9 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             "Without any sound row there is nothing to score.",
         )
     cubes = cubes_of(rows, settings.grid)
-    contrasts, decays, notes = [], [], []
+    contrasts: list[effects.Contrast] = []
+    decays: list[tuple[Any, ...]] = []
+    notes: list[str] = []
     for cube in cubes.values():
         for system in cube.systems:
             base = effects.base_of(system)
@@ -76,7 +79,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
                 base, notes = None, [*notes, reason]
             found, decay = effects.effects_of(cube, system, base, draws)
             contrasts += found
-            decays += [decay] if decay else []
+            decays += decay
     every = cells.cells_of(cubes.values())
     tables = [
         cells.rate_table(every, "main", "Success by system and condition"),

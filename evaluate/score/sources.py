@@ -29,7 +29,7 @@ from robomme_interference_data.parquet import open_parquet, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.rows import arrow_schema
 
-__all__ = ["COLUMNS", "Codes", "Part", "Source", "find_sources", "read_part"]
+__all__ = ["COLUMNS", "Codes", "Part", "find_sources", "read_part"]
 
 Codes = NDArray[np.int64]
 
@@ -46,78 +46,63 @@ COLUMNS = tuple(n for n in _KNOWN if n in _READ - {"split"} or n.endswith("_frac
 
 
 @dataclass(frozen=True)
-class Source:
-    """One file of rows.
-
-    Attributes:
-        path: The file: `.jsonl`, `.parquet` or `.csv`.
-        header: What `run.json` says about its run; None for a file that was given by itself.
-    """
-
-    path: Path
-    header: Mapping[str, Any] | None
-
-
-@dataclass(frozen=True)
 class Part:
     """The N rows of one file.
 
     Attributes:
+        path: The file.
         columns: Of each of `COLUMNS` that is there: the place of each row's value among the
             distinct ones, `(N,) int64`, and these, None for an empty cell.
         lines: Where each row begins; in parquet its number, from 1.
         malformed: Number from 0, and reason, of what is no row.
     """
 
+    path: Path
     columns: Mapping[str, tuple[Codes, Sequence[Any]]]
     lines: Sequence[int]
     malformed: Mapping[int, str] = field(default_factory=dict)
 
 
-def find_sources(paths: Sequence[Path]) -> list[Source]:
+def find_sources(paths: Sequence[Path]) -> dict[Path, Mapping[str, Any] | None]:
     """Find the file of rows that each path stands for: of a run's folder it is the record.
+
+    Returns:
+        File to what `run.json` says about its run, None for a file that is of no run's folder.
 
     Raises:
         MissingFileError: There is no such file, or a folder holds no record.
         FormatError: A run has another format version.
         InvalidOptionError: A file is given twice.
     """
-    sources = [_source(path) for path in paths]
-    files = [source.path.resolve() for source in sources]
-    for place, source in enumerate(sources):
-        if files[place] in files[:place]:
-            raise InvalidOptionError(f"{source.path} is given twice", "Give each file once.")
-    return sources
+    found: dict[Path, Mapping[str, Any] | None] = {}
+    for given in paths:
+        path = given / RUN_RECORD if given.is_dir() else given
+        if not path.is_file():
+            raise MissingFileError(
+                f"there is no file {path}",
+                "Give folders of runs, or .csv, .parquet or .jsonl files.",
+            )
+        if any(path.samefile(other) for other in found):
+            raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
+        run, found[path] = path.parent / RUN_HEADER, None
+        if path.name in (RUN_RECORD, *RUN_TABLES) and run.is_file():
+            header = found[path] = read_json(run)
+            if header.get("format_version") != FORMAT_VERSION:
+                raise FormatError.version(run, header.get("format_version"), FORMAT_VERSION)
+    return found
 
 
-def _source(path: Path) -> Source:
-    if path.is_dir():
-        path = path / RUN_RECORD
-    if not path.is_file():
-        raise MissingFileError(
-            f"there is no file {path}", "Give folders of runs, or .csv, .parquet or .jsonl files."
-        )
-    run = path.parent / RUN_HEADER
-    if path.name not in (RUN_RECORD, *RUN_TABLES) or not run.is_file():
-        return Source(path, None)
-    header = read_json(run)
-    if header.get("format_version") != FORMAT_VERSION:
-        raise FormatError.version(run, header.get("format_version"), FORMAT_VERSION)
-    return Source(path, header)
-
-
-def read_part(source: Source, with_system: bool) -> Part:
+def read_part(path: Path, with_system: bool) -> Part:
     """Read the columns of a file that scoring asks for, as far as they are there.
 
     Args:
-        source: The file.
+        path: The file: `.jsonl`, `.parquet` or `.csv`.
         with_system: Whether a name is at hand for rows that name no system.
 
     Raises:
         FormatError: The file cannot be read, lacks columns, or has one that reads like another,
             two of one name, or one of nested values.
     """
-    path = source.path
     suffix = path.suffix.lower()
     with reading(path):
         if suffix == ".parquet":
@@ -167,7 +152,7 @@ def _read_parquet(path: Path, with_system: bool) -> Part:
             array = column.cast(kind).combine_chunks().dictionary_encode("encode")
             codes = np.from_dlpack(array.indices).astype(np.int64)
             columns[name] = codes, array.dictionary.to_pylist()
-        return Part(columns, range(1, file.metadata.num_rows + 1))
+        return Part(path, columns, range(1, file.metadata.num_rows + 1))
 
 
 def _read_lines(path: Path, rows: Iterator[tuple[int, Sequence[Any]]], with_system: bool) -> Part:
@@ -176,7 +161,8 @@ def _read_lines(path: Path, rows: Iterator[tuple[int, Sequence[Any]]], with_syst
     chosen = {names.index(there): n for n, there in _match(path, names, with_system).items()}
     codes: dict[int, list[int]] = {at: [] for at in chosen}
     values: dict[int, dict[Any, int]] = {at: {} for at in chosen}
-    lines, malformed = [], {}
+    lines: list[int] = []
+    malformed: dict[int, str] = {}
     for line, found in rows:
         row = found
         if len(row) != len(names):
@@ -187,7 +173,7 @@ def _read_lines(path: Path, rows: Iterator[tuple[int, Sequence[Any]]], with_syst
         for at, known in values.items():
             codes[at].append(known.setdefault(row[at] or None, len(known)))
     columns = {n: (np.array(codes[at], np.int64), list(values[at])) for at, n in chosen.items()}
-    return Part(columns, lines, malformed)
+    return Part(path, columns, lines, malformed)
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[int, Sequence[Any]]]:
