@@ -166,9 +166,8 @@ class _Reader:
     def add(self, part: Part, in_run: bool) -> None:
         """Take the rows of a file, and judge each value by itself."""
         start = self._starts[-1]
-        self._reasons |= {start + row: reason for row, reason in part.malformed.items()}
         for name in COLUMNS:
-            default = np.zeros(len(part.lines), np.int64), [self._default.get(name)]
+            default = np.zeros(part.count, np.int64), [self._default.get(name)]
             codes, values = part.columns.get(name, default)
             known, reasons = np.full(len(values), -1, np.int64), {}
             for code, value in enumerate(values):
@@ -185,7 +184,7 @@ class _Reader:
             for row in np.flatnonzero(known[codes] < 0).tolist():
                 self._reasons.setdefault(start + row, reasons[int(codes[row])])
         self._parts.append(part)
-        self._starts.append(start + len(part.lines))
+        self._starts.append(start + part.count)
 
     def checked(self) -> Rows:
         """Return the rows that are sound, beside each other too, and what is against the others."""
@@ -199,20 +198,26 @@ class _Reader:
         for name in ("difficulty", "seed"):
             self._check_alike(rows, name, _EPISODE, "an episode has one")
         self._check_repeats(rows)
-        bad = sorted(self._reasons)
-        refusals = tuple(f"{self._place(row)}: {self._reasons[row]}" for row in bad[:_SHOWN])
-        return replace(rows.chosen(self._sound(rows)), refusals=refusals, refused=len(bad))
+        found = [(*self._where(row), reason) for row, reason in self._reasons.items()]
+        for number, part in enumerate(self._parts):
+            found += [(number, line, reason) for line, reason in part.malformed]
+        refusals = [f"{self._place(n, line)}: {reason}" for n, line, reason in sorted(found)]
+        rows = rows.chosen(self._sound(rows))
+        return replace(rows, refusals=tuple(refusals[:_SHOWN]), refused=len(refusals))
 
     def _sound(self, rows: Rows) -> Codes:
         sound = np.ones(len(rows), bool)
         sound[list(self._reasons)] = False
         return np.flatnonzero(sound)
 
-    def _place(self, row: int) -> str:
-        """Return file and line of a row."""
+    def _where(self, row: int) -> tuple[int, int]:
+        """Return the number of a row's file, and its line there."""
         number = bisect_right(self._starts, row) - 1
-        part, line = self._parts[number], self._parts[number].lines[row - self._starts[number]]
-        return f"{part.path}, {'row' if part.path.suffix.lower() == '.parquet' else 'line'} {line}"
+        return number, self._parts[number].line(row - self._starts[number])
+
+    def _place(self, number: int, line: int) -> str:
+        path = self._parts[number].path
+        return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
 
     def _check_success(self, rows: Rows) -> None:
         sound = self._sound(rows)
@@ -251,7 +256,7 @@ class _Reader:
         other = np.where(begins, np.roll(sound, -1), first)
         for at in np.flatnonzero(~begins | contradicted).tolist():
             more = "; its rows contradict each other" if contradicted[at] else ""
-            place = self._place(int(other[at]))
+            place = self._place(*self._where(int(other[at])))
             self._reasons[int(sound[at])] = f"the same rollout as {place}{more}"
 
 

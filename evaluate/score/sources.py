@@ -4,17 +4,20 @@ Columns come as codes and distinct values: where pandas is installed, pyarrow wo
 which takes seconds, to make arrays of its own or to give them away as numpy's.
 """
 
+import codecs
 import csv
 import io
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pa_csv
+import pyarrow.json as pa_json
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
@@ -33,7 +36,7 @@ __all__ = ["COLUMNS", "Codes", "Part", "find_sources", "read_part"]
 
 Codes = NDArray[np.int64]
 
-_KNOWN = arrow_schema(Rollout).names
+_SCHEMA = arrow_schema(Rollout)
 _NEEDED = ("family", "condition", "episode", "status", "success")
 _RUN_ONLY = {"split", "revision", "episode_split", "model_seed", "protocol_version"}
 """Key columns of a run's rows. The released layout is without them, and without `simulator`,
@@ -41,7 +44,7 @@ which exported rows of other simulators have as one column more."""
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
 
 _READ = {*KEY_COLUMNS, *_NEEDED, "seed", "difficulty", "steps", "video", "retrieval_model"}
-COLUMNS = tuple(n for n in _KNOWN if n in _READ - {"split"} or n.endswith("_fraction"))
+COLUMNS = tuple(n for n in _SCHEMA.names if n in _READ - {"split"} or n.endswith("_fraction"))
 """What scoring reads of a file, as far as it is there."""
 
 
@@ -53,14 +56,17 @@ class Part:
         path: The file.
         columns: Of each of `COLUMNS` that is there: the place of each row's value among the
             distinct ones, `(N,) int64`, and these, None for an empty cell.
-        lines: Where each row begins; in parquet its number, from 1.
-        malformed: Number from 0, and reason, of what is no row.
+        count: How many rows.
+        line: From the number of a row, from 0, to the line on which it begins; in parquet to its
+            number from 1.
+        malformed: Line and reason of what is no row.
     """
 
     path: Path
     columns: Mapping[str, tuple[Codes, Sequence[Any]]]
-    lines: Sequence[int]
-    malformed: Mapping[int, str] = field(default_factory=dict)
+    count: int
+    line: Callable[[int], int]
+    malformed: Sequence[tuple[int, str]] = ()
 
 
 def find_sources(paths: Sequence[Path]) -> dict[Path, Mapping[str, Any] | None]:
@@ -103,22 +109,19 @@ def read_part(path: Path, with_system: bool) -> Part:
         FormatError: The file cannot be read, lacks columns, or has one that reads like another,
             two of one name, or one of nested values.
     """
-    suffix = path.suffix.lower()
+    readers = {".parquet": _read_parquet, ".csv": _read_csv, ".jsonl": _read_record}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise FormatError(f"{path} is no {' or '.join(readers)} file", "Give a file of rows.")
     with reading(path):
-        if suffix == ".parquet":
-            return _read_parquet(path, with_system)
-        if suffix == ".csv":
-            return _read_lines(path, _csv_rows(path), with_system)
-        if suffix == ".jsonl":
-            return _read_lines(path, _record_rows(path), with_system)
-    raise FormatError(f"{path} is no .csv, .parquet or .jsonl file", "Give a file of rows.")
+        return reader(path, with_system)
 
 
 def _match(path: Path, names: Sequence[str], with_system: bool) -> dict[str, str]:
     """Return which of our columns is which of the file's."""
     ours = {_ALIASES.get(name, name): name for name in names}
     for name in names:
-        known = [*_KNOWN, *_ALIASES]
+        known = [*_SCHEMA.names, *_ALIASES]
         near = [] if name in known else get_close_matches(name, known, n=1, cutoff=0.8)
         if near:
             raise FormatError(f"{path} has the column {name!r}", f"Did you mean {near[0]!r}?")
@@ -140,77 +143,81 @@ def _match(path: Path, names: Sequence[str], with_system: bool) -> dict[str, str
     return {name: ours[name] for name in COLUMNS if name in ours}
 
 
+def _encoded(path: Path, column: Any) -> tuple[Codes, Sequence[Any]]:
+    kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+    if pa.types.is_nested(kind):
+        raise FormatError.damaged(path, f"a column holds {kind}; expected text and numbers")
+    kind = pa.string() if pa.types.is_null(kind) else kind
+    array = column.cast(kind).combine_chunks().dictionary_encode("encode")
+    return np.from_dlpack(array.indices).astype(np.int64), array.dictionary.to_pylist()
+
+
 def _read_parquet(path: Path, with_system: bool) -> Part:
-    columns = {}
     with open_parquet(path) as file:
-        for name, there in _match(path, file.schema_arrow.names, with_system).items():
-            column = file.read(columns=[there])[there]
-            kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-            if pa.types.is_nested(kind):
-                raise FormatError.damaged(path, f"the column {there!r} holds {kind}, no values")
-            kind = pa.string() if pa.types.is_null(kind) else kind
-            array = column.cast(kind).combine_chunks().dictionary_encode("encode")
-            codes = np.from_dlpack(array.indices).astype(np.int64)
-            columns[name] = codes, array.dictionary.to_pylist()
-        return Part(path, columns, range(1, file.metadata.num_rows + 1))
+        chosen = _match(path, file.schema_arrow.names, with_system)
+        table = file.read(columns=list(chosen.values()))
+    columns = {name: _encoded(path, table[there]) for name, there in chosen.items()}
+    return Part(path, columns, len(table), lambda row: row + 1)
 
 
-def _read_lines(path: Path, rows: Iterator[tuple[int, Sequence[Any]]], with_system: bool) -> Part:
-    """Encode rows that come with the lines on which they begin; the first one names the columns."""
-    names = [str(name) for name in next(rows, (0, []))[1]]
-    chosen = {names.index(there): n for n, there in _match(path, names, with_system).items()}
-    codes: dict[int, list[int]] = {at: [] for at in chosen}
-    values: dict[int, dict[Any, int]] = {at: {} for at in chosen}
-    lines: list[int] = []
-    malformed: dict[int, str] = {}
-    for line, found in rows:
-        row = found
-        if len(row) != len(names):
-            reason = f"the line has {len(row)} fields; expected {len(names)}"
-            malformed[len(lines)] = reason if row else "the line holds no row"
-            row = [None] * len(names)
-        lines.append(line)
-        for at, known in values.items():
-            codes[at].append(known.setdefault(row[at] or None, len(known)))
-    columns = {n: (np.array(codes[at], np.int64), list(values[at])) for at, n in chosen.items()}
-    return Part(path, columns, lines, malformed)
+def _read_csv(path: Path, with_system: bool) -> Part:
+    data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    # Decoded here: of a byte that is no text pyarrow would show a traceback of its own.
+    text = data.decode()
+    csv.field_size_limit(len(data) + 1)
+    names = next(csv.reader(io.StringIO(text, newline="")), [])
+    chosen = _match(path, names, with_system)
+    ragged: dict[int, str] = {}  # by number of the record; the header is 1
+
+    def note(row: Any) -> str:
+        told = f"the line has {row.actual_columns} fields; expected {row.expected_columns}"
+        ragged[row.number] = told
+        return "skip"
+
+    table = pa_csv.read_csv(
+        pa.BufferReader(data),
+        read_options=pa_csv.ReadOptions(use_threads=False),  # else it tells no numbers
+        parse_options=pa_csv.ParseOptions(
+            ignore_empty_lines=False, newlines_in_values=True, invalid_row_handler=note
+        ),
+        # All as text: what a number should be is judged row by row.
+        convert_options=pa_csv.ConvertOptions(
+            column_types=dict.fromkeys(chosen.values(), pa.string()),
+            include_columns=list(chosen.values()),
+            strings_can_be_null=True,
+            null_values=[""],
+        ),
+    )
+
+    @cache
+    def lines() -> list[int]:  # on which records begin: quoted text may hold line breaks
+        reader = csv.reader(io.StringIO(text, newline=""))
+        return [1, *(reader.line_num + 1 for _ in reader)]
+
+    @cache
+    def kept() -> list[int]:
+        return [line for record, line in enumerate(lines(), 1) if record not in ragged][1:]
+
+    columns = {name: _encoded(path, table[there]) for name, there in chosen.items()}
+    malformed = [(lines()[record - 1], told) for record, told in ragged.items()]
+    return Part(path, columns, len(table), lambda row: kept()[row], malformed)
 
 
-def _csv_rows(path: Path) -> Iterator[tuple[int, Sequence[Any]]]:
-    reader = csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline=""))
-    line = 1
-    try:
-        for row in reader:
-            yield line, row
-            line = reader.line_num + 1  # quoted text may hold line breaks
-    except csv.Error as error:
-        raise FormatError.damaged(path, f"line {line}: {error}") from None
-
-
-def _record_rows(path: Path) -> Iterator[tuple[int, Sequence[Any]]]:
-    """Yield the rows of a run's record, as text: of one that broke and ran again, the last."""
-    names = (*COLUMNS, "split")
-    rows: list[tuple[int, Sequence[Any]]] = []
-    broken: dict[tuple[Any, ...], int] = {}
-    lines = path.read_bytes().split(b"\n")
-    for line, data in enumerate(lines, 1):
-        try:
-            value = json.loads(data)
-        except (ValueError, RecursionError):
-            value = None
-        if isinstance(value, dict):
-            row = {name: _text(value.get(name)) for name in names}
-            key = tuple(row[name] for name in KEY_COLUMNS)
-            if key in broken:
-                rows[broken.pop(key)] = (0, ())
-            if row["status"] == Status.ERROR:
-                broken[key] = len(rows)
-            rows.append((line, tuple(row.values())))
-        elif line < len(lines):  # a crash can leave a part of the last one
-            rows.append((line, ()))
-    yield 0, names
-    yield from (row for row in rows if row[0])
-
-
-def _text(value: Any) -> str | None:
-    return value if value is None or isinstance(value, str) else str(value).lower()
+def _read_record(path: Path, with_system: bool) -> Part:
+    """Read the record of a run: of a rollout that broke and ran again, the last row counts."""
+    whole, _, _ = path.read_bytes().rpartition(b"\n")  # a crash can leave a part of a line
+    if not whole:
+        return Part(path, {}, 0, int)
+    schema = pa.schema([_SCHEMA.field(name) for name in (*COLUMNS, "split")])
+    options = pa_json.ParseOptions(schema, unexpected_field_behavior="ignore")
+    table = pa_json.read_json(pa.BufferReader(whole), parse_options=options)
+    codes = {name: _encoded(path, table[name]) for name in schema.names}
+    sizes = [max(1, len(codes[name][1])) for name in KEY_COLUMNS]
+    key = np.ravel_multi_index([codes[name][0] for name in KEY_COLUMNS], sizes)
+    status, names = codes["status"]
+    _, last = np.unique(key[::-1], return_index=True)
+    kept = status != (names.index(Status.ERROR) if Status.ERROR in names else -1)
+    kept[len(key) - 1 - last] = True
+    rows = np.flatnonzero(kept)
+    columns = {name: (codes[name][0][rows], codes[name][1]) for name in COLUMNS}
+    return Part(path, columns, len(rows), lambda row: int(rows[row]) + 1)
