@@ -83,7 +83,8 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     for name in dataset.features:
         values = stats.get(name)
         try:
-            finite = all(np.isfinite(np.asarray(v, float)).all() for v in dict(values).values())
+            found = dict(values or {}).values()
+            finite = all(np.isfinite(np.asarray(one, float)).all() for one in found)
         except (TypeError, ValueError):
             finite = False
         if not values or not finite:
