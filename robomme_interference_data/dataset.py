@@ -219,5 +219,6 @@ class Dataset:
         name = camera_feature(camera)
         if name not in self.features:
             where = self.files.describe()
-            raise UnknownNameError.among("camera", camera, where, self.cameras)
+            plain = camera.removeprefix(CAMERA_PREFIX)
+            raise UnknownNameError.among("camera", plain, where, self.cameras)
         return name

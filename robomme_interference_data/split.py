@@ -146,9 +146,8 @@ class Split:
                 f"robomme-interference build manifests {self.root} --conditions "
                 f"{' '.join(self.conditions)} {wanted.name}",
             )
-        keys = self._keys
         same = pc.and_(
-            pc.equal(keys["episode_id"], str(episode)), pc.equal(keys["condition"], wanted.name)
+            self._matching("episode_id", str(episode)), self._matching("condition", wanted.name)
         )
         row = pc.index(same, True).as_py()
         if row < 0:
@@ -175,7 +174,7 @@ class Split:
         for column, value in (("family", family), ("condition", name), ("difficulty", difficulty)):
             if value is None:
                 continue
-            same = pc.equal(self._keys[column], value).fill_null(False).to_numpy()
+            same = self._matching(column, value).to_numpy()
             if not same.any():
                 known = pc.unique(self._keys[column]).drop_null().to_pylist()
                 raise UnknownNameError.among(column, value, self.root, known)
@@ -208,6 +207,11 @@ class Split:
             cache=self._cache,
             threads=self._threads,
         )
+
+    def _matching(self, column: str, value: str) -> pa.ChunkedArray:
+        """Return for each row whether a key column has a value."""
+        # A scalar of Arrow's own: of a plain value, Arrow asks pandas, which takes a second.
+        return pc.equal(self._keys[column], pa.scalar(value)).fill_null(False)
 
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self.episode_ids:
