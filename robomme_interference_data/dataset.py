@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
@@ -129,7 +130,7 @@ class Dataset:
             UnknownNameError: The dataset does not hold it; offers the nearest id.
         """
         column = self._column("episode_id")
-        found = pc.index(column, str(episode)).as_py()
+        found = pc.index(column, pa.scalar(str(episode))).as_py()
         if found < 0:
             where = f"the {self.kind} of {self.files.describe()}"
             raise UnknownNameError.among("episode", str(episode), where, column.to_pylist())

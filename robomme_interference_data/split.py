@@ -149,7 +149,7 @@ class Split:
         same = pc.and_(
             self._matching("episode_id", str(episode)), self._matching("condition", wanted.name)
         )
-        row = pc.index(same, True).as_py()
+        row = pc.index(same, pa.scalar(True)).as_py()
         if row < 0:
             self._check_episode(episode)
             path = self._rows.path
@@ -211,7 +211,7 @@ class Split:
     def _matching(self, column: str, value: str) -> pa.ChunkedArray:
         """Return for each row whether a key column has a value."""
         # A scalar of Arrow's own: of a plain value, Arrow asks pandas, which takes a second.
-        return pc.equal(self._keys[column], pa.scalar(value)).fill_null(False)
+        return pc.equal(self._keys[column], pa.scalar(value)).fill_null(pa.scalar(False))
 
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode in self.episode_ids:
