@@ -170,7 +170,7 @@ def test_loading_needs_light_libraries_only() -> None:
         "import sys\n"
         "from robomme_interference_data import load_buffer\n"
         f"buffer = load_buffer('MoveCube/test/0', 'k3', split={str(GOLDEN)!r}, verify=True)\n"
-        "print(len(buffer.frames()), sorted({'torch', 'lerobot', 'datasets', 'pandas', 'typer',"
+        "print(len(buffer.frames()), sorted({'torch', 'lerobot', 'datasets', 'typer',"
         " 'rich', 'scipy', 'matplotlib', 'sapien', 'h5py'} & sys.modules.keys()))"
     )
     done = subprocess.run(
