@@ -80,7 +80,6 @@ _KINDS = (
 KINDS: dict[str, Kind] = {kind.name: kind for kind in _KINDS}
 """All kinds by name, in the order of tables."""
 
-_RANK = {name: rank for rank, name in enumerate(KINDS)}
 _COUNTED = re.compile(r"(?:(?P<kind>[a-z]+)-)?k(?P<k>0|[1-9][0-9]?)")
 
 
@@ -109,7 +108,7 @@ class Condition:
     @property
     def sort_key(self) -> tuple[int, int]:
         """Key of the order in tables: by kind as registered, then by `k`."""
-        return _RANK[self.kind.name], self.k
+        return list(KINDS).index(self.kind.name), self.k
 
     def __str__(self) -> str:
         return self.name

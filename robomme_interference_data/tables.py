@@ -75,7 +75,8 @@ class Table:
         """Return the table as Markdown, under its title."""
         rule = ["---" if column.kind in ("text", "flag") else "---:" for column in self.columns]
         heads = [column.name.replace("_", " ") for column in self.columns]
-        lines = [heads, rule, *(self.cells(row) for row in self.rows)]
+        cells = ([cell.replace("|", "\\|") for cell in self.cells(row)] for row in self.rows)
+        lines = [heads, rule, *cells]
         text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
         return "\n\n".join(part for part in (f"# {self.title}", text, self.note) if part) + "\n"
 
@@ -131,4 +132,4 @@ def _shown(value: Any, kind: Kind) -> str:
         "p": lambda v: "< 0.001" if v < 0.001 else f"{v:.3f}",
         "count": lambda v: f"{v:,}",
     }
-    return shapes.get(kind, lambda v: _plain(v, kind).replace("|", "\\|"))(value)
+    return shapes.get(kind, lambda v: _plain(v, kind))(value)

@@ -32,7 +32,10 @@ class Settings:
     """What is scored, and how."""
 
     rows: tuple[Path, ...] = setting(
-        name="-", metavar="ROWS…", help="Folders of runs, or CSV, parquet or jsonl files."
+        name="-",
+        whole=True,
+        metavar="ROWS…",
+        help="Folders of runs, or CSV, parquet or jsonl files.",
     )
     system: str | None = setting(None, help="Name of the system of rows that name none.")
     against: Against | None = setting(None, help="Put the published rates beside these.")

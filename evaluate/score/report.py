@@ -31,11 +31,9 @@ __all__ = ["flips", "load_jinja2", "write_report"]
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 
-_RUN_FIELDS = (
-    *("status", "command", "identity", "split", "revision", "simulator", "system", "policy"),
-    *("versions", "git", "machine", "planned", "counts"),
-)
-"""What is shown of a run's `run.json`, as far as it is there."""
+_RUN_FIELDS = ("status", "identity", "split", "planned", "counts", "merged")
+_START_FIELDS = ("policy", "versions", "git", "machine")
+"""What is shown of a run's `run.json`, and of the latest start in it, as far as it is there."""
 
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
@@ -176,14 +174,21 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
 
 
 def _source(path: Path, run: Mapping[str, Any] | None) -> dict[str, list[str]]:
-    facts = {"SHA-256": [sha256_file(path)]}
-    for name in _RUN_FIELDS:
-        value = (run or {}).get(name)
-        if name == "command" and isinstance(value, list):  # a joined run has several
-            facts[name] = value
-        elif value not in (None, "", {}, []):
-            facts[name] = [_told(value)]
-    return facts
+    header = run or {}
+    starts = [one for one in _listed(header.get("starts")) if isinstance(one, dict)]
+    commands = [line for one in starts for line in _listed(one.get("command"))]
+    told = {name: header.get(name) for name in _RUN_FIELDS}
+    told |= {name: one.get(name) for one in starts[-1:] for name in _START_FIELDS}
+    told = {name: value for name, value in told.items() if value not in (None, "", {}, [])}
+    return {
+        "SHA-256": [sha256_file(path)],
+        **({"command": [*dict.fromkeys(map(str, commands))]} if commands else {}),
+        **{name: [_told(value)] for name, value in told.items()},
+    }
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
 
 
 def _told(value: Any) -> str:

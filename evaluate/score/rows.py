@@ -47,7 +47,8 @@ _SHOWN = 10
 _EPISODE = ("simulator", "family", "episode_split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
 
-_NAMES = {"family": FAMILIES, "episode_split": SPLITS, "status": FINAL, "difficulty": DIFFICULTIES}
+_NAMES = {"family": FAMILIES, "episode_split": SPLITS, "difficulty": DIFFICULTIES}
+_NAMES["status"] = tuple(map(str, FINAL))
 _NUMBERS = {
     **dict.fromkeys(("episode", "model_seed", "seed"), (0, 10**18 - 1)),  # as in episode ids
     "steps": (0, MAX_STEPS),
@@ -224,7 +225,8 @@ class _Reader:
         names, given = rows.values["status"], rows.values["success"]
         status, success = (rows.codes[name][sound] for name in ("status", "success"))
         expected = [None if one == Status.ERROR else one == Status.SUCCESS for one in names]
-        fits = np.array([[one is other for other in given] for one in expected], bool)
+        fits = np.array([one is other for one in expected for other in given], bool)
+        fits = fits.reshape(len(names), len(given))
         for at in np.flatnonzero(~fits[status, success]).tolist():
             self._reasons[int(sound[at])] = (
                 f"success {_shown(given[success[at]])} contradicts status {names[status[at]]!r}"

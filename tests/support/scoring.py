@@ -1,27 +1,32 @@
 """Made-up rollout rows for the tests of scoring: few enough to be worked out by hand."""
 
 import csv
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import typer
 from typer.testing import CliRunner
 
-from robomme_interference_data.cli import app
-from robomme_interference_data.evaluate.rows import NO_HISTORY, ROLLOUT_SCHEMA, Rollout
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.evaluate.score import Against, Grid, Settings, commands
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.scoring import score as compute
+from robomme_interference_data.records import Rollout
+from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 BASE, RETRIEVAL, OWN = "perceptual-framesamp-modul", "retrieval-framesamp-modul", "my-memory"
 FAMILIES = ("MoveCube", "InsertPeg")
 EPISODES = 6
 REVISION = "ab" * 32
+SCHEMA = arrow_schema(Rollout)
 
-RELEASED = (
-    Path(__file__).parent.parent.parent / "shared" / "data" / "results" / "retrieval_rollouts.csv"
-)
+ROOT = Path(__file__).parent.parent.parent
+RELEASED = ROOT.parent / "shared" / "data" / "results" / "retrieval_rollouts.csv"
 needs_released = pytest.mark.skipif(not RELEASED.exists(), reason="the released rows are not here")
 
 # Outcomes of MoveCube 0-5, then InsertPeg 0-5: s success, f fail, t timeout, e error, - no row.
@@ -54,7 +59,7 @@ def row(system: str, condition: str, family: str, episode: int, letter: str) -> 
         model_seed=0,
         protocol_version=1,
         seed=1000 * FAMILIES.index(family) + episode,
-        difficulty=("easy", "medium", "hard")[episode // 2],
+        difficulty=("easy", "medium", "hard")[episode // 2 % 3],
         goal="do it",
         status=status,
         success=None if letter == "e" else letter == "s",
@@ -76,23 +81,47 @@ def rows() -> list[Rollout]:
     ]
 
 
+def cells(outcomes: Mapping[tuple[str, str], str], seed: int = 0) -> list[Rollout]:
+    """Rows of MoveCube by system and condition: an episode a letter."""
+    return [
+        replace(row(system, condition, "MoveCube", place, letter), model_seed=seed)
+        for (system, condition), letters in outcomes.items()
+        for place, letter in enumerate(letters)
+        if letter != "-"
+    ]
+
+
 def repeat(given: Iterable[Rollout], seed: int) -> list[Rollout]:
     """The same rollouts with another model seed."""
     return [replace(one, model_seed=seed) for one in given]
 
 
+def changed(given: Iterable[Rollout], **values: Any) -> list[Rollout]:
+    """The same rollouts with other values."""
+    return [replace(one, **values) for one in given]
+
+
 def write_csv(path: Path, given: Sequence[Rollout]) -> Path:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(ROLLOUT_SCHEMA.names)
+        writer.writerow(SCHEMA.names)
         for one in given:
-            writer.writerow(["" if v is None else v for v in one.as_dict().values()])
+            writer.writerow(["" if v is None else v for v in to_dict(one).values()])
     return path
 
 
 def write_parquet(path: Path, given: Sequence[Rollout]) -> Path:
-    pq.write_table(pa.Table.from_pylist([r.as_dict() for r in given], ROLLOUT_SCHEMA), path)
+    pq.write_table(to_table(given, SCHEMA), path)
     return path
+
+
+def write_run(folder: Path, given: Sequence[Rollout], **header: Any) -> Path:
+    """A run's folder, as far as scoring looks at it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [json.dumps(to_dict(one)) + "\n" for one in given]
+    (folder / "rollouts.jsonl").write_text("".join(lines), encoding="utf-8")
+    (folder / "run.json").write_text(json.dumps({"format_version": 1, **header}))
+    return folder
 
 
 def released(path: Path, lines: Sequence[str]) -> Path:
@@ -102,6 +131,32 @@ def released(path: Path, lines: Sequence[str]) -> Path:
     return path
 
 
+def score(
+    *paths: Path, grid: Grid = Grid.GIVEN, paper: bool = False, draws: int = 200, **options: Any
+) -> Score:
+    """Score rows; by their own grid and with few draws, unless it is said otherwise."""
+    against = Against.PAPER if paper else None
+    return compute(Settings(paths, grid=grid, against=against, **options), draws)
+
+
+def records(found: Score, table: str, **equal: Any) -> list[dict[str, Any]]:
+    """The rows of a table with given values."""
+    return [
+        record
+        for record in found.tables[table].records()
+        if all(record[name] == value for name, value in equal.items())
+    ]
+
+
+def record(found: Score, table: str, **equal: Any) -> dict[str, Any]:
+    """The one row of a table with given values."""
+    (one,) = records(found, table, **equal)
+    return one
+
+
 def run(*arguments: str | Path) -> Any:
     """What the command line does, in this process."""
+    app = typer.Typer()
+    app.command()(commands.score)
+    app.command()(commands.compare)
     return CliRunner().invoke(app, list(map(str, arguments)))

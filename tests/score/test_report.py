@@ -1,27 +1,24 @@
-"""The report, opened and clicked in a browser; and the figures in it."""
+"""The report: what it says, and that it works in a browser."""
 
 import html
+import json
 import platform
 import re
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
-import score_rows as made
-from browser import open_page
+from support import scoring as made
+from support.browser import open_page
+from support.scoring import BASE, OWN, cells
 
-from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.evaluate.score.cells import main_markdown
-from robomme_interference_data.evaluate.score.episodes import episode_rows, flips
 from robomme_interference_data.evaluate.score.figures import draw_figures
-from robomme_interference_data.evaluate.score.grid import Grid
 from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.looks import looks_of, spread
-from robomme_interference_data.evaluate.score.report import write_report
-from robomme_interference_data.evaluate.score.scoring import Score, score
-from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
-from robomme_interference_data.files import sha256_file, write_json
+from robomme_interference_data.evaluate.score.report import flips, write_report
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.files import sha256_file
 
 VIDEO = "videos/MoveCube/k0 #0.mp4"
 
@@ -30,32 +27,28 @@ VIDEO = "videos/MoveCube/k0 #0.mp4"
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run, with one video that is there and one that is not."""
     folder = tmp_path_factory.mktemp("runs_with_a_name_that_no_browser_would_break") / "my run"
-    (folder / VIDEO).parent.mkdir(parents=True)
-    (folder / VIDEO).write_bytes(b"video")
     rows = made.rows()
-    place = next(i for i, r in enumerate(rows) if (r.system, r.condition) == (made.BASE, "k0"))
+    place = next(i for i, r in enumerate(rows) if (r.system, r.condition) == (BASE, "k0"))
     rows[place] = replace(rows[place], video=VIDEO)
     rows[place + 1] = replace(rows[place + 1], video="videos/gone.mp4")
-    made.write_parquet(folder / "rollouts.parquet", rows)
-    record = {
-        "format_version": 1,
-        "command": [
-            "robomme-interference evaluate --out 'my run' --shard 1/2",
-            "robomme-interference evaluate --out 'my run' --shard 2/2",
-        ],
-        "versions": {"python": "3.12.0", "numpy": "2.2.0"},
-        "split": "made-up",
-        "revision": made.REVISION,
-        "git": {"commit": "0" * 40, "dirty": False},
-        "policy": {"name": "<script>alert(1)</script>"},
-    }
-    write_json(folder / "run.json", record)
+    starts = [
+        {
+            "command": [f"robomme-interference evaluate --out 'my run' --shard {shard}/2"],
+            "versions": {"python": "3.12.0", "numpy": "2.2.0"},
+            "git": "0" * 40,
+            "policy": {"name": "<script>alert(1)</script>"},
+        }
+        for shard in (1, 2)
+    ]
+    made.write_run(folder, rows, split="made-up", status="complete", starts=starts)
+    (folder / VIDEO).parent.mkdir(parents=True)
+    (folder / VIDEO).write_bytes(b"video")
     return folder
 
 
 @pytest.fixture(scope="module")
 def small(run: Path) -> Score:
-    return score([run], grid=Grid.GIVEN, draws=500)
+    return made.score(run, draws=500)
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +58,14 @@ def report(small: Score, run: Path) -> Path:
     return out / "report.html"
 
 
+def episodes(found: Score, folder: Path) -> list[list[Any]]:
+    """The rows of single episodes in a page."""
+    write_report(found, {}, folder / "page.html")
+    text = (folder / "page.html").read_text(encoding="utf-8")
+    (data,) = re.findall(r'id="episode-data">(.*?)</script>', text, re.DOTALL)
+    return list(json.loads(data))
+
+
 def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
     with open_page() as page:
         page.open(report)
@@ -72,16 +73,13 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert page.requests() == [report.resolve().as_uri()]
         shown = page.run("document.querySelector('.headline').textContent")
         assert shown == headline(small, "tabletop")
-        grid = (
+        found = page.run(
             "[...document.querySelectorAll('#grid-tabletop tr')]"
             ".map(r => [...r.cells].map(c => c.textContent))"
         )
-        markdown = [line.strip("|").split("|") for line in main_markdown(small.cells).splitlines()]
-        expected = [[cell.strip(" *") for cell in line] for line in markdown if len(line) > 1]
-        found = page.run(grid)
         assert found[0] == ["tabletop", "no-history", "k0", "k1", "k3", "k7"]
-        assert [row[0] for row in found[1:]] == [row[0] for row in expected[2:]]
-        assert found[1][1] == "8.3% [1.5, 35.4] n=12"
+        expected = [[cell.replace("**", "") for cell in row] for row in small.grids[0].rows]
+        assert found[1:] == expected and found[1][1] == "8.3% [1.5, 35.4] n=12"
         images = "[...document.images].map(i => i.complete && i.naturalWidth > 100)"
         assert page.run(images) == [True] * 6
 
@@ -118,11 +116,10 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         page.click("#flipped")
         assert page.run(count) == 5 + 2
         page.type("#table-episodes input[type=search]", "Retrieval")
-        cells = (
+        rows = page.run(
             "[...document.querySelectorAll('#table-episodes tbody tr')].map("
             "r => [...r.cells].map(c => c.textContent))"
         )
-        rows = page.run(cells)
         assert [(row[2], row[3], row[-1]) for row in rows] == [
             ("InsertPeg", "test/1", "k7 gained"),
             ("InsertPeg", "test/2", "k7 lost"),
@@ -134,39 +131,32 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         # The one video that is there has a link that leads to it.
         page.run("document.querySelector('#table-episodes input[type=search]').select()")
         page.call("Input.insertText", text="framesamp-modul movecube")
-        links = (
+        ((text, address),) = page.run(
             "[...document.querySelectorAll('#table-episodes a')].map(a => [a.textContent, a.href])"
         )
-        ((text, address),) = page.run(links)
         assert text == "success"
         assert address == (report.parent.parent / "my run" / VIDEO).resolve().as_uri()
-        assert page.complaints() == []
 
-
-def test_the_report_fits_a_narrow_window(report: Path) -> None:
-    with open_page() as page:
-        page.call(
-            "Emulation.setDeviceMetricsOverride",
-            **{"width": 400, "height": 900, "deviceScaleFactor": 1, "mobile": True},
-        )
-        page.open(report)
+        # On a phone nothing sticks out.
+        size = {"width": 400, "height": 900, "deviceScaleFactor": 1, "mobile": True}
+        page.call("Emulation.setDeviceMetricsOverride", **size)
         assert page.run("document.documentElement.scrollWidth") == 400
+        assert page.complaints() == []
 
 
 def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
     text = report.read_text(encoding="utf-8")
     for shown in (
-        # One line for each shard of a joined run, to be copied as it was typed.
+        # One line for each start of the command, to be copied as it was typed.
         "<pre><code>robomme-interference evaluate --out 'my run' --shard 1/2</code></pre>"
         "<pre><code>robomme-interference evaluate --out 'my run' --shard 2/2</code></pre>",
         # From Python there is no command: the call stands in its place.
-        f"<pre><code>score([{str(run)!r}], system=None, lenient=False, grid='given', "
-        "against_paper=False, draws=500)</code></pre>",
+        f"<pre><code>score(Settings(rows=(PosixPath('{run}'),), ",
         "500 draws, seeded by the simulator",
         f"Python {platform.python_version()}, robomme-interference-data ",
         *(f"{name} {metadata.version(name)}" for name in ("numpy", "pyarrow", "matplotlib")),
         "numpy 2.2.0, python 3.12.0",
-        sha256_file(run / "rollouts.parquet"),
+        sha256_file(run / "rollouts.jsonl"),
         made.REVISION,
         "those that any of the given rows is of",
     ):
@@ -176,12 +166,10 @@ def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
 
 
 def test_the_report_and_figures_are_the_same_bytes_each_time(
-    report: Path, run: Path, tmp_path_factory: pytest.TempPathFactory
+    report: Path, run: Path, small: Score
 ) -> None:
-    again = score([run], grid=Grid.GIVEN, draws=500)
     out = run.parent / "again"
-    figures = draw_figures(again, out / "figures")
-    write_report(again, figures, out / "report.html")
+    write_report(small, draw_figures(small, out / "figures"), out / "report.html")
     assert (out / "report.html").read_bytes() == report.read_bytes()
     names = sorted(path.name for path in (report.parent / "figures").iterdir())
     assert names == sorted(path.name for path in (out / "figures").iterdir())
@@ -193,95 +181,50 @@ def test_the_report_and_figures_are_the_same_bytes_each_time(
         assert b"<dc:date>" not in one.read_bytes()
 
 
-def test_a_missing_library_names_the_line_to_type(
-    small: Score, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(
-        MissingExtraError, match=r'pip install "robomme-interference-data\[score\]"'
-    ):
-        write_report(small, {}, tmp_path / "report.html")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_where_episodes_flip() -> None:
+def test_where_episodes_flip(filler: None) -> None:
     nan = float("nan")
-    conditions = ["k0", "k1", "k3", "k7"]
-    assert flips(conditions, [1, 1, 0, 1]) == "k3 lost, k7 gained"
-    assert flips(conditions, [1, nan, 0, nan]) == "k3 lost"
-    assert flips(conditions, [0, 0, 0, 0]) == flips([], []) == flips(["k0"], [nan]) == ""
-    assert flips(conditions, [0.5, 1, 1, 0.5]) == "k1 gained, k7 lost"
+    conditions = ["no-history", "k0", "k1", "k3", "k7"]
+    assert flips(conditions, [0, 1, 1, 0, 1]) == "k3 lost, k7 gained"
+    assert flips(conditions, [nan, 1, nan, 0, nan]) == "k3 lost"
+    assert flips(conditions, [1, 0, 0, 0, 0]) == flips([], []) == flips(["k0"], [nan]) == ""
+    assert flips(conditions, [nan, 0.5, 1, 1, 0.5]) == "k1 gained, k7 lost"
+    assert flips(["k7", "filler-k0", "filler-k1"], [1, 0, 1]) == "filler-k1 gained"
 
 
-def test_episode_rows_show_every_outcome(tmp_path: Path) -> None:
+def test_episodes_show_every_outcome(tmp_path: Path) -> None:
     rows = made.rows()
-    rows += [
-        replace(r, model_seed=1, status="fail", success=False, error=None)
-        for r in rows
-        if r.condition == "k0"
+    again = made.repeat([r for r in rows if r.condition == "k0"], 1)
+    rows += made.changed(again, status="fail", success=False, error=None)
+    found = episodes(made.score(made.write_csv(tmp_path / "a.csv", rows)), tmp_path)
+    assert len(found) == 36
+    assert found[0] == [
+        *("tabletop", "FrameSamp-Modul", "MoveCube", "test/0", "easy"),
+        ["success", "1/2", "success", "success", "success"],
+        "k1 gained",
+        [""] * 5,
     ]
-    found = score([made.write_csv(tmp_path / "a.csv", rows)], grid=Grid.GIVEN, draws=10)
-    listed = list(episode_rows(found.outcomes, found.rollouts, tmp_path))
-    assert len(listed) == 36
-    first = listed[0]
-    assert (first.system, first.episode, first.difficulty) == (made.BASE, "MoveCube/test/0", "easy")
-    assert first.outcomes == {
-        "no-history": "success",
-        "k0": "1/2",
-        "k1": "success",
-        "k3": "success",
-        "k7": "success",
-    }
-    assert first.flips == "k1 gained"
-    own = {row.episode: row.outcomes for row in listed if row.system == made.OWN}
-    assert own["MoveCube/test/2"] == {"no-history": "fail", "k0": "0/1"}  # the other one broke
-    assert own["MoveCube/test/5"] == {"no-history": "fail"}
+    own = {row[3]: row[5] for row in found if row[1:3] == [OWN, "MoveCube"]}
+    assert own["test/2"] == ["fail", "0/1", "", "", ""]  # the other one broke
+    assert own["test/5"] == ["fail", "", "", "", ""]
 
 
 def test_each_rollout_has_its_video_whatever_seeds_others_have(tmp_path: Path) -> None:
-    first = next(r for r in made.rows() if (r.system, r.condition) == (made.BASE, "k0"))
     given = {  # run to rows of (episode, model seed, video)
         "a": [(0, 0, "a0.mp4")],
         "b": [(1, 5, "b1.mp4"), (2, 5, "gone.mp4"), (2, 7, "b2.mp4"), (2, 9, "b9.mp4")],
     }
+    (first,) = cells({(OWN, "k0"): "s"})
     for name, rollouts in given.items():
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "run.json").write_text('{"format_version": 1}')
         rows = [
             replace(first, episode=episode, seed=episode, model_seed=model, video=video)
             for episode, model, video in rollouts
         ]
-        made.write_parquet(tmp_path / name / "rollouts.parquet", rows)
+        made.write_run(tmp_path / name, rows)
         for _, _, video in rollouts:
             if video != "gone.mp4":
                 (tmp_path / name / video).touch()
-    found = score([tmp_path / "a", tmp_path / "b"], grid=Grid.GIVEN, draws=10)
-    listed = list(episode_rows(found.outcomes, found.rollouts, tmp_path))
-    assert [row.videos for row in listed] == [{"k0": f"{v}.mp4"} for v in ("a/a0", "b/b1", "b/b2")]
-
-
-def test_no_two_systems_of_the_paper_look_alike() -> None:
-    looks = looks_of([system.name for system in PAPER_SYSTEMS])
-    pictures = {(look.colour, look.marker, str(look.line)) for look in looks.values()}
-    assert len(pictures) == len(PAPER_SYSTEMS) == 13
-    # Told apart in grey, too, within a memory: by the marker.
-    assert len(looks_of(["one", "two", *SYSTEMS])) == len(SYSTEMS) + 2
-
-
-def test_several_systems_with_retrieval_are_stars_in_the_colours_of_their_bases() -> None:
-    memories = [f"replay-{memory}" for memory in ("full", "framesamp", "window")]
-    looks = looks_of([*memories, *(f"retrieval-{name}" for name in memories)])
-    assert len({(look.colour, look.marker, str(look.line)) for look in looks.values()}) == 6
-    for name in memories:
-        assert looks[f"retrieval-{name}"].colour == looks[name].colour
-        assert looks[f"retrieval-{name}"].marker == "*"
-    assert looks_of(["retrieval-replay-full"])["retrieval-replay-full"].colour == "#000000"
-
-
-def test_labels_are_moved_apart_by_as_little_as_need_be() -> None:
-    assert spread([1.0, 5.0, 9.0], 2.0) == [1.0, 5.0, 9.0]
-    # Two at 5 go to 4 and 6; the one at 7 then is too close: the three lie around their mean.
-    assert spread([5.0, 5.0, 7.0], 2.0) == pytest.approx([11 / 3, 17 / 3, 23 / 3])
-    assert spread([], 1.0) == []
+    found = episodes(made.score(tmp_path / "a", tmp_path / "b"), tmp_path)
+    assert [row[-1] for row in found] == [["a/a0.mp4"], ["b/b1.mp4"], ["b/b2.mp4"]]
+    # Of a file by itself nobody knows where its videos lie.
+    alone = made.write_csv(tmp_path / "a.csv", [replace(first, video="a0.mp4")])
+    assert episodes(made.score(alone), tmp_path)[0][-1] == [""]

@@ -10,46 +10,44 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data import bootstrap
-from robomme_interference_data.bootstrap import (
+from robomme_interference_data.stats import (
+    Z95,
+    Interval,
     Resampler,
     Statistic,
+    cohens_h,
     difference,
     enough,
-    mean,
-    retention,
-    slope,
-)
-from robomme_interference_data.evaluate.score.statistics import (
-    cohens_h,
-    flip_rate,
     holm,
     mcnemar,
+    mean,
+    newcombe,
+    newcombe_paired,
+    paired_interval,
+    retention,
+    slope,
     slope_weights,
+    wilson,
 )
-from robomme_interference_data.intervals import Z95, newcombe, wilson
+
+COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)
 
 
 def test_wilson_interval_by_hand() -> None:
-    # 8 of 10, z = 1.96: middle (0.8 + 1.9208/10)/1.38416 = 0.7167, half 0.2266
-    low, high = wilson(8, 10, z=1.96)
-    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
-    # 202 of 450, z² = 3.841459: (202 + 1.920729)/453.841459 = 0.449322, half
+    # 8 of 10, z² = 3.841459: (8 + 1.920729)/13.841459 = 0.716741, half
+    # 1.959964 · √(10 · 0.8 · 0.2 + 0.960365)/13.841459 = 0.226579
+    assert wilson(8, 10) == pytest.approx((0.490162, 0.943318), abs=1e-6)
+    # 202 of 450: (202 + 1.920729)/453.841459 = 0.449322, half
     # 1.959964 · √(450 · 0.448889 · 0.551111 + 0.960365)/453.841459 = 0.045761
-    low, high = wilson(202, 450)
-    assert (round(low, 6), round(high, 6)) == (0.403560, 0.495083)
+    assert wilson(202, 450) == pytest.approx((0.403560, 0.495083), abs=1e-6)
     assert wilson(0, 0) == (0.0, 1.0)
-    assert wilson(0, 50)[0] == 0.0
-    assert wilson(50, 50)[1] == 1.0
+    assert (wilson(0, 50)[0], wilson(50, 50)[1]) == (0.0, 1.0)
 
 
 @given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_wilson_is_scipys(counts: tuple[int, int]) -> None:
     expected = scipy.stats.binomtest(*counts).proportion_ci(0.95, method="wilson")
     assert wilson(*counts) == pytest.approx((expected.low, expected.high), abs=1e-12)
-
-
-def test_the_quantile() -> None:
     assert pytest.approx(scipy.stats.norm.ppf(0.975), abs=1e-15) == Z95
 
 
@@ -72,10 +70,68 @@ def test_newcombes_own_examples(
     assert newcombe(*counts) == pytest.approx(interval, abs=0.00006)
     a, n, b, m = counts
     assert newcombe(b, m, a, n) == pytest.approx((-interval[1], -interval[0]), abs=0.00006)
-
-
-def test_newcombe_without_trials_says_nothing() -> None:
     assert newcombe(0, 0, 3, 5) == newcombe(3, 5, 0, 0) == (-1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("counts", "interval"),
+    [
+        # p = 2/21 in (0.0265188, 0.2891414), q = 8/21 in (0.2075101, 0.5912135). A = 12 − 7 = 5 is
+        # under 21/2, so φ is 0: −6/21 − √(0.0687193² + 0.2102610²), −6/21 + √(0.1939033² +
+        # 0.1734423²).
+        ((1, 1, 7, 12), (-0.506920, -0.025559)),
+        # p = 32/50 in (0.5014102, 0.7586125), q = 22/50 in (0.3116220, 0.5769397). A = 320 − 24 =
+        # 296, less 25 is 271; φ = 271/√(32 · 18 · 22 · 28) = 0.4549542.
+        # 0.2 − √(0.1385898² − 2φ · 0.1385898 · 0.1369397 + 0.1369397²)
+        ((20, 12, 2, 16), (0.056156, 0.329207)),
+        # p = 48/50 in (0.8653991, 0.9889611), q = 38/50 in (0.6258732, 0.8570260). A = −24 stays;
+        # φ = −24/√(48 · 2 · 38 · 12) = −0.1147079.
+        ((36, 12, 2, 0), (0.056930, 0.340428)),
+        # All agree, half of them in success: A = 25, less 5 is 20, φ = 20/25. Both rates in
+        # (0.2365931, 0.7634069): ±0.2634069 · √(2 − 1.6)
+        ((5, 0, 0, 5), (-0.166593, 0.166593)),
+        # Both sides certain, without a correlation: low is 1 − √(0.6576198² + 0.6576198²).
+        ((0, 2, 0, 0), (0.069985, 1.0)),
+        ((0, 0, 0, 0), (-1.0, 1.0)),
+    ],
+)
+def test_newcombes_paired_interval_by_hand(
+    counts: tuple[int, int, int, int], interval: tuple[float, float]
+) -> None:
+    assert newcombe_paired(*counts) == pytest.approx(interval, abs=1e-6)
+
+
+@given(COUNTS)
+def test_newcombes_paired_interval_holds_the_estimate_and_mirrors(
+    counts: tuple[int, int, int, int],
+) -> None:
+    both, first, second, neither = counts
+    low, high = newcombe_paired(*counts)
+    assert -1 <= low <= (first - second) / sum(counts) <= high <= 1
+    assert high - low > 1e-3
+    mirrored = newcombe_paired(both, second, first, neither)
+    assert mirrored == pytest.approx((-high, -low), abs=1e-9)
+    # Failure in the place of success turns the difference round as well.
+    assert newcombe_paired(neither, first, second, both) == pytest.approx((low, high), abs=1e-9)
+
+
+@given(COUNTS, st.booleans())
+def test_no_paired_interval_has_width_zero(counts: tuple[int, int, int, int], once: bool) -> None:
+    kinds = np.array([[1, 1], [0, 1], [1, 0], [0, 0]], float)
+    values = np.repeat(kinds, counts, axis=0)
+    estimate = (counts[1] - counts[2]) / len(values)
+    drawn = Interval(estimate, estimate - 0.01, estimate + 0.01)
+    found, kind = paired_interval(values, once, drawn)
+    assert found.value == estimate
+    if kind == "bca":
+        assert counts[1] + counts[2] >= 10 and found == drawn
+    elif kind == "newcombe":
+        assert once and (found.low, found.high) == newcombe_paired(*counts)
+    else:
+        assert not once and math.isnan(found.low) and math.isnan(found.high)
+    # A bootstrap whose draws all agree has no interval to give, whatever the episodes.
+    flat, kind = paired_interval(values, once, Interval(estimate, estimate, estimate))
+    assert kind != "bca" and flat.low != flat.high
 
 
 def test_mcnemar_by_hand() -> None:
@@ -109,40 +165,26 @@ def test_holm_keeps_the_order_and_only_raises(values: list[float]) -> None:
     adjusted = holm(values)
     assert all(b >= a for a, b in zip(values, adjusted, strict=True))
     assert max(adjusted, default=0) <= 1
-    for i, a in enumerate(values):
-        for j, b in enumerate(values):
-            assert not (a < b and adjusted[i] > adjusted[j])
+    order = sorted(range(len(values)), key=values.__getitem__)
+    assert sorted(adjusted) == [adjusted[place] for place in order]
 
 
-def test_cohens_h_by_hand() -> None:
+def test_effect_sizes_by_hand() -> None:
     # 2 arcsin 1 − 2 arcsin √½ = π − π/2
     assert cohens_h(1.0, 0.5) == pytest.approx(math.pi / 2)
     assert cohens_h(0.3, 0.3) == 0.0
     assert cohens_h(0.2, 0.4) == -cohens_h(0.4, 0.2)
-
-
-def test_the_slope_is_the_least_squares_line_over_log2_sessions() -> None:
-    ks, rates = [0, 1, 3, 7], [0.453, 0.384, 0.300, 0.193]
-    expected = scipy.stats.linregress([0, 1, 2, 3], rates).slope
-    assert float(slope_weights(ks) @ rates) == pytest.approx(expected)
-    # Over 0, 1, 2, 3 the weights are −0.3, −0.1, 0.1, 0.3: −0.1359 + −0.0384 + 0.03 + 0.0579
-    assert float(slope_weights(ks) @ rates) == pytest.approx(-0.0864)
-
-
-def test_flip_rate_by_hand() -> None:
-    first, second = np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 0, 1, 1], bool)
-    flips, rate, low, high = flip_rate(first, second)
-    assert (flips, rate) == (2, 0.4)
-    assert (low, high) == wilson(2, 5)
-    assert math.isnan(flip_rate(first[:0], second[:0])[1])
+    # The slope is that of the least-squares line over log2 of the sessions, 0, 1, 2 and 3, with the
+    # weights −0.3, −0.1, 0.1, 0.3: −0.1359 + −0.0384 + 0.03 + 0.0579
+    rates = [0.453, 0.384, 0.300, 0.193]
+    found = float(slope_weights([0, 1, 3, 7]) @ rates)
+    assert found == pytest.approx(-0.0864)
+    assert found == pytest.approx(scipy.stats.linregress([0, 1, 2, 3], rates).slope)
 
 
 def outcomes(episodes: int = 80) -> Any:
     numbers = np.random.default_rng(1).random((episodes, 4))
     return (numbers < [0.2, 0.7, 0.55, 0.4]).astype(float)
-
-
-Function = Callable[..., Any]
 
 
 @pytest.mark.parametrize(
@@ -162,7 +204,7 @@ Function = Callable[..., Any]
     ],
     ids=["difference", "retention", "slope"],
 )
-def test_intervals_are_scipys_bca(statistic: Statistic, function: Function) -> None:
+def test_intervals_are_scipys_bca(statistic: Statistic, function: Callable[..., Any]) -> None:
     # Means of repeats, so that draws seldom tie with the estimate or each other.
     values = outcomes() + np.random.default_rng(2).normal(0, 0.05, (80, 4))
     found = Resampler(values, "seed", draws=40_000).intervals([statistic])[0]
@@ -174,6 +216,14 @@ def test_intervals_are_scipys_bca(statistic: Statistic, function: Function) -> N
     tolerance = 0.04 * (expected.high - expected.low)
     assert found.low == pytest.approx(expected.low, abs=tolerance)
     assert found.high == pytest.approx(expected.high, abs=tolerance)
+
+
+def test_the_draws_are_these() -> None:
+    """Published intervals can be had again: the draws of a key never change."""
+    statistics = [difference(0, 1), retention(0, 1, 3), slope([1, 2, 3], slope_weights([0, 1, 3]))]
+    found = Resampler(outcomes(), "robomme", 1000).intervals(statistics)
+    bounds = [(round(one.low, 9), round(one.high, 9)) for one in found]
+    assert bounds == [(0.2375, 0.5125), (0.162473198, 0.833714829), (-0.16875, -0.025)]
 
 
 def test_ten_episodes_must_stand_out_for_an_interval() -> None:
@@ -204,20 +254,15 @@ def test_missing_episodes_do_not_count() -> None:
 def test_nothing_to_compare_is_no_number() -> None:
     for values in (np.zeros((0, 2)), np.array([[1.0, np.nan], [np.nan, 0.0]])):
         (found,) = Resampler(values, "").intervals([difference(0, 1)])
-        assert math.isnan(found.value) and math.isnan(found.low) and math.isnan(found.high)
+        assert all(map(math.isnan, found))
     # Retention without any lift divides by nothing.
     (found,) = Resampler(np.ones((9, 3)), "").intervals([retention(0, 1, 2)])
     assert math.isnan(found.value)
-
-
-def test_one_episode_alone_has_no_interval() -> None:
-    found = Resampler(np.array([[0.0, 1.0], [np.nan, 1.0]]), "key", 100).intervals(
-        [difference(0, 1), mean(1)]
-    )
-    assert found[0].value == 1.0
-    assert math.isnan(found[0].low)
-    assert math.isnan(found[0].high)
-    assert (found[1].value, found[1].low, found[1].high) == (1.0, 1.0, 1.0)
+    # One episode alone has no interval.
+    alone = Resampler(np.array([[0.0, 1.0], [np.nan, 1.0]]), "key", 100)
+    found, both = alone.intervals([difference(0, 1), mean(1)])
+    assert found.value == 1.0 and math.isnan(found.low) and math.isnan(found.high)
+    assert both == (1.0, 1.0, 1.0)
 
 
 def test_the_key_alone_seeds_the_draws() -> None:
@@ -227,27 +272,3 @@ def test_the_key_alone_seeds_the_draws() -> None:
     assert first != other
     # Whatever else is computed from the same draws makes no difference.
     assert Resampler(values, "a", 500).intervals([difference(0, 1), *statistics])[1:] == first
-
-
-def test_draws_in_chunks_are_the_same_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    statistics = [difference(0, 1), retention(0, 1, 3)]
-    whole = Resampler(outcomes(), "x", 500).intervals(statistics)
-    monkeypatch.setattr(bootstrap, "_CHUNK", 160)
-    bootstrap._drawn.cache_clear()
-    assert Resampler(outcomes(), "x", 500).intervals(statistics) == whole
-
-
-def test_many_episodes_are_drawn_by_their_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both ways of drawing are the same bootstrap; by kinds, order and _MANY play no part."""
-    values, statistics = outcomes(400), [difference(0, 1), retention(0, 1, 3)]
-    single = Resampler(values, "x", 20_000).intervals(statistics)
-    monkeypatch.setattr(bootstrap, "_MANY", 399)
-    by_kind = Resampler(values, "x", 20_000).intervals(statistics)
-    assert by_kind == Resampler(values[::-1], "x", 20_000).intervals(statistics)
-    for one, other in zip(single, by_kind, strict=True):
-        assert one.value == other.value
-        tolerance = 0.05 * (one.high - one.low)
-        assert one.low == pytest.approx(other.low, abs=tolerance)
-        assert one.high == pytest.approx(other.high, abs=tolerance)
-    monkeypatch.setattr(bootstrap, "_CHUNK", 160)
-    assert by_kind == Resampler(values, "x", 20_000).intervals(statistics)

@@ -1,0 +1,177 @@
+"""Rates worked out by hand; which cells are complete, missing or not ranked; other conditions."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support import scoring as made
+from support.scoring import record
+
+from robomme_interference_data import conditions
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.stats import wilson
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Score:
+    folder = tmp_path_factory.mktemp("rows")
+    return made.score(made.write_parquet(folder / "a.parquet", made.rows()))
+
+
+def grid_of(found: Score) -> list[tuple[str, ...]]:
+    return [row for grid in found.grids for row in grid.rows]
+
+
+def test_cells_by_hand(small: Score) -> None:
+    cell = record(small, "main", system=made.BASE, condition="k1")
+    assert (cell["n"], cell["successes"], cell["fails"], cell["timeouts"]) == (12, 5, 6, 1)
+    assert cell["rate"] == 5 / 12
+    assert (cell["low"], cell["high"]) == wilson(5, 12)
+    cell = record(small, "family", system=made.BASE, condition="k0", family="InsertPeg")
+    assert (cell["n"], cell["successes"], cell["rank"]) == (6, 2, 1)
+    cell = record(small, "difficulty", system=made.BASE, condition="k0", difficulty="hard")
+    assert (cell["n"], cell["successes"]) == (4, 1)  # episodes 4 and 5 of both families: s f, f f
+
+
+def test_an_error_is_neither_and_an_incomplete_cell_is_never_ranked(small: Score) -> None:
+    cell = record(small, "main", system=made.OWN, condition="k0")
+    assert (cell["n"], cell["successes"], cell["errors"], cell["missing"]) == (10, 2, 1, 2)
+    assert cell["rate"] == 0.2
+    assert (cell["complete"], cell["rank"]) == (False, None)
+    # Both others have 7 of 12: two first places, and no third.
+    assert record(small, "main", system=made.BASE, condition="k0")["rank"] == 1
+    assert record(small, "main", system=made.RETRIEVAL, condition="k0")["rank"] == 1
+    # MoveCube lacks episodes 2 and 5; InsertPeg is whole, and there it is third.
+    lacking = record(small, "coverage", system=made.OWN, condition="k0", family="MoveCube")
+    assert (lacking["expected"], lacking["n"], lacking["errors"]) == (6, 4, 1)
+    assert (lacking["missing_episodes"], lacking["error_episodes"]) == ("test 2,5", "test 2")
+    assert record(small, "family", system=made.OWN, condition="k0", family="InsertPeg")["rank"] == 3
+    assert grid_of(small)[2][2] == "20.0%† [5.7, 51.0] n=10, errors: 1"
+    assert "Rollouts that broke: 1." in small.grids[0].note
+
+
+def test_repeats_count_as_the_mean_of_their_episode(tmp_path: Path) -> None:
+    given = {(made.OWN, "k0"): "ssf"}, {(made.OWN, "k0"): "sff"}
+    path = made.write_csv(tmp_path / "a.csv", [*made.cells(given[0]), *made.cells(given[1], 4)])
+    found = made.score(path)
+    cell = record(found, "main")
+    assert (cell["n"], cell["successes"], cell["fails"], cell["rate"]) == (3, 3, 3, 1.5 / 3)
+    assert (cell["low"], cell["high"]) == wilson(1.5, 3)
+
+
+def test_a_cell_is_complete_only_if_every_seed_is(tmp_path: Path) -> None:
+    first = made.cells({(made.OWN, "k0"): "ssf", (made.OWN, "k7"): "ssf"})
+    second = made.cells({(made.OWN, "k0"): "sff", (made.OWN, "k7"): "se-"}, seed=1)
+    found = made.score(made.write_csv(tmp_path / "a.csv", [*first, *second]))
+    whole = [cell for cell in found.cells if not cell.part]
+    assert [(c.condition, c.n, c.missing, c.complete, c.rank) for c in whole] == [
+        ("k0", 3, 0, True, 1),
+        ("k7", 3, 2, False, None),
+    ]
+    cell = record(found, "coverage", condition="k7")
+    assert (cell["n"], cell["missing_episodes"], cell["error_episodes"]) == (
+        *(3, "test 1-2", "test 1"),
+    )
+    assert not record(found, "effects", condition="k7")["complete"]
+
+
+def test_cells_without_any_rollout_are_listed(tmp_path: Path) -> None:
+    given = {
+        ("mine", "k0"): "ss",
+        (made.RETRIEVAL, "k3"): "sf",
+        ("pi05_baseline", NO_HISTORY): "ff",
+    }
+    path = made.write_csv(tmp_path / "a.csv", made.cells(given))
+    found = made.score(path)
+    listed = [(r["system"], r["condition"], r["n"]) for r in made.records(found, "main")]
+    # pi0.5 has no memory, and the retrieval step nothing to retrieve without history.
+    assert listed == [
+        ("pi05_baseline", NO_HISTORY, 2),
+        (made.RETRIEVAL, "k0", 0),
+        (made.RETRIEVAL, "k3", 2),
+        ("mine", NO_HISTORY, 0),
+        ("mine", "k0", 2),
+        ("mine", "k3", 0),
+    ]
+    coverage = [(r["system"], r["condition"], r["n"]) for r in made.records(found, "coverage")]
+    assert coverage == listed
+    assert made.records(found, "coverage")[-1]["missing_episodes"] == "test 0-1"
+    assert grid_of(found)[:2] == [
+        ("π0.5 (baseline)", "0.0% [0.0, 65.8] n=2", "–", "–"),
+        ("Retrieval-FrameSamp-Modul", "–", "missing†", "50.0% [9.5, 90.5] n=2"),
+    ]
+    # In no other table, as there is nothing to say of their parts.
+    assert len(found.tables["family"].rows) == 3
+    found = made.score(path, grid=Grid.BENCHMARK)
+    assert [(r["system"], r["condition"]) for r in made.records(found, "main")] == [
+        ("pi05_baseline", NO_HISTORY),
+        *((made.RETRIEVAL, c) for c in ("k0", "k1", "k3", "k7")),
+        *(("mine", c) for c in (NO_HISTORY, "k0", "k1", "k3", "k7")),
+    ]
+    nothing = made.records(found, "coverage", condition="k7")
+    assert len(nothing) == 2 * len(FAMILIES)
+    assert {r["missing_episodes"] for r in nothing} == {"test 0-49"}
+
+
+def test_the_benchmarks_grid_is_nine_families_of_fifty_episodes(tmp_path: Path) -> None:
+    lines = [
+        f"my-memory,{family},k0,{episode},,easy,fail,0,9"
+        for family in FAMILIES
+        for episode in range(50)
+    ]
+    path = made.released(tmp_path / "a.csv", lines)
+    assert record(made.score(path, grid=Grid.BENCHMARK), "main", condition="k0")["complete"]
+    # An episode beside the grid makes a cell incomplete, as a missing one does.
+    more = made.released(tmp_path / "b.csv", [*lines, "my-memory,MoveCube,k0,50,,easy,fail,0,9"])
+    found = made.score(more, grid=Grid.BENCHMARK)
+    assert not record(found, "main", condition="k0")["complete"]
+    lacking = record(found, "coverage", condition="k0", family="MoveCube")
+    assert (lacking["n"], lacking["other_episodes"]) == (51, "test 50")
+    few = made.score(made.released(tmp_path / "c.csv", lines[:12]), grid=Grid.BENCHMARK)
+    assert record(few, "main", condition="k0")["missing"] == 450 - 12
+
+
+def test_systems_without_a_memory_are_not_ranked(tmp_path: Path) -> None:
+    given = {("oracle", "k0"): "ss", ("guess", "k0"): "ff", (made.OWN, "k0"): "sf"}
+    found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
+    ranks = {r["system"]: r["rank"] for r in made.records(found, "main")}
+    assert ranks == {"oracle": None, "guess": None, made.OWN: 1}
+    assert "Not ranked either, as they use no memory: Oracle, Guess." in found.grids[0].note
+
+
+def test_a_condition_of_another_kind_is_a_cell_and_no_contrast(
+    tmp_path: Path, filler: None
+) -> None:
+    given = {
+        (made.OWN, NO_HISTORY): "ffff",
+        (made.OWN, "filler-k3"): "sfff",
+        (made.OWN, "k7"): "ssff",
+        (made.OWN, "k0"): "ssss",
+    }
+    found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
+    rates = [(r["condition"], r["rate"]) for r in made.records(found, "main")]
+    assert rates == [(NO_HISTORY, 0), ("k0", 1), ("k7", 0.5), ("filler-k3", 0.25)]
+    assert record(found, "decay")["conditions"] == "k0 k7"
+    assert [r["condition"] for r in made.records(found, "lift")] == ["k0", "k7"]
+    assert [r["condition"] for r in made.records(found, "effects")] == ["k7"]
+    # Alone it is a score, too.
+    alone = made.write_csv(tmp_path / "b.csv", made.cells({(made.OWN, "filler-k3"): "sf"}))
+    assert made.score(alone, grid=Grid.BENCHMARK).tables["lift"].rows == ()
+
+
+def test_kinds_are_ordered_as_registered(filler: None) -> None:
+    names = [one.name for one in conditions.in_order(["filler-k0", "k7", NO_HISTORY, "k1"])]
+    assert names == [NO_HISTORY, "k1", "k7", "filler-k0"]
+
+
+def test_episodes_of_other_splits_are_other_episodes(tmp_path: Path) -> None:
+    rows = made.cells({(made.OWN, "k0"): "ss"})
+    rows += [
+        replace(row, episode_split="val", seed=9, status="fail", success=False) for row in rows
+    ]
+    found = made.score(made.write_csv(tmp_path / "a.csv", rows))
+    assert record(found, "main")["rate"] == 0.5
+    assert record(found, "coverage")["expected"] == 4

@@ -1,0 +1,234 @@
+"""`score` and `compare` as commands: what they print, write, export and leave alone."""
+
+import csv
+import html
+import json
+import re
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import scoring as made
+from support.scoring import BASE, OWN, RETRIEVAL, run
+
+from robomme_interference_data.errors import (
+    BadRowsError,
+    InvalidIdError,
+    InvalidOptionError,
+    MissingExtraError,
+    UnknownNameError,
+)
+from robomme_interference_data.evaluate.score import figures
+from robomme_interference_data.evaluate.score.export import RELEASED_COLUMNS, export
+from robomme_interference_data.evaluate.score.rows import read_rows
+from robomme_interference_data.evaluate.score.scoring import TABLES, write_score
+
+
+def files(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures take most of the time, and have tests of their own."""
+    monkeypatch.setattr(figures, "draw_figures", lambda score, folder: {})
+
+
+@made.needs_released
+def test_score_and_export_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    words = [
+        *("score", made.RELEASED, "--system", RETRIEVAL, "--against", "paper", "--out", out),
+        *("--export", tmp_path / "export", "--json"),
+    ]
+    monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, words)])
+    done = run(*words)
+    assert done.exit_code == 0, done.output
+    value = json.loads(done.stdout)
+    assert value["rows"] == 1800 and value["grid"] == "benchmark"
+    assert [one["successes"] for one in value["tables"]["main"]] == [202, 201, 202, 202]
+    assert f"Report: {out / 'report.html'}" in done.stderr
+    assert {path.stem for path in (out / "tables").glob("*.csv")} == set(TABLES)
+    drawn = sorted(path.name for path in (out / "figures").iterdir())
+    kinds = ("difficulty", "families", "heatmap", "retrieval", "success")
+    assert drawn == [f"{kind}-robomme{s}" for kind in kinds for s in (".png", ".svg")]
+    # The released rows come back byte for byte.
+    (exported,) = (tmp_path / "export").iterdir()
+    assert exported.read_bytes() == made.RELEASED.read_bytes()
+    # The report holds the command, to be typed again.
+    page = (out / "report.html").read_text(encoding="utf-8")
+    codes = [html.unescape(code) for code in re.findall("<code>(.*?)</code>", page)]
+    assert codes == [shlex.join(sys.argv)]
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_what_is_printed(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    done = run("score", path, "--grid", "given", "--against", "paper", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert lines[0] == "Success by system and condition, tabletop"
+    assert lines[2].split() == ["system", "no-history", "k0", "k1", "k3", "k7"]
+    assert "**58.3%** [32.0, 80.7] n=12" in lines[4]
+    assert "Rows of tabletop are not set against the paper's RoboMME." in done.stderr
+    done = run("compare", path, path)
+    assert done.stdout.startswith("Two runs compared\n\nsimulator")
+    value = json.loads(run("compare", path, path, "--json").stdout)
+    assert value["bad_rows"] == [0, 0] and len(value["rows"]) == 27
+    for command in ("score", "compare"):
+        help_text = run(command, "--help").stdout
+        assert "Examples" in help_text and f"robomme-interference {command}" in help_text
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
+    lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,MoveCub,k0,1,8,easy,fail,0,9"]
+    path = made.released(tmp_path / "a.csv", lines)
+    common = ("score", path, "--grid", "given", "--out", tmp_path / "out")
+    assert isinstance(run(*common).exception, BadRowsError)
+    assert not (tmp_path / "out").exists()
+    done = run(*common, "--lenient")
+    assert done.exit_code == 0, done.output
+    assert f"left out: {path}, line 3: family 'MoveCub'" in done.stderr
+    assert "1 bad rows left out" in done.stderr
+    assert "my-memory  100.0% [20.7, 100.0] n=1" in done.stdout
+    assert "family &#39;MoveCub&#39;" in (tmp_path / "out" / "report.html").read_text()
+    assert isinstance(run("compare", path, path).exception, BadRowsError)
+    done = run("compare", path, path, "--lenient", "--json")
+    assert json.loads(done.stdout)["bad_rows"] == [1, 1]
+    assert done.stderr.count("family 'MoveCub'") == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("ret rieval", InvalidIdError), ("pi05-baseline", UnknownNameError), ("", InvalidIdError)],
+)
+def test_a_name_that_is_none_is_a_bad_option_not_bad_rows(
+    tmp_path: Path, name: str, error: type[Exception]
+) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    for given in (
+        ("score", path, "--system", name, "--out", tmp_path / "out", "--lenient"),
+        ("compare", path, path, "--system-b", name),
+    ):
+        done = run(*given)
+        assert isinstance(done.exception, error) and repr(name) in str(done.exception)
+    assert files(tmp_path) == {"a.csv"}
+
+
+# --- the folder of a score ---------------------------------------------------------------------
+
+
+def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def draw(score: Any, folder: Path) -> dict[str, Path]:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = [f"success-{simulator}" for simulator in score.cubes]
+        for name in names:
+            (folder / f"{name}.png").touch()
+            (folder / f"{name}.svg").touch()
+        return {name: folder / f"{name}.svg" for name in names}
+
+    monkeypatch.setattr(figures, "draw_figures", draw)
+    rows, out, fresh = made.rows(), tmp_path / "out", tmp_path / "fresh"
+    both = [*rows, *made.changed(rows, simulator="robomme")]
+    first = made.score(made.write_parquet(tmp_path / "a.parquet", both), paper=True)
+    own = [row for row in rows if row.system == OWN]
+    second = made.score(made.write_parquet(tmp_path / "b.parquet", own))
+    write_score(first, out)
+    assert {"tables/paper.csv", "tables/paper.md", "figures/success-robomme.png"} <= files(out)
+    others = {"tables/notes.csv", "tables/mine.md", "figures/mine.svg", "figures/success-me.svg"}
+    for name in (*others, "notes.txt"):
+        (out / name).touch()
+    write_score(second, out)
+    write_score(second, fresh)
+    assert "tables/paper.csv" not in files(fresh)
+    assert files(out) == files(fresh) | others | {"notes.txt"}
+
+
+@pytest.mark.parametrize("library", ["matplotlib", "jinja2"])
+def test_without_a_library_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    monkeypatch.setitem(sys.modules, library, None)
+    given = ("score", path, "--grid", "given", "--out", tmp_path / "o", "--export", tmp_path / "e")
+    done = run(*given)
+    assert isinstance(done.exception, MissingExtraError) and library in str(done.exception)
+    assert "robomme-interference-data[score]" in (done.exception.hint or "")
+    assert files(tmp_path) == {"a.csv"}
+
+
+# --- exported rows -----------------------------------------------------------------------------
+
+
+def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
+    rows = read_rows([made.write_parquet(tmp_path / "a.parquet", made.rows())])
+    exported = export(rows, tmp_path / "export")
+    assert [path.name for path in exported] == [
+        f"{system}-tabletop_rollouts.csv" for system in (OWN, BASE, RETRIEVAL)
+    ]
+    with exported[0].open(newline="") as lines:
+        assert [row["status"] for row in csv.DictReader(lines)].count("error") == 1
+    found = made.score(exported[1], system=BASE)
+    cells = [cell for cell in found.cells if not cell.part]
+    assert [cell.counts[0] for cell in cells] == [1, 7, 5, 3, 2]
+    assert cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
+    # Their simulator comes back, too: they never stand beside the paper's rates.
+    assert list(found.cubes) == ["tabletop"]
+
+
+def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path) -> None:
+    kept = [made.row(OWN, "k0", "InsertPeg", i, letter) for i, letter in enumerate("sfte")]
+    kept[1] = replace(kept[1], seed=None, difficulty=None)
+    rows = [
+        replace(
+            one,
+            simulator=simulator,
+            retrieval_model="thumbnail/max/adaptive",
+            retrieval_selected_lesson_fraction=0.0,
+            retrieval_selected_filler_fraction=0.46875,
+            retrieval_selected_query_fraction=1 / 32,
+        )
+        for simulator in ("robomme", "tabletop")
+        for one in kept
+    ]
+    # As pandas saves a column with a gap, and an author a number.
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    text = path.read_text(encoding="utf-8")
+    text = text.replace(",1000,", ",1000.0,").replace(",0.46875,", ",0.468750,")
+    path.write_text(text, encoding="utf-8")
+    lines = [
+        *("InsertPeg,k0,0,1000,easy,success,1,100", "InsertPeg,k0,1,,,fail,0,100"),
+        *("InsertPeg,k0,2,1002,medium,ongoing,0,1300", "InsertPeg,k0,3,1003,medium,error,,100"),
+    ]
+    sources = (path, made.write_parquet(tmp_path / "a.parquet", rows))
+    for number, source in enumerate((*sources, made.write_run(tmp_path / "run", rows))):
+        folder = tmp_path / str(number)
+        assert len(export(read_rows([source]), folder)) == 2
+        for simulator, head, tail in (("robomme", "", ""), ("tabletop", ",simulator", ",tabletop")):
+            expected = [
+                ",".join(RELEASED_COLUMNS) + head,
+                *(f"{line},thumbnail/max/adaptive,0.0,0.46875,0.03125{tail}" for line in lines),
+            ]
+            found = (folder / f"{OWN}-{simulator}_rollouts.csv").read_bytes()
+            assert found == "".join(f"{line}\r\n" for line in expected).encode()
+
+
+def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    rows = [*made.rows(), *made.repeat(made.rows(), 3)]
+    rows[7] = replace(rows[7], episode_split="val", seed=7)
+    rows[9] = replace(rows[9], family="X")
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    given = ("score", path, "--lenient", "--out", tmp_path / "o", "--export", tmp_path / "e")
+    done = run(*given)
+    assert isinstance(done.exception, InvalidOptionError)
+    for reason in ("2 model seeds", "1 rows of train or val episodes", "1 bad rows"):
+        assert reason in str(done.exception)
+    assert files(tmp_path) == {"a.csv"}

@@ -1,0 +1,113 @@
+"""Two runs compared: pairs, the noise floor, and runs that cannot be paired."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import scoring as made
+from support.scoring import BASE, OWN, RETRIEVAL, cells
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.score.compare import Comparison, compare
+from robomme_interference_data.records import Rollout
+from robomme_interference_data.stats import newcombe_paired, wilson
+
+
+def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> Comparison:
+    paths = [made.write_csv(tmp_path / f"{n}.csv", r) for n, r in (("a", a), ("b", b))]
+    return compare(*paths)
+
+
+def own(seed: int = 0, **outcomes: str) -> list[Rollout]:
+    return cells({(OWN, condition): text for condition, text in outcomes.items()}, seed)
+
+
+def test_two_systems_are_paired_by_episode(tmp_path: Path) -> None:
+    rows = made.rows()
+    found = compared(
+        tmp_path, [r for r in rows if r.system == BASE], [r for r in rows if r.system == RETRIEVAL]
+    )
+    assert found.notes == (
+        f"Only in a, and left out (episodes): {BASE} in tabletop, no-history (12), k1 (12), k3 "
+        "(12).",
+    )
+    records = found.table.records()
+    assert len(records) == 6  # both conditions in all, and in the two families
+    overall = {row["condition"]: row for row in records if row["family"] == "all"}
+    assert (overall["k0"]["gained"], overall["k0"]["lost"], overall["k0"]["p"]) == (1, 1, 1.0)
+    k7 = overall["k7"]
+    assert (k7["n"], k7["rate_a"], k7["rate_b"]) == (12, 2 / 12, 7 / 12)
+    assert (k7["gained"], k7["lost"], k7["p"]) == (5, 0, 2 / 32)
+    assert k7["difference"] == pytest.approx(5 / 12)
+    assert (k7["interval"], k7["pairs"], k7["flips"]) == ("newcombe", 12, 5 / 12)
+    assert (k7["low"], k7["high"]) == newcombe_paired(2, 5, 0, 5)
+    assert k7["p_holm"] == pytest.approx(6 * 2 / 32)
+
+
+def test_two_runs_of_one_system_show_the_noise_floor(tmp_path: Path) -> None:
+    found = compared(tmp_path, own(k0="ssff", k7="ssss"), own(k0="sfsf"))
+    low, high = wilson(2, 4)
+    noise, left_out = found.notes
+    assert "my-memory ran in both, with the same model seeds, in tabletop" in noise
+    assert noise.endswith(f"k0 50.0% of 4 (95% interval {100 * low:.1f} to {100 * high:.1f}).")
+    assert left_out.endswith("my-memory in tabletop, k7 (4).")
+    assert found.table.records()[0]["flips"] == 0.5
+
+
+def test_model_seeds_are_matched(tmp_path: Path) -> None:
+    # Without a seed in common by rank.
+    found = compared(tmp_path, own(3, k0="ssff"), own(7, k0="sfff"))
+    assert "with other model seeds" in found.notes[0]
+    overall = found.table.records()[0]
+    assert (overall["pairs"], overall["gained"], overall["lost"]) == (4, 0, 1)
+    # With seed 7 on both sides, it is that seed: episode 0 is lost, and 1 gained.
+    found = compared(tmp_path, own(3, k0="ffff") + own(7, k0="sf"), own(7, k0="fsss"))
+    overall = found.table.records()[0]
+    assert (overall["n"], overall["pairs"], overall["gained"], overall["lost"]) == (4, 2, 1, 1)
+
+
+def test_what_only_one_run_has_is_told(tmp_path: Path) -> None:
+    a = [*own(k0="sssss", k1="sssss", k3="ss"), *cells({(BASE, "k0"): "ss"})]
+    b = own(k0="sse", k1="ss--s", k7="ss")
+    other = made.changed(b, simulator="robomme", revision="cd" * 32)
+    assert compared(tmp_path, a, [*b, *other]).notes[1:] == (
+        f"Only in a, and left out (episodes): {BASE} in tabletop, k0 (2); my-memory in tabletop, "
+        "k0 (3), k1 (2), k3 (2).",
+        "Only in b, and left out (episodes): my-memory in robomme, k0 (2), k1 (3), k7 (2); "
+        "my-memory in tabletop, k7 (2).",
+    )
+
+
+def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
+    other = made.changed(own(k0="sf"), revision="cd" * 32, model_seed=9)
+    found = compared(tmp_path, own(k0="ss"), other)
+    (note,) = found.notes
+    assert "are of different splits" in note
+    released = made.released(
+        tmp_path / "c.csv", [f"{OWN},MoveCube,k0,{e},{e},easy,fail,0,9" for e in range(2)]
+    )
+    both = made.write_csv(tmp_path / "b.csv", made.changed(own(k0="ss"), simulator="robomme"))
+    (note,) = compare(both, released).notes
+    assert "Only one of the runs names the revision" in note
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"simulator": "robomme"}, "the rows are of different simulators: tabletop and robomme"),
+        ({"seed": 77}, "has the seed 0 in one run and 77 in the other"),
+        ({"episode_split": "val"}, "no episode under a common condition"),
+        ({"condition": "k9"}, "no episode under a common condition"),
+        ({"system": "other"}, ""),
+    ],
+)
+def test_what_cannot_be_paired_is_not_compared(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    a, b = own(k0="sfsf"), made.changed(own(k0="sfsf"), **change)
+    if not message:  # two systems, one a run, are compared
+        assert compared(tmp_path, a, b).table.records()[0]["system_b"] == "other"
+        a, message = [*a, *cells({(BASE, "k0"): "s"})], "no system is in both"
+    with pytest.raises(InvalidOptionError, match=message):
+        compared(tmp_path, a, b)

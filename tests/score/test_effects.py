@@ -1,0 +1,177 @@
+"""Paired comparisons: which rollouts are paired, which interval they bear, what they come to."""
+
+import math
+from pathlib import Path
+
+import pytest
+from support import scoring as made
+from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
+
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.records import Rollout
+from robomme_interference_data.stats import newcombe_paired, wilson
+
+
+def scored(tmp_path: Path, *parts: list[Rollout]) -> Score:
+    rows = [row for part in parts for row in part]
+    return made.score(made.write_parquet(tmp_path / "a.parquet", rows), draws=2000)
+
+
+def own(**outcomes: str) -> list[Rollout]:
+    """Rows of one's own memory; `none` is no-history."""
+    return cells({(OWN, c.replace("none", NO_HISTORY)): text for c, text in outcomes.items()})
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Score:
+    return scored(tmp_path_factory.mktemp("rows"), made.rows())
+
+
+def test_lift_and_retention_by_hand(small: Score) -> None:
+    lift = record(small, "lift", system=BASE, condition="k0")
+    assert (lift["rate"], lift["no_history_rate"]) == (7 / 12, 1 / 12)
+    assert lift["lift"] == pytest.approx(6 / 12)
+    # MoveCube 1 to 4 and InsertPeg 0 and 1 are gained, none is lost: p = 2 · 1/2⁶
+    assert (lift["gained"], lift["lost"], lift["p"]) == (6, 0, 2 / 64)
+    # Fewer than ten episodes differ: Newcombe's interval, of 1 pair on both sides and 5 on neither.
+    assert (lift["interval"], lift["pairs"], lift["flips"]) == ("newcombe", 12, 6 / 12)
+    assert (lift["low"], lift["high"]) == newcombe_paired(1, 6, 0, 5)
+    assert lift["retention"] is None
+    kept = record(small, "lift", system=BASE, condition="k3")
+    assert kept["retention"] == pytest.approx((3 - 1) / (7 - 1))
+    assert kept["retention_low"] is kept["retention_high"] is None
+    # Without history, the system with retrieval is the one without.
+    kept = record(small, "lift", system=RETRIEVAL, condition="k7")
+    assert (kept["no_history_of"], kept["retention"]) == (BASE, 1.0)
+    # Ten episodes count on both sides: 2 against 1; no sure lift, so no retention.
+    lift = record(small, "lift", system=OWN, condition="k0")
+    assert (lift["n"], lift["lift"], lift["complete"]) == (10, pytest.approx(0.1), False)
+
+
+def test_effects_by_hand(small: Score) -> None:
+    effect = record(small, "effects", system=BASE, condition="k1", against_system=BASE)
+    assert effect["difference"] == pytest.approx(-2 / 12)
+    assert (effect["gained"], effect["lost"], effect["p"]) == (0, 2, 0.5)
+    h = 2 * math.asin(math.sqrt(5 / 12)) - 2 * math.asin(math.sqrt(7 / 12))
+    assert effect["cohens_h"] == pytest.approx(h)
+    # InsertPeg 1 is lost and InsertPeg 2 gained by retrieval at k0.
+    effect = record(small, "effects", system=RETRIEVAL, condition="k0")
+    assert (effect["against_system"], effect["against_condition"]) == (BASE, "k0")
+    assert (effect["difference"], effect["gained"], effect["lost"]) == (0.0, 1, 1)
+    tests = records(small, "effects")
+    assert len(tests) == 6  # k1, k3, k7 against k0; k7 against k0; k0 and k7 against the base
+    smallest = min(tests, key=lambda one: one["p"])
+    assert smallest["p_holm"] == min(1.0, 6 * smallest["p"])
+
+
+def test_decay_by_hand(small: Score) -> None:
+    decay = record(small, "decay", system=BASE)
+    # Weights −0.3, −0.1, 0.1, 0.3 of 7, 5, 3 and 2 of 12: −2.1 − 0.5 + 0.3 + 0.6 = −1.7 of 12
+    assert decay["slope"] == pytest.approx(-1.7 / 12)
+    # Only MoveCube 1 to 4 and InsertPeg 0 and 1 change over the sessions: too few for an interval.
+    assert decay["low"] is decay["high"] is None
+    assert (decay["conditions"], decay["n"], decay["complete"]) == ("k0 k1 k3 k7", 12, True)
+    assert {one["system"] for one in records(small, "decay")} == {BASE, RETRIEVAL}
+
+
+def test_two_episodes_prove_no_lift_and_no_retention(tmp_path: Path) -> None:
+    found = scored(tmp_path, own(none="ff", k0="ss", k7="ss"))
+    lift = record(found, "lift", condition="k0")
+    assert (lift["p"], lift["interval"]) == (0.5, "newcombe")
+    assert (lift["low"], lift["high"]) == newcombe_paired(0, 2, 0, 0)
+    assert record(found, "lift", condition="k7")["retention"] is None
+    # None of two differs between k7 and k0: no difference, and no certainty of it.
+    effect = record(found, "effects", condition="k7")
+    assert (effect["low"], effect["high"]) == newcombe_paired(2, 0, 0, 0)
+
+
+def test_the_bootstrap_begins_at_ten_episodes_that_differ(tmp_path: Path) -> None:
+    found = scored(
+        tmp_path,
+        own(k0="f" * 10 + "s" * 30, k1="s" * 9 + "f" + "s" * 30, k3="s" * 10 + "s" * 30),
+    )
+    nine, ten = (record(found, "effects", condition=condition) for condition in ("k1", "k3"))
+    assert (nine["interval"], nine["gained"]) == ("newcombe", 9)
+    assert (ten["interval"], ten["gained"]) == ("bca", 10)
+    assert 0 < ten["low"] < 0.25 < ten["high"]
+
+
+def test_retention_has_an_interval_if_all_three_conditions_differ(tmp_path: Path) -> None:
+    # k0 lifts 30 of 60; k1 keeps all but nine of them, k3 all but ten, k7 nine alone.
+    found = scored(
+        tmp_path,
+        own(
+            none="f" * 60,
+            k0="s" * 30 + "f" * 30,
+            k1="f" * 9 + "s" * 21 + "f" * 30,
+            k3="f" * 10 + "s" * 20 + "f" * 30,
+            k7="s" * 9 + "f" * 51,
+        ),
+    )
+    kept = {
+        condition: record(found, "lift", condition=condition) for condition in ("k1", "k3", "k7")
+    }
+    assert [kept[c]["retention"] for c in kept] == pytest.approx([21 / 30, 20 / 30, 9 / 30])
+    assert kept["k1"]["retention_low"] is kept["k7"]["retention_high"] is None
+    assert 0 < kept["k3"]["retention_low"] < 20 / 30 < kept["k3"]["retention_high"] < 1
+
+
+@pytest.mark.parametrize(("gained", "sure"), [(5, False), (6, True)])
+def test_retention_is_of_a_lift_that_the_exact_test_is_sure_of(
+    tmp_path: Path, gained: int, sure: bool
+) -> None:
+    # Five gained and none lost: p = 2/32. Six: 2/64.
+    k0 = "s" * gained + "f" * (20 - gained)
+    found = scored(tmp_path, own(none="f" * 20, k0=k0, k7=k0))
+    assert record(found, "lift", condition="k7")["retention"] == (1.0 if sure else None)
+
+
+def test_pairs_are_of_the_lowest_seed_that_counts_on_both_sides(tmp_path: Path) -> None:
+    found = scored(
+        tmp_path,
+        # Seed 0 broke at k7 in episodes 0 to 2; in episode 3 no seed counts on both sides.
+        cells({(OWN, "k0"): "sssss", (OWN, "k7"): "eeeef"}),
+        cells({(OWN, "k0"): "fsf-s", (OWN, "k7"): "sfsss"}, seed=1),
+    )
+    effect = record(found, "effects", condition="k7")
+    # Episodes 0 and 2 are gained and 1 is lost with seed 1; 4 is lost with seed 0.
+    assert (effect["n"], effect["pairs"]) == (5, 4)
+    assert (effect["gained"], effect["lost"], effect["flips"], effect["p"]) == (2, 2, 1.0, 1.0)
+    assert "In 1 row the test leaves out a part of the n episodes" in found.tables["effects"].note
+    assert "leaves out" not in found.tables["lift"].note
+    # Repeats, and fewer than ten episodes: no interval is made for that.
+    assert effect["low"] is effect["high"] is None and effect["interval"] == ""
+
+
+def test_noise_is_of_the_two_lowest_seeds_that_count(tmp_path: Path) -> None:
+    parts = [cells({(OWN, "k0"): text}, seed) for seed, text in enumerate(("ess-", "sfse", "fssf"))]
+    found = scored(tmp_path, *parts, cells({(OWN, "k1"): "ss"}))
+    noise = record(found, "noise")
+    # Episode 0 flips from seed 1 to 2, episode 1 from seed 0 to 1; episode 3 counts once.
+    assert (noise["pairs"], noise["flips"], noise["rate"]) == (3, 2, 2 / 3)
+    assert (noise["low"], noise["high"]) == wilson(2, 3)
+
+
+def test_rows_without_a_revision_stand_beside_others_and_are_not_paired(tmp_path: Path) -> None:
+    """Released rows name no revision: their buffers may be others than those of one's own runs."""
+    rows = made.changed(made.rows(), simulator="robomme")
+    base = made.write_csv(tmp_path / "own.csv", [r for r in rows if r.system == BASE])
+    pinned = made.write_csv(tmp_path / "b.csv", [r for r in rows if r.system == RETRIEVAL])
+    lines = [
+        f"{r.system},{r.family},{r.condition},{r.episode},{r.seed},{r.difficulty},{r.status},"
+        f"{int(bool(r.success))},9"
+        for r in rows
+        if r.system == RETRIEVAL
+    ]
+    unpinned = made.released(tmp_path / "c.csv", lines)
+    inside = {(BASE, BASE), (RETRIEVAL, RETRIEVAL)}
+    for paths in ([base, unpinned], [unpinned, base]):
+        found = made.score(*paths)
+        pairs = {(r["system"], r["against_system"]) for r in records(found, "effects")}
+        assert pairs == inside
+        (note,) = found.notes
+        assert "are not paired" in note and f"the rows of {RETRIEVAL} name no revision" in note
+    found = made.score(base, pinned)
+    pairs = {(r["system"], r["against_system"]) for r in records(found, "effects")}
+    assert (pairs, found.notes) == (inside | {(RETRIEVAL, BASE)}, ())

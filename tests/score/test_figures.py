@@ -1,0 +1,161 @@
+"""What figures tell beside their points: who is who, what a hollow point means, who is left out."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import scoring as made
+from support.scoring import BASE, OWN, RETRIEVAL, cells
+
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.drawing import open_figure
+from robomme_interference_data.evaluate.score.curves import Data, looks_of, spread
+from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure
+from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
+from robomme_interference_data.records import Rollout
+
+
+def data(path: Path, rows: list[Rollout], paper: bool = False) -> Data:
+    found = made.score(made.write_parquet(path / "a.parquet", rows), paper=paper, draws=50)
+    return Data(found, rows[0].simulator)
+
+
+@pytest.fixture
+def figure() -> Iterator[Any]:
+    with open_figure() as figure:
+        yield figure
+
+
+def explained(figure: Any) -> str:
+    """What the figure's legend is headed by."""
+    return "; ".join(legend.get_title().get_text() for legend in figure.legends)
+
+
+def names(figure: Any) -> list[str]:
+    """Whom the figure's legend names."""
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+# --- looks -------------------------------------------------------------------------------------
+
+
+def test_two_dozen_own_systems_differ_without_colour() -> None:
+    own = [f"own-{number}" for number in range(24)]
+    looks = looks_of([*SYSTEMS, *own])
+    shapes = {(looks[name].marker, looks[name].line) for name in own}
+    assert len(shapes) == 24
+    assert not shapes & {(looks[name].marker, looks[name].line) for name in SYSTEMS}
+    more = looks_of([f"own-{number}" for number in range(48)])
+    assert len({(look.colour, look.marker, look.line) for look in more.values()}) == 48
+    # Neighbours differ in colour as well.
+    assert looks["own-0"].colour != looks["own-1"].colour != looks["own-2"].colour
+
+
+def test_systems_of_the_table_look_the_same_in_every_figure() -> None:
+    without = {name for name, system in SYSTEMS.items() if not system.retrieval}
+    together = looks_of(["mine", *SYSTEMS])
+    for name in without:
+        assert looks_of([name])[name] == together[name]
+    seen = {(together[n].colour, together[n].marker, together[n].line) for n in without}
+    assert len(seen) == len(without)
+    paper = looks_of([system.name for system in PAPER_SYSTEMS]).values()
+    assert len({(look.colour, look.marker, look.line) for look in paper}) == 13
+
+
+def test_several_systems_with_retrieval_are_stars_in_the_colours_of_their_bases() -> None:
+    memories = [f"replay-{memory}" for memory in ("full", "framesamp", "window")]
+    looks = looks_of([*memories, *(f"retrieval-{name}" for name in memories)])
+    assert len({(look.colour, look.marker, look.line) for look in looks.values()}) == 6
+    for name in memories:
+        assert looks[f"retrieval-{name}"].colour == looks[name].colour
+        assert looks[f"retrieval-{name}"].marker == "*"
+    assert looks_of(["retrieval-replay-full"])["retrieval-replay-full"].colour == "#000000"
+
+
+def test_labels_are_moved_apart_by_as_little_as_need_be() -> None:
+    assert spread([1.0, 5.0, 9.0], 2.0) == [1.0, 5.0, 9.0]
+    # Two at 5 go to 4 and 6; the one at 7 then is too close: the three lie around their mean.
+    assert spread([5.0, 5.0, 7.0], 2.0) == pytest.approx([11 / 3, 17 / 3, 23 / 3])
+    assert spread([], 1.0) == []
+
+
+# --- figures -----------------------------------------------------------------------------------
+
+WHOLE = [row for row in made.rows() if row.system == BASE]
+
+
+@pytest.mark.parametrize(
+    ("rows", "paper", "expected"),
+    [
+        (WHOLE, False, ""),
+        (WHOLE[:-1], False, "hollow: cell not complete"),
+        (made.changed(WHOLE, simulator="robomme"), True, "dashes: published rates"),
+        (
+            made.changed(WHOLE[:-1], simulator="robomme"),
+            True,
+            "hollow: cell not complete; dashes: published rates",
+        ),
+        # Published rates are of RoboMME alone.
+        (WHOLE, True, ""),
+    ],
+)
+def test_a_legend_explains_hollow_and_published_points(
+    tmp_path: Path, figure: Any, rows: list[Rollout], paper: bool, expected: str
+) -> None:
+    assert draw_figure("success", figure, data(tmp_path, rows, paper))
+    assert explained(figure) == expected
+
+
+@pytest.mark.parametrize(("systems", "dashes"), [(4, 4 * 5), (5, 0)])
+def test_beside_many_systems_published_rates_are_in_the_table_alone(
+    tmp_path: Path, figure: Any, systems: int, dashes: int
+) -> None:
+    ran = [name for name, s in SYSTEMS.items() if s.paper and s.no_history and s.with_history]
+    rows = [
+        row
+        for name in ran[:systems]
+        for row in made.changed(WHOLE, simulator="robomme", system=name)
+    ]
+    assert draw_figure("success", figure, data(tmp_path, rows, paper=True))
+    assert ("in the table" in explained(figure)) == (not dashes)
+    (axes,) = figure.axes
+    assert sum(line.get_marker() == "_" for line in axes.lines) == dashes
+
+
+def test_a_retrieval_system_stands_beside_its_published_base(tmp_path: Path, figure: Any) -> None:
+    rows = [row for row in made.rows() if row.system == RETRIEVAL]
+    shown = data(tmp_path, made.changed(rows, simulator="robomme"), paper=True)
+    assert draw_figure("retrieval", figure, shown)
+    assert names(figure) == ["Retrieval-FrameSamp-Modul", "FrameSamp-Modul, published"]
+    assert not draw_figure("retrieval", figure, data(tmp_path, rows))  # nobody to stand beside
+
+
+def test_the_retention_figure_names_whom_it_leaves_out(tmp_path: Path, figure: Any) -> None:
+    rows = [row for row in made.rows() if row.system != OWN]
+    # Of the own memory no episode is lifted, and its retention is of nothing.
+    own = made.changed(WHOLE, system=OWN, status="fail", success=False)
+    assert draw_figure("retention", figure, data(tmp_path, [*rows, *own]))
+    (axes,) = figure.axes
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert labels == ["FrameSamp-Modul", "Retrieval-FrameSamp-Modul"]
+    assert explained(figure).replace("\n", " ") == (
+        "Not shown (no lift at k0 with p < 0.05, or rows missing at k7): my-memory"
+    )
+    # Too few episodes differ for intervals: no bars, two points and the lines at 0 and 1.
+    assert len(axes.lines) == 4
+    with open_figure() as other:
+        assert draw_figure("retention", other, data(tmp_path, rows))
+        assert explained(other) == ""
+
+
+def test_only_conditions_of_a_kind_are_joined(tmp_path: Path, figure: Any, filler: None) -> None:
+    given = {(OWN, c): "sf" for c in (NO_HISTORY, "k0", "k7", "filler-k1", "filler-k3")}
+    assert draw_figure("success", figure, data(tmp_path, cells(given)))
+    (axes,) = figure.axes
+    joined = [len(line.get_xdata()) for line in axes.lines if line.get_linewidth() == 1.6]
+    assert joined == [2, 2]
+    assert [text.get_text() for text in axes.get_xticklabels()][3:] == ["filler-k1", "filler-k3"]
+    for kind in FIGURES:
+        with open_figure() as other:
+            draw_figure(kind, other, data(tmp_path, cells(given)))

@@ -1,0 +1,259 @@
+"""What a score comes to: headlines, the released and published numbers, the tables' files."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support import scoring as made
+from support.scoring import BASE, OWN, RETRIEVAL, cells, record
+
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.compare import compare
+from robomme_interference_data.evaluate.score.headline import headline
+from robomme_interference_data.evaluate.score.paper import published
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.stats import newcombe
+
+GOLDEN = made.ROOT / "tests" / "golden" / "score"
+PAPER = made.RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"
+
+
+def told(tmp_path: Path, outcomes: dict[tuple[str, str], str], grid: Grid = Grid.GIVEN) -> str:
+    rows = cells(outcomes)
+    return headline(made.score(made.write_csv(tmp_path / "a.csv", rows), grid=grid), "tabletop")
+
+
+# --- headlines ---------------------------------------------------------------------------------
+
+
+def test_the_headline_of_made_up_rows(tmp_path: Path) -> None:
+    text = headline(made.score(made.write_csv(tmp_path / "a.csv", made.rows())), "tabletop")
+    assert text.startswith(
+        "FrameSamp-Modul succeeds in 58.3% of 12 episodes when the history holds the lesson alone"
+    )
+    # Both have 7 of 12 at k0. Of 5 + 4 + 5 expected cells, retrieval lacks k1 and k3, and the
+    # own memory k1, k3 and k7, and part of k0.
+    assert text.endswith(
+        "Under k0, Retrieval-FrameSamp-Modul has the same rate. The highest rate at k7 is 58.3%, "
+        "of Retrieval-FrameSamp-Modul. 8 of 14 cells are complete."
+    )
+
+
+HEADLINES = {
+    "a lucky episode does not lead": (
+        {("lucky", "k0"): "s----", ("a-memory", "k0"): "sssff", ("a-memory", "k7"): "sffff"},
+        # Expected of each: k0 and k7, which any row is of.
+        ("a-memory succeeds in 60.0% of 5 episodes", "2 of 4 cells are complete."),
+    ),
+    "nothing complete": (
+        {("one", "k0"): "sss--", ("other", "k0"): "s---f", ("other", "k7"): "ffff-"},
+        (
+            "No cell is complete, so no system leads. Nearest to it is other under k7: 1 of 5",
+            "episodes are missing. 0 of 4 cells are complete.",
+        ),
+    ),
+    "an end that is not complete": (
+        {("a", "k0"): "sssss", ("a", "k7"): "sssf-", ("b", "k0"): "ssfff", ("b", "k7"): "sffff"},
+        (
+            "a succeeds in 100.0% of 5 episodes when",
+            "in 75.0% with 7 distractor sessions behind it (k7, not complete, over the 4 episodes "
+            "it has): −25.0 points (−69.9 to +28.1; 0 episodes gained, 1 lost, McNemar p = 1). 3 "
+            "of 4 cells are complete.",
+        ),
+    ),
+    "equal rates": (
+        {
+            **{("a", "k0"): "sssff", ("b", "k0"): "ffsss", ("c", "k0"): "sssff"},
+            **{("a", "k7"): "sffff", ("b", "k7"): "fffsf", ("c", "k7"): "ffffs"},
+        },
+        (
+            "a succeeds in 60.0% of 5 episodes when",
+            "Under k0, b and c have the same rate. Under k7, b and c have the same rate.",
+        ),
+    ),
+    "without k0": (
+        {("a", "k1"): "sf", ("b", "k1"): "fs", ("b", "k7"): "ff"},
+        (
+            "a succeeds in 50.0% of 2 episodes under k1 (95% interval 9.5 to 90.5). Under k1, b "
+            "has the same rate.",
+            "cells are complete.",
+        ),
+    ),
+    "without history": (
+        {(BASE, NO_HISTORY): "sfffffffffff"},
+        (
+            "FrameSamp-Modul succeeds in 8.3% of 12 episodes under no history (95% interval 1.5 "
+            "to 35.4).",
+            "",
+        ),
+    ),
+    "only errors": (
+        {("a", "k0"): "ee"},
+        ("No rollout counts yet.", "0 of 1 cells are complete."),
+    ),
+    "a bound does not lead": (
+        {("oracle", "k0"): "s", (OWN, "k0"): "f"},
+        ("my-memory succeeds in 0.0% of 1 episodes", ""),
+    ),
+    "a bound alone": ({("oracle", "k0"): "s"}, ("Oracle succeeds in 100.0% of 1 episodes", "")),
+}
+
+
+@pytest.mark.parametrize(("outcomes", "ends"), HEADLINES.values(), ids=HEADLINES.keys())
+def test_headlines(
+    tmp_path: Path, outcomes: dict[tuple[str, str], str], ends: tuple[str, str]
+) -> None:
+    text = told(tmp_path, outcomes)
+    assert text.startswith(ends[0]) and text.endswith(ends[1])
+
+
+def test_the_benchmark_names_what_it_misses(tmp_path: Path) -> None:
+    assert told(tmp_path, {("one", "k0"): "sss--"}, Grid.BENCHMARK) == (
+        "No cell is complete, so no system leads. Nearest to it is one under k0: 447 of 450 "
+        "episodes are missing. 0 of 5 cells are complete."
+    )
+
+
+# --- the paper ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Score:
+    other = made.changed(made.rows(), simulator="robomme", revision="cd" * 32)
+    path = tmp_path_factory.mktemp("rows") / "a.csv"
+    return made.score(made.write_csv(path, [*made.rows(), *other]), paper=True)
+
+
+def test_rates_stand_beside_the_published_ones(beside: Score) -> None:
+    # Five cells of the base system; two of retrieval, each beside its own and the base's.
+    assert len(beside.tables["paper"].rows) == 9
+    base = record(beside, "paper", system=BASE, condition="k0")
+    assert (base["n"], base["published_n"]) == (12, 450)
+    # Only the benchmark's whole grid is complete, whatever the grid of the scoring.
+    assert not base["complete"]
+    assert base["published_rate"] == 204 / 450
+    assert (base["difference_low"], base["difference_high"]) == newcombe(7, 12, 204, 450)
+
+
+def test_what_is_not_in_the_paper_is_told(beside: Score, tmp_path: Path) -> None:
+    assert beside.notes == (
+        "Rows of tabletop are not set against the paper's RoboMME.",
+        f"Not in the paper under these conditions: {OWN}.",
+    )
+    rows = made.changed(cells({(OWN, "k0"): "sf", (BASE, "k15"): "s"}), simulator="robomme")
+    found = made.score(made.write_csv(tmp_path / "a.csv", rows), paper=True)
+    assert found.tables["paper"].rows == ()
+    assert found.notes == (f"Not in the paper under these conditions: {BASE}, {OWN}.",)
+    assert found.notes[0] in found.tables["paper"].note
+
+
+def test_published_rates_are_the_papers() -> None:
+    rates = published()
+    assert len(rates) == 1 + 11 * 5 + 4
+    for one in rates:
+        # Of all counts of 450 exactly one rounds to the printed rate.
+        counts = [n for n in range(451) if f"{100 * n / 450:.1f}" == f"{one.percent:.1f}"]
+        assert counts == [one.successes] and one.n == 450
+        assert SYSTEMS[one.system].paper and one.simulator == "robomme"
+    at = {(one.system, one.condition): one.percent for one in rates}
+    assert at[BASE, "k7"] == 19.3
+    assert at["symbolic-groundsg", "k7"] == 26.0
+    assert at["recurrent-ttt-context", "k3"] == 17.3
+    assert at[RETRIEVAL, "k1"] == 44.7
+
+
+@pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
+def test_published_rates_are_in_the_papers_source() -> None:
+    lines = PAPER.read_text(encoding="utf-8").splitlines()
+    names = {one.system: SYSTEMS[one.system].display for one in published()}
+    names["pi05_baseline"] = "$\\pi_{0.5}$ (baseline)"
+    for table, start in ((3, "System & No history"), (4, "System & k0")):
+        first = next(i for i, line in enumerate(lines) if line.strip().startswith(start))
+        for system in {one.system for one in published() if one.table == table}:
+            line = next(t for t in lines[first:] if t.strip().startswith(names[system]))
+            line = line.replace("\\textbf{", "").replace("}", "").replace("\\\\", "")
+            printed = [
+                float(cell.strip().removesuffix("\\%"))
+                for cell in line.split("&")[1:]
+                if "--" not in cell
+            ]
+            assert printed == [
+                o.percent for o in published() if (o.table, o.system) == (table, system)
+            ]
+
+
+@made.needs_released
+def test_the_released_rows_give_the_published_numbers() -> None:
+    found = made.score(
+        made.RELEASED, system=RETRIEVAL, grid=Grid.BENCHMARK, paper=True, draws=10_000
+    )
+    whole = {cell.condition: cell for cell in found.cells if not cell.part and cell.n}
+    assert all(cell.complete and cell.n == 450 for cell in whole.values())
+    assert {condition: cell.counts for condition, cell in whole.items()} == {
+        "k0": (202, 231, 17, 0),
+        "k1": (201, 232, 17, 0),
+        "k3": (202, 230, 18, 0),
+        "k7": (202, 229, 19, 0),
+    }
+    # By hand: see tests/core/test_stats.py.
+    assert whole["k0"].interval == pytest.approx((0.403560, 0.495083), abs=1e-6)
+    k7 = record(found, "effects", condition="k7")
+    assert (k7["n"], k7["gained"], k7["lost"], k7["p"], k7["difference"]) == (450, 13, 13, 1.0, 0.0)
+    by_hand = {
+        "InsertPeg": [5, 4, 4, 3],
+        "MoveCube": [43, 42, 43, 43],
+        "PatternLock": [28, 26, 29, 27],
+        "RouteStick": [34, 33, 35, 33],
+        "VideoPlaceButton": [26, 28, 25, 30],
+        "VideoPlaceOrder": [20, 24, 20, 23],
+        "VideoRepick": [16, 15, 17, 15],
+        "VideoUnmask": [19, 17, 18, 19],
+        "VideoUnmaskSwap": [11, 12, 11, 9],
+    }
+    for family, counts in by_hand.items():
+        cells = made.records(found, "family", family=family)
+        assert [cell["successes"] for cell in cells] == counts
+    ours = made.records(found, "paper", published_system=RETRIEVAL)
+    assert {one["difference"] for one in ours} == {0.0}
+    assert headline(found, "robomme") == (
+        "Retrieval-FrameSamp-Modul succeeds in 44.9% of 450 episodes when the history holds the "
+        "lesson alone (k0, 95% interval 40.4 to 49.5), and in 44.9% with 7 distractor sessions "
+        "behind it (k7): 0.0 points (−2.2 to +2.2; 13 episodes gained, 13 lost, McNemar p = 1). "
+        "Without retrieval, FrameSamp-Modul falls from 45.3% to 19.3% (published)."
+    )
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+def test_tables_are_those_of_the_golden_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # the note of a comparison holds the paths as they were given
+    rows = made.rows()
+    again = made.repeat((row for row in rows if row.condition == "k7"), 4)
+    # In the repeat, the base system loses MoveCube/1 and gains MoveCube/2.
+    lost = {1: "fail", 2: "success"}
+    again = [
+        replace(row, status=lost[row.episode], success=row.episode == 2)
+        if (row.system, row.family) == (BASE, "MoveCube") and row.episode in lost
+        else row
+        for row in again
+    ]
+    small = made.score(made.write_parquet(Path("small.parquet"), [*rows, *again]), draws=2000)
+    robomme = made.changed(rows, simulator="robomme")
+    paper = made.score(made.write_csv(Path("all.csv"), robomme), grid=Grid.BENCHMARK, paper=True)
+    sides = [
+        made.write_csv(Path(name), [row for row in robomme if row.system == system])
+        for name, system in (("a.csv", BASE), ("b.csv", RETRIEVAL))
+    ]
+    tables = [*small.tables.values(), paper.tables["paper"], compare(*sides).table]
+    written = {f"{table.name}.csv": table.csv() for table in tables}
+    written |= {f"{table.name}.md": table.markdown() for table in tables}
+    written["main.md"] = small.grids[0].markdown()
+    golden = {path.name: path.read_text(encoding="utf-8") for path in GOLDEN.iterdir()}
+    assert written.keys() == golden.keys()
+    for name, text in golden.items():
+        assert written[name] == text, name

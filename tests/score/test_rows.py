@@ -1,0 +1,422 @@
+"""Rows are read from CSV, parquet and records of runs alike; bad ones are named and refused."""
+
+import json
+import os
+import random
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import scoring as made
+from support.scoring import GOOD
+
+from robomme_interference_data.errors import (
+    BadRowsError,
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+)
+from robomme_interference_data.evaluate.score.rows import Rows, read_rows
+
+COLUMNS = ("simulator", "system", "condition", "family", "episode", "model_seed", "status")
+
+
+def told(rows: Rows, *columns: str) -> list[tuple[Any, ...]]:
+    """What the rows hold, sorted."""
+    return sorted(zip(*(rows.list(name) for name in columns or COLUMNS), strict=True), key=repr)
+
+
+def write(path: Path, **columns: Any) -> Path:
+    """Write the rows of `scoring` with some columns replaced."""
+    table = pq.read_table(made.write_parquet(path, made.rows()))
+    for name, values in columns.items():
+        table = table.set_column(table.schema.get_field_index(name), name, values)
+    pq.write_table(table, path)
+    return path
+
+
+# --- what is read ------------------------------------------------------------------------------
+
+
+def test_csv_parquet_and_runs_are_read_alike(tmp_path: Path) -> None:
+    rows = made.rows()
+    run = made.write_run(tmp_path / "run", rows, status="complete")
+    by_csv, by_parquet, by_run = (
+        read_rows([path])
+        for path in (
+            made.write_csv(tmp_path / "a.csv", rows),
+            made.write_parquet(tmp_path / "a.parquet", rows),
+            run,
+        )
+    )
+    assert len(by_csv) == 107  # 9 cells of 12, one row missing
+    assert told(by_csv) == told(by_parquet) == told(by_run)
+    for other in (by_csv, by_parquet, by_run):
+        assert set(other.names("system")) == {made.BASE, made.RETRIEVAL, made.OWN}
+        assert other.revisions == {"tabletop": made.REVISION}
+    assert by_run.sources == {run / "rollouts.jsonl": {"format_version": 1, "status": "complete"}}
+    assert list(by_csv.sources.values()) == [None]
+
+
+@settings(max_examples=15)
+@given(st.randoms(use_true_random=False), st.integers(1, 3))
+def test_the_order_of_rows_and_files_makes_no_difference(
+    tmp_path_factory: pytest.TempPathFactory, order: random.Random, files: int
+) -> None:
+    folder = tmp_path_factory.mktemp("shuffled")
+    rows = [*made.rows(), *made.repeat(made.rows()[:20], 5), *made.repeat(made.rows()[:9], 3)]
+    expected = made.score(made.write_parquet(folder / "all.parquet", rows), draws=50)
+    order.shuffle(rows)
+    found = made.score(
+        *(made.write_parquet(folder / f"{n}.parquet", rows[n::files]) for n in range(files)),
+        draws=50,
+    )
+    assert {name: table.csv() for name, table in found.tables.items()} == {
+        name: table.csv() for name, table in expected.tables.items()
+    }
+
+
+def test_a_record_holds_what_came_last(tmp_path: Path) -> None:
+    good = made.rows()[3]
+    broken = replace(good, status="error", success=None, error="it broke")
+    folder = made.write_run(tmp_path / "run", [broken, made.rows()[4], broken, good])
+    assert told(read_rows([folder]), "episode", "status") == [(3, "fail"), (4, "fail")]
+    # A crash can cut the last line short.
+    record = folder / "rollouts.jsonl"
+    record.write_bytes(record.read_bytes() + b'{"system": "my')
+    assert len(read_rows([folder])) == 2
+    record.write_bytes(b'{"system": "my')
+    assert len(read_rows([folder])) == 0
+    # What did not break is not run again: two rows contradict each other.
+    made.write_run(folder, [good, broken])
+    with pytest.raises(BadRowsError, match="line 2: the same rollout as"):
+        read_rows([folder])
+
+
+def test_the_released_layout(tmp_path: Path) -> None:
+    lines = [
+        GOOD,
+        "my-memory,MoveCube,k0,1,8,hard,ongoing,False,1300",
+        "my-memory,MoveCube,no-history,1,8,hard,error,,0",
+    ]
+    path = made.released(tmp_path / "a.csv", lines)
+    expected = [
+        ("robomme", "my-memory", "k0", "MoveCube", 0, 0, "success"),
+        ("robomme", "my-memory", "k0", "MoveCube", 1, 0, "timeout"),
+        ("robomme", "my-memory", "no-history", "MoveCube", 1, 0, "error"),
+    ]
+    assert told(read_rows([path])) == expected
+    # The paper's own tables call a system a variant; a program may begin a file with a mark.
+    text = path.read_text(encoding="utf-8").replace("system", "variant", 1)
+    path.write_text(text, encoding="utf-8-sig")
+    assert told(read_rows([path])) == expected
+
+
+def test_simulators_have_revisions_scenes_and_names_of_their_own(tmp_path: Path) -> None:
+    names = ("my_package.kitchen:make_simulator", "_doubles:make", "sim-2.1", "x" * 128)
+    rows = made.rows()[:2]
+    for number, name in enumerate(names):
+        rows += made.changed(rows[:2], simulator=name, revision=f"{number}" * 64, seed=number)
+    found = read_rows([made.write_csv(tmp_path / "a.csv", rows)])
+    assert found.names("simulator") == sorted((*names, "tabletop"))
+    assert len(found.revisions) == 5
+
+
+@pytest.mark.parametrize("kind", [pa.float32(), pa.float64(), pa.uint8(), pa.string()])
+def test_numbers_of_any_type_are_read_alike(tmp_path: Path, kind: Any) -> None:
+    episodes = pa.array([row.episode for row in made.rows()]).cast(kind)
+    success = pa.array([row.success for row in made.rows()]).cast(pa.int8()).cast(pa.float64())
+    words = pa.array([row.family for row in made.rows()]).dictionary_encode()
+    found = write(tmp_path / "a.parquet", episode=episodes, success=success, family=words)
+    expected = made.write_parquet(tmp_path / "b.parquet", made.rows())
+    assert told(read_rows([found])) == told(read_rows([expected]))
+
+
+@pytest.mark.parametrize("gap", [None, float("nan")])
+def test_a_scene_may_lack_its_seed_but_no_rollout_the_models(tmp_path: Path, gap: Any) -> None:
+    seeds = [gap, *(float(row.seed or 0) for row in made.rows()[1:])]
+    path = write(tmp_path / "a.parquet", seed=pa.array(seeds, from_pandas=False))
+    assert read_rows([path]).list("seed")[:2] == [None, 1]
+    text = made.write_csv(tmp_path / "b.csv", made.rows()).read_text()
+    (tmp_path / "b.csv").write_text(text.replace(",1000,", ",1000.0,"))  # as with a gap beside it
+    assert 1000 in read_rows([tmp_path / "b.csv"]).list("seed")
+    models = pa.array([0.0, gap, *([5.0] * 105)], from_pandas=False)
+    path = write(tmp_path / "c.parquet", model_seed=models)
+    with pytest.raises(BadRowsError, match=r"1 bad row:\n.*row 2: model_seed .*; expected"):
+        read_rows([path])
+    found = read_rows([path], lenient=True)
+    assert (len(found), found.refused, found.names("model_seed")) == (106, 1, [0, 5])
+
+
+# --- bad rows ----------------------------------------------------------------------------------
+
+BAD = {
+    "a family": ("my-memory,MoveCub,k0,0,7,easy,fail,0,9", "Did you mean 'MoveCube'?"),
+    "no family": ("my-memory,,k0,0,7,easy,fail,0,9", "family '' is none of"),
+    "a condition": ("my-memory,MoveCube,k64,0,7,easy,fail,0,9", "'k64' is not a condition"),
+    "a status": ("my-memory,MoveCube,k0,0,7,easy,failed,0,9", "Did you mean 'fail'?"),
+    "won": ("my-memory,MoveCube,k0,0,7,easy,fail,1,9", "success True contradicts status 'fail'"),
+    "lost": ("my-memory,MoveCube,k0,0,7,easy,error,0,9", "success False contradicts status 'error"),
+    "neither": ("my-memory,MoveCube,k0,0,7,easy,success,,9", "success (empty) contradicts"),
+    "maybe": ("my-memory,MoveCube,k0,0,7,easy,fail,maybe,9", "success 'maybe'; expected 1, 0"),
+    "below 0": ("my-memory,MoveCube,k0,-1,7,easy,fail,0,9", "episode '-1'; expected a whole"),
+    "half": ("my-memory,MoveCube,k0,1.5,7,easy,fail,0,9", "episode '1.5'; expected a whole"),
+    "grouped": ("my-memory,MoveCube,k0,1_0,7,easy,fail,0,9", "episode '1_0'; expected a whole"),
+    "Arabic": ("my-memory,MoveCube,k0,٣,7,easy,fail,0,9", "episode '٣'; expected a whole"),
+    "spaced": ("my-memory,MoveCube,k0, 3,7,easy,fail,0,9", "episode ' 3'; expected a whole"),
+    "too great": (f"my-memory,MoveCube,k0,{10**18},7,easy,fail,0,9", "expected a whole number"),
+    "no episode": ("my-memory,MoveCube,k0,,7,easy,fail,0,9", "episode (empty); expected a whole"),
+    "steps": ("my-memory,MoveCube,k0,0,7,easy,fail,0,1301", "steps '1301'; expected a whole"),
+    "a seed": ("my-memory,MoveCube,k0,0,x,easy,fail,0,9", "seed 'x'; expected a whole number"),
+    "difficulty": ("my-memory,MoveCube,k0,0,7,tough,fail,0,9", "difficulty 'tough' is none of"),
+    "two difficulties": ("my-memory,MoveCube,k1,0,7,hard,fail,0,9", "difficulty 'hard' beside"),
+    "two seeds": ("my-memory,MoveCube,k1,0,9,easy,fail,0,9", "seed 9 beside 7"),
+    "a slip": ("pi05-baseline,MoveCube,k0,0,7,easy,fail,0,9", "reads like the system 'pi05_bas"),
+    "no system": (",MoveCube,k0,0,7,easy,fail,0,9", "'' is not the name of a system"),
+    "too short": ("my-memory,MoveCube,k0,1,7,easy,fail,0", "the line has 8 fields; expected 9"),
+    "twice": (GOOD, "the same rollout as"),
+    "blank": ("", "'' is not the name of a system"),
+}
+
+
+@pytest.mark.parametrize(("line", "reason"), BAD.values(), ids=BAD.keys())
+def test_bad_rows_are_refused_with_file_line_and_reason(
+    tmp_path: Path, line: str, reason: str
+) -> None:
+    path = made.released(tmp_path / "rows.csv", [GOOD, line, GOOD.replace("k0", "k3")])
+    with pytest.raises(BadRowsError) as raised:
+        read_rows([path])
+    assert raised.value.message.startswith(f"1 bad row:\n{path}, line 3: ")
+    assert reason in raised.value.message
+    assert raised.value.hint is not None and "--lenient" in raised.value.hint
+    # Leniently it is left out and counted; the others stay.
+    found = read_rows([path], lenient=True)
+    assert (found.refused, len(found)) == (1, 2)
+    assert found.refusals[0].startswith(f"{path}, line 3: ") and reason in found.refusals[0]
+
+
+OF_RUNS = {
+    "another split": ({"revision": "cd" * 32}, "rows of different splits do not mix"),
+    "no revision": ({"revision": ""}, "revision (empty); expected"),
+    "another protocol": ({"protocol_version": 2}, "protocol_version '2'; expected a whole"),
+    "another scene": ({"seed": 5}, "seed 5 beside 1002: an episode has one"),
+    "a path": ({"simulator": "../escaped"}, "simulator '../escaped'; expected up to 128 letters"),
+    "a folder": ({"simulator": "a/b"}, "simulator 'a/b'; expected"),
+    "hidden": ({"simulator": ".hidden"}, "simulator '.hidden'; expected"),
+    "no simulator": ({"simulator": ""}, "simulator (empty); expected"),
+    "a long name": ({"simulator": "x" * 129}, "expected up to 128"),
+    "a name in capitals": ({"simulator": "RoboMME"}, "Did you mean 'robomme'?"),
+    "a fraction": ({"retrieval_selected_lesson_fraction": "half"}, "'half'; expected"),
+}
+
+
+@pytest.mark.parametrize(("change", "reason"), OF_RUNS.values(), ids=OF_RUNS.keys())
+def test_bad_rows_of_runs_are_refused(tmp_path: Path, change: dict[str, Any], reason: str) -> None:
+    rows = made.rows()
+    rows[20] = replace(rows[20], **change)
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    with pytest.raises(BadRowsError) as raised:
+        read_rows([path])
+    first = raised.value.message.splitlines()[1]
+    assert first.startswith(f"{path}, line 22: ") and reason in first
+    found = read_rows([path], lenient=True)
+    assert (found.refused, len(found)) == (1, 106)
+
+
+def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
+    rows = [replace(row, goal="do\nit" if row.episode % 2 else "do") for row in made.rows()[:20]]
+    rows[5] = replace(rows[5], goal='a "long\r\n\nstory"')
+    rows[7] = replace(rows[7], family="X")
+    rows[15] = rows[14]
+    path = made.write_csv(tmp_path / "a.csv", rows)
+    lines = path.read_bytes().decode().splitlines(keepends=True)
+    begins = [n for n, line in enumerate(lines, 1) if line.startswith(made.BASE)]
+    lines[begins[18] - 1] = "too,short\n"
+    path.write_bytes("".join(lines).encode())
+    found = read_rows([path], lenient=True)
+    assert len(begins) == 20 and len(found) == 17
+    assert [text.removeprefix(f"{path}, line ")[:10] for text in found.refusals] == [
+        f"{begins[7]}: family"[:10],
+        f"{begins[15]}: the same"[:10],
+        f"{begins[18]}: the line"[:10],
+    ]
+
+
+def test_rows_of_parquet_are_counted_from_one(tmp_path: Path) -> None:
+    names = [row.family for row in made.rows()]
+    names[17] = "Unknown"
+    with pytest.raises(BadRowsError, match=r"x\.parquet, row 18: family 'Unknown'"):
+        read_rows([write(tmp_path / "x.parquet", family=pa.array(names))])
+
+
+def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
+    lines = [f"my-memory,MoveCube,k0,{n},{n},easy,fail,1,9" for n in range(25)]
+    path = made.released(tmp_path / "rows.csv", lines)
+    with pytest.raises(BadRowsError) as raised:
+        read_rows([path])
+    shown = raised.value.message.splitlines()
+    assert (shown[0], len(shown), shown[-1]) == ("25 bad rows:", 12, "… and 15 more")
+    assert len(read_rows([path], lenient=True).refusals) == 10
+
+
+def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -> None:
+    rows = made.rows()
+    other = replace(rows[8], status="timeout", success=False)  # rows[8] failed
+    one = made.write_csv(tmp_path / "one.csv", rows[:50])
+    two = made.write_csv(tmp_path / "two.csv", [other, rows[60]])
+    three = made.write_csv(tmp_path / "three.csv", [rows[3], rows[8]])
+    with pytest.raises(BadRowsError) as raised:
+        read_rows([one, two, three])
+    more = "; its rows contradict each other"
+    assert raised.value.message.splitlines() == [
+        "4 bad rows:",
+        f"{one}, line 10: the same rollout as {two}, line 2{more}",
+        f"{two}, line 2: the same rollout as {one}, line 10{more}",
+        f"{three}, line 2: the same rollout as {one}, line 5",
+        f"{three}, line 3: the same rollout as {one}, line 10{more}",
+    ]
+    # Of equal rows one stays and counts.
+    kept = made.write_csv(tmp_path / "kept.csv", [*rows[:8], *rows[9:50], rows[60]])
+    for paths in ([one, two, three], [three, two, one], [two, one, three]):
+        found = read_rows(paths, lenient=True)
+        assert (told(found), found.refused) == (told(read_rows([kept])), 4)
+
+
+def test_of_rows_that_differ_on_an_episode_the_first_counts(tmp_path: Path) -> None:
+    first = next(row for row in made.rows() if row.condition == "k0")
+    kinds = (("k0", 7), ("k1", 8), ("k3", 7), ("k7", 8))
+    rows = [replace(first, condition=name, seed=seed) for name, seed in kinds]
+    found = read_rows([path := made.write_csv(tmp_path / "a.csv", rows)], lenient=True)
+    assert [text.partition(": ")[0] for text in found.refusals] == [
+        f"{path}, line 3",
+        f"{path}, line 5",
+    ]
+
+
+def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:
+    path = made.write_csv(tmp_path / "a.csv", made.changed(made.rows()[:3], family="X"))
+    with pytest.raises(BadRowsError, match=r"all 3 rows .* are bad; the first is .*line 2: family"):
+        made.score(path, lenient=True)
+    with pytest.raises(BadRowsError, match="no rows"):
+        made.score(made.write_csv(tmp_path / "b.csv", []))
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("family,condition,episode,status", "lacks the columns success"),
+        ("family,condition,episode,status,success", "names no system"),
+        ("system,simulatr,family,condition,episode,status,success", "has the column 'simulatr'"),
+        ("system,family,family,condition,episode,status,success", "two columns 'family'"),
+        (
+            "system,simulator,split,family,condition,episode,status,success",
+            "lacks the columns revision, episode_split, model_seed, protocol_version;",
+        ),
+        ("", "lacks the columns"),
+    ],
+)
+def test_files_without_what_is_needed_are_refused(
+    tmp_path: Path, header: str, message: str
+) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text(header + "\n")
+    with pytest.raises(FormatError) as raised:
+        read_rows([path])
+    assert message in raised.value.message and str(path) in raised.value.message
+    assert raised.value.hint
+
+
+def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = made.write_parquet(tmp_path / "rows.parquet", made.rows()).read_bytes()
+    text = made.write_csv(tmp_path / "rows.csv", made.rows()).read_bytes()
+    record = (made.write_run(tmp_path / "run", made.rows()) / "rollouts.jsonl").read_bytes()
+    damaged = {
+        "a.csv": (b"a,b\n1,\xff\n", "position 6"),
+        # A byte that is no text in a line with too few fields.
+        "late.csv": (text + b"\xe9,x\n" + text, f"position {len(text)}"),
+        "cut.csv": (b"a,b\n1,\xc3", "position 6"),
+        "empty.parquet": (b"", "cannot be read"),
+        "b.parquet": (whole[:200] + bytes(100) + whole[300:], "cannot be read"),
+        "a.jsonl": (record.replace(b'"episode"', b"episode", 1), "cannot be read"),
+        "b.jsonl": (record + b"[1]\n", "cannot be read"),
+        "c.jsonl": (record + b"[" * 100_000 + b"\n", "cannot be read"),
+        "rows.txt": (b"", "no .parquet or .csv or .jsonl file"),
+    }
+    for name, (data, message) in damaged.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(FormatError, match=message) as raised:
+            read_rows([tmp_path / name], lenient=True)
+        assert name in raised.value.message
+    nested = write(tmp_path / "n.parquet", family=pa.nulls(107, pa.list_(pa.string())))
+    with pytest.raises(FormatError, match="list<"):
+        read_rows([nested])
+    assert capfd.readouterr().err == ""
+
+
+def test_files_that_are_not_there_or_twice(tmp_path: Path) -> None:
+    for path in (tmp_path / "nowhere", tmp_path):
+        with pytest.raises(MissingFileError):
+            read_rows([path])
+    path = made.write_csv(tmp_path / "a.csv", made.rows())
+    with pytest.raises(InvalidOptionError, match=r"a\.csv is given twice"):
+        read_rows([path, tmp_path / "." / "a.csv"])
+    folder = made.write_run(tmp_path / "run", made.rows())
+    (folder / "run.json").write_text(json.dumps({"format_version": 99}))
+    with pytest.raises(FormatError, match="format version 99"):
+        read_rows([folder])
+
+
+def test_rows_of_one_system_with_and_without_a_revision_do_not_mix(tmp_path: Path) -> None:
+    rows = [r for r in made.rows() if r.system == made.RETRIEVAL]
+    half = made.write_csv(tmp_path / "half.csv", rows[:12])
+    other = tmp_path / "other.csv"
+    other.write_text(
+        "system,simulator,family,condition,episode,status,success\n"
+        f"{made.RETRIEVAL},tabletop,MoveCube,k7,3,success,1\n"
+    )
+    for paths in ([half, other], [other, half]):
+        with pytest.raises(InvalidOptionError, match="name no revision"):
+            read_rows(paths, lenient=True)
+
+
+def test_reading_never_imports_pandas(tmp_path: Path) -> None:
+    """It would take seconds, and a Ctrl-C meanwhile would be lost."""
+    (tmp_path / "pandas").mkdir()
+    mark = tmp_path / "imported"
+    (tmp_path / "pandas" / "__init__.py").write_text(f"open({str(mark)!r}, 'w').close()")
+    rows = made.rows()
+    rows[0] = replace(rows[0], seed=None, video="videos/0.mp4")
+    paths = [
+        made.write_parquet(tmp_path / "a.parquet", rows),
+        made.write_csv(tmp_path / "b.csv", made.repeat(rows, 1)),
+        write(tmp_path / "c.parquet", model_seed=pa.array([2.0] * 107), seed=pa.nulls(107)),
+        made.write_run(tmp_path / "run", made.repeat(rows, 3)),
+    ]
+    code = (
+        "import sys; from pathlib import Path; "
+        "from robomme_interference_data.evaluate.score import Grid, Settings; "
+        "from robomme_interference_data.evaluate.score.scoring import score; "
+        "score(Settings(tuple(map(Path, sys.argv[1:])), grid=Grid.GIVEN), draws=10)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", code, *map(str, paths)]
+    subprocess.run(command, env=environment, timeout=120, check=True)
+    assert not mark.exists()
+
+
+def test_places_of_values() -> None:
+    rows = Rows({"status": np.array([1, 0, 1])}, {"status": ["fail", "success"]}, {})
+    assert rows.places("status", ["success", "timeout"]).tolist() == [0, -1, 0]
+    assert rows.chosen(np.array([True, False, True])).list("status") == ["success"] * 2
+    assert rows.chosen(np.array([1])).names("status") == ["fail"]
