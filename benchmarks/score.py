@@ -1,6 +1,6 @@
 """How fast rows are scored, against pandas computing the same tables.
 
-    python benchmarks/score.py               # the full grid, then ten million rows; minutes
+    python benchmarks/score.py               # the full grid, then a million rows; minutes
     python benchmarks/score.py --repeats 20  # fewer repeats in the second part
 
 Each way reads the rows, checks them, and writes the same rates, intervals, exact tests and
@@ -28,18 +28,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
-from robomme_interference_data.bootstrap import _drawn
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA
-from robomme_interference_data.evaluate.score.cells import main_markdown
+from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.evaluate.score.scoring import score
-from robomme_interference_data.tables import write_tables
+from robomme_interference_data.records import Rollout
+from robomme_interference_data.rows import arrow_schema
+from robomme_interference_data.stats import _drawn
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 KS = (0, 1, 3, 7)
 SYSTEMS = 11
-EPISODES = 50
-GRID = SYSTEMS * len(CONDITIONS) * len(FAMILIES) * EPISODES
+EPISODES = len(FAMILIES) * 50
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rounds", type=positive, default=3, help="repetitions of the full grid")
     parser.add_argument(
-        "--repeats", type=positive, default=405, help="repeats of the grid in the second part"
+        "--repeats", type=positive, default=40, help="repeats of the grid in the second part"
     )
     parser.add_argument("--draws", type=positive, default=10_000, help="of each bootstrap")
     options = parser.parse_args()
@@ -68,7 +67,7 @@ def main() -> None:
         calls = {w: partial(c, rows, folder / "out", options.draws) for w, c in WAYS.items()}
         times = interleave(calls, options.rounds)
         lines = [
-            [f"{GRID:,}", way, f"{times.median(way):.2f}", f"{times.ratio(way, 'score'):.1f}"]
+            [f"{grid():,}", way, f"{times.median(way):.2f}", f"{times.ratio(way, 'score'):.1f}"]
             for way in WAYS
         ]
         print(
@@ -88,7 +87,7 @@ def main() -> None:
         }
         lines = [
             [
-                f"{GRID * options.repeats:,}",
+                f"{grid() * options.repeats:,}",
                 way,
                 f"{run.seconds:.1f}",
                 f"{run.seconds / runs['score'].seconds:.1f}",
@@ -115,64 +114,71 @@ def measure(way: str, rows: Path, out: Path, draws: int) -> Run:
     return Run(time.perf_counter() - began, peak_memory() - before)
 
 
+def grid() -> int:
+    """Return the rows of the full grid: each system under five conditions, π0.5 under one."""
+    return (SYSTEMS * len(CONDITIONS) + 1) * EPISODES
+
+
 def write_rows(path: Path, repeats: int) -> Path:
     """Write made-up rows of the grid, in the columns of a run, a row group per repeat or more."""
     numbers = np.random.default_rng(0)
-    skill = numbers.random((SYSTEMS, len(CONDITIONS), 1, 1)) * 0.4 + 0.1
+    skill = numbers.random((SYSTEMS, len(CONDITIONS))) * 0.4 + 0.1
     skill[:, 0] = 0  # without history
-    ease = numbers.random((1, 1, len(FAMILIES), EPISODES)) * 0.5
-    system, condition, family, episode = np.indices(
-        (SYSTEMS, len(CONDITIONS), len(FAMILIES), EPISODES)
-    ).reshape(4, -1)
-    chance = (skill + ease).ravel()
+    cells = [*np.ndindex(SYSTEMS, len(CONDITIONS)), (SYSTEMS, 0)]
+    system, condition = (part.repeat(EPISODES) for part in np.array(cells).T)
+    family, episode = np.divmod(np.tile(np.arange(EPISODES), len(cells)), 50)
+    chance = np.append(skill, 0).repeat(EPISODES) + np.tile(
+        numbers.random(EPISODES) * 0.5, len(cells)
+    )
+    same = np.zeros(grid(), int)
     texts = {
-        "system": ([f"memory-{number}" for number in range(SYSTEMS)], system),
-        "simulator": (["tabletop"], np.zeros(GRID, int)),
-        "split": (["made-up"], np.zeros(GRID, int)),
-        "revision": (["ab" * 32], np.zeros(GRID, int)),
+        "system": ([*(f"memory-{n}" for n in range(SYSTEMS)), "pi05_baseline"], system),
+        "simulator": (["tabletop"], same),
+        "split": (["made-up"], same),
+        "revision": (["ab" * 32], same),
         "family": (list(FAMILIES), family),
         "condition": (list(CONDITIONS), condition),
-        "episode_split": (["test"], np.zeros(GRID, int)),
+        "episode_split": (["test"], same),
         "difficulty": (["easy", "medium", "hard"], episode % 3),
-        "goal": (["do it"], np.zeros(GRID, int)),
+        "goal": (["do it"], same),
     }
-    with pq.ParquetWriter(path, ROLLOUT_SCHEMA, compression="zstd") as writer:
+    fixed = {"protocol_version": 1, "steps": 200, "history_frames": 300, "lesson_frames": 100}
+    fixed |= {"lesson_share": 0.5, "attempt": 1}
+    schema = arrow_schema(Rollout)
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         for repeat in range(repeats):
-            won = numbers.random(GRID) < chance
+            won = numbers.random(grid()) < chance
             columns: dict[str, Any] = {
                 name: pa.DictionaryArray.from_arrays(
                     pa.array(codes.astype(np.int32)), pa.array(values)
                 ).cast(pa.string())
                 for name, (values, codes) in texts.items()
             }
+            columns |= {name: np.full(grid(), value) for name, value in fixed.items()}
             columns |= {
                 "episode": episode,
-                "model_seed": np.full(GRID, repeat),
-                "protocol_version": np.ones(GRID),
-                "seed": family * EPISODES + episode,
+                "model_seed": np.full(grid(), repeat),
+                "seed": family * 50 + episode,
                 "status": pa.array(np.where(won, "success", "fail")),
                 "success": won,
-                "steps": np.full(GRID, 200),
-                "history_frames": np.full(GRID, 300),
-                "lesson_frames": np.full(GRID, 100),
-                "lesson_share": np.full(GRID, 0.5),
-                "attempt": np.ones(GRID),
             }
             arrays = [
                 pa.array(columns[f.name]).cast(f.type)
                 if f.name in columns
-                else pa.nulls(GRID, f.type)
-                for f in ROLLOUT_SCHEMA
+                else pa.nulls(grid(), f.type)
+                for f in schema
             ]
-            writer.write_table(pa.table(arrays, schema=ROLLOUT_SCHEMA))
+            writer.write_table(pa.table(arrays, schema=schema))
     return path
 
 
 def ours(rows: Path, out: Path, draws: int) -> None:
     """Score with the package, the draws made anew: it keeps them from one call to the next."""
     _drawn.cache_clear()
-    found = score([rows], draws=draws)
-    write_tables(list(found.tables.values()), out, main_markdown(found.cells))
+    out.mkdir(exist_ok=True)
+    for name, found in score(Settings((rows,)), draws).tables.items():
+        (out / f"{name}.csv").write_text(found.csv())
+        (out / f"{name}.md").write_text(found.markdown())
 
 
 Interval = tuple[float, float, float]
@@ -268,6 +274,8 @@ def with_pandas(rows: Path, out: Path, draws: int, *, scipy: bool) -> None:
     weights = (x - x.mean()) / ((x - x.mean()) ** 2).sum()
     records = []
     for system, group in means.groupby("system"):
+        if group["condition"].nunique() < len(CONDITIONS):
+            continue  # π0.5 has nothing to compare
         wide = group.pivot_table(index=["family", "episode"], columns="condition", values="success")
         once = first[first["system"] == system].pivot_table(
             index=["family", "episode"], columns="condition", values="success"

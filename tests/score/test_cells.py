@@ -7,7 +7,6 @@ import pytest
 from support import scoring as made
 from support.scoring import record
 
-from robomme_interference_data import conditions
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score import Grid
@@ -160,11 +159,6 @@ def test_a_condition_of_another_kind_is_a_cell_and_no_contrast(
     # Alone it is a score, too.
     alone = made.write_csv(tmp_path / "b.csv", made.cells({(made.OWN, "filler-k3"): "sf"}))
     assert made.score(alone, grid=Grid.BENCHMARK).tables["lift"].rows == ()
-
-
-def test_kinds_are_ordered_as_registered(filler: None) -> None:
-    names = [one.name for one in conditions.in_order(["filler-k0", "k7", NO_HISTORY, "k1"])]
-    assert names == [NO_HISTORY, "k1", "k7", "filler-k0"]
 
 
 def test_episodes_of_other_splits_are_other_episodes(tmp_path: Path) -> None:

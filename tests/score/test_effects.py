@@ -75,17 +75,6 @@ def test_decay_by_hand(small: Score) -> None:
     assert {one["system"] for one in records(small, "decay")} == {BASE, RETRIEVAL}
 
 
-def test_two_episodes_prove_no_lift_and_no_retention(tmp_path: Path) -> None:
-    found = scored(tmp_path, own(none="ff", k0="ss", k7="ss"))
-    lift = record(found, "lift", condition="k0")
-    assert (lift["p"], lift["interval"]) == (0.5, "newcombe")
-    assert (lift["low"], lift["high"]) == newcombe_paired(0, 2, 0, 0)
-    assert record(found, "lift", condition="k7")["retention"] is None
-    # None of two differs between k7 and k0: no difference, and no certainty of it.
-    effect = record(found, "effects", condition="k7")
-    assert (effect["low"], effect["high"]) == newcombe_paired(2, 0, 0, 0)
-
-
 def test_the_bootstrap_begins_at_ten_episodes_that_differ(tmp_path: Path) -> None:
     found = scored(
         tmp_path,

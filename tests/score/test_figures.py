@@ -1,6 +1,6 @@
 """What figures tell beside their points: who is who, what a hollow point means, who is left out."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.drawing import open_figure
-from robomme_interference_data.evaluate.score.curves import Data, looks_of, spread
+from robomme_interference_data.evaluate.score.curves import Data, Look, looks_of, spread
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
 from robomme_interference_data.records import Rollout
@@ -40,36 +40,31 @@ def names(figure: Any) -> list[str]:
 # --- looks -------------------------------------------------------------------------------------
 
 
-def test_two_dozen_own_systems_differ_without_colour() -> None:
-    own = [f"own-{number}" for number in range(24)]
-    looks = looks_of([*SYSTEMS, *own])
-    shapes = {(looks[name].marker, looks[name].line) for name in own}
-    assert len(shapes) == 24
-    assert not shapes & {(looks[name].marker, looks[name].line) for name in SYSTEMS}
-    more = looks_of([f"own-{number}" for number in range(48)])
-    assert len({(look.colour, look.marker, look.line) for look in more.values()}) == 48
-    # Neighbours differ in colour as well.
-    assert looks["own-0"].colour != looks["own-1"].colour != looks["own-2"].colour
+def shapes(looks: Iterable[Look], *, colour: bool = False) -> set[tuple[str, ...]]:
+    return {(look.colour * colour, look.marker, str(look.line)) for look in looks}
 
 
-def test_systems_of_the_table_look_the_same_in_every_figure() -> None:
-    without = {name for name, system in SYSTEMS.items() if not system.retrieval}
-    together = looks_of(["mine", *SYSTEMS])
+def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> None:
+    own = [f"own-{number}" for number in range(48)]
+    without = [name for name, system in SYSTEMS.items() if not system.retrieval]
+    together = looks_of([*own, *without])
+    assert len(shapes(together.values(), colour=True)) == len(together)
     for name in without:
         assert looks_of([name])[name] == together[name]
-    seen = {(together[n].colour, together[n].marker, together[n].line) for n in without}
-    assert len(seen) == len(without)
+    # Two dozen of one's own are told apart without colour, too.
+    mine, table = (shapes(together[n] for n in names) for names in (own[:24], without))
+    assert len(mine) == 24 and not mine & table
     paper = looks_of([system.name for system in PAPER_SYSTEMS]).values()
-    assert len({(look.colour, look.marker, look.line) for look in paper}) == 13
+    assert len(shapes(paper, colour=True)) == 13
 
 
 def test_several_systems_with_retrieval_are_stars_in_the_colours_of_their_bases() -> None:
     memories = [f"replay-{memory}" for memory in ("full", "framesamp", "window")]
     looks = looks_of([*memories, *(f"retrieval-{name}" for name in memories)])
-    assert len({(look.colour, look.marker, look.line) for look in looks.values()}) == 6
+    assert len(shapes(looks.values(), colour=True)) == 6
     for name in memories:
-        assert looks[f"retrieval-{name}"].colour == looks[name].colour
-        assert looks[f"retrieval-{name}"].marker == "*"
+        star = looks[f"retrieval-{name}"]
+        assert (star.colour, star.marker) == (looks[name].colour, "*")
     assert looks_of(["retrieval-replay-full"])["retrieval-replay-full"].colour == "#000000"
 
 

@@ -157,11 +157,6 @@ def test_published_rates_are_the_papers() -> None:
         counts = [n for n in range(451) if f"{100 * n / 450:.1f}" == f"{one.percent:.1f}"]
         assert counts == [one.successes] and one.n == 450
         assert SYSTEMS[one.system].paper and one.simulator == "robomme"
-    at = {(one.system, one.condition): one.percent for one in rates}
-    assert at[BASE, "k7"] == 19.3
-    assert at["symbolic-groundsg", "k7"] == 26.0
-    assert at["recurrent-ttt-context", "k3"] == 17.3
-    assert at[RETRIEVAL, "k1"] == 44.7
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
@@ -233,7 +228,7 @@ def test_tables_are_those_of_the_golden_files(
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the note of a comparison holds the paths as they were given
     rows = made.rows()
-    again = made.repeat((row for row in rows if row.condition == "k7"), 4)
+    again = made.changed((row for row in rows if row.condition == "k7"), model_seed=4)
     # In the repeat, the base system loses MoveCube/1 and gains MoveCube/2.
     lost = {1: "fail", 2: "success"}
     again = [

@@ -193,7 +193,7 @@ def test_where_episodes_flip(filler: None) -> None:
 
 def test_episodes_show_every_outcome(tmp_path: Path) -> None:
     rows = made.rows()
-    again = made.repeat([r for r in rows if r.condition == "k0"], 1)
+    again = made.changed([r for r in rows if r.condition == "k0"], model_seed=1)
     rows += made.changed(again, status="fail", success=False, error=None)
     found = episodes(made.score(made.write_csv(tmp_path / "a.csv", rows)), tmp_path)
     assert len(found) == 36

@@ -91,11 +91,6 @@ def cells(outcomes: Mapping[tuple[str, str], str], seed: int = 0) -> list[Rollou
     ]
 
 
-def repeat(given: Iterable[Rollout], seed: int) -> list[Rollout]:
-    """The same rollouts with another model seed."""
-    return [replace(one, model_seed=seed) for one in given]
-
-
 def changed(given: Iterable[Rollout], **values: Any) -> list[Rollout]:
     """The same rollouts with other values."""
     return [replace(one, **values) for one in given]
