@@ -1,6 +1,7 @@
 """Commands that look at splits and at this machine: `list`, `show` and `doctor`."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -8,14 +9,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from robomme_interference_data.progress import MESSAGES
+from robomme_interference_data.console import MESSAGES, AsJson, print_json
 
 __all__ = ["doctor", "list_buffers", "show"]
 
 # Goals and paths are shown as they are, whatever brackets and colons they hold.
 _OUT = Console(markup=False, emoji=False)
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON on stdout.")]
 
 
 def list_buffers(
@@ -97,10 +96,10 @@ def doctor(as_json: AsJson = False) -> None:
     """Tell what works on this machine, and the command that mends what does not."""
     from robomme_interference_data import doctor as module
 
-    checks = module.checks()
+    rows = module.checks()
     if as_json:
-        typer.echo(module.to_json(checks))
+        print_json([asdict(row) for row in rows])
     else:
-        _OUT.print(module.render(checks))
-    if module.any_failed(checks):
+        typer.echo(module.report(rows).text())
+    if module.any_failed(rows):
         raise typer.Exit(1)

@@ -7,18 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
-from robomme_interference_data.errors import (
-    SimulatorCrashError,
-    UnknownNameError,
-    nearest,
-)
+from robomme_interference_data.errors import SimulatorCrashError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.base import (
     CAMERAS,
     Demonstration,
     EpisodeInfo,
     Observation,
-    Status,
     action_array,
     camera_names,
 )
@@ -31,7 +27,7 @@ POLICIES = ("oracle", "guess")
 
 
 class TabletopSimulator:
-    """See `Simulator`. Keep to one in a process: `worker.RemoteSimulator` is for more.
+    """See `Simulator`. Keep to one in a process: an executor's workers are for more.
 
     Args:
         render: Whether to draw. Without, observations hold no images, and episodes run several
@@ -83,14 +79,8 @@ class TabletopSimulator:
         """Return the next action of `oracle` or `guess`; see `Simulator.act`."""
         self._running()
         if policy not in POLICIES:
-            raise UnknownNameError(f"no built-in policy {policy!r}", nearest(policy, POLICIES))
+            raise UnknownNameError.among("built-in policy", policy, "tabletop", POLICIES)
         return self._env.act(policy)
-
-    @property
-    def chance(self) -> float:
-        """Probability that a guess at the hidden answer of the present episode is right."""
-        self._running()
-        return self._env.chance
 
     def close(self) -> None:
         """Release the scene; further calls but `close` are errors."""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
