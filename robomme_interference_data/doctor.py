@@ -5,7 +5,6 @@ processes are asked whether the simulators work.
 """
 
 import ctypes
-import json
 import os
 import platform
 import shutil
@@ -18,6 +17,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.tables import Column, Table
 
 __all__ = ["Check", "any_failed", "checks", "report"]
@@ -234,29 +234,21 @@ def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check
 
 
 def check_robomme() -> Check:
-    """Ask RoboMME's interpreter, if one is named."""
+    """Start RoboMME's interpreter, if one is named."""
+    from robomme_interference_data.simulators.robomme import PYTHON_VARIABLE, RoboMMESimulator
+
     name = "Official simulator"
-    fix = "export ROBOMME_PYTHON=PATH, the Python of an environment that RoboMME is installed in"
-    python = os.environ.get("ROBOMME_PYTHON")
+    fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
+    python = os.environ.get(PYTHON_VARIABLE)
     if not python:
-        detail = "ROBOMME_PYTHON is not set; only --simulator robomme needs it"
+        detail = f"{PYTHON_VARIABLE} is not set; only --simulator robomme needs it"
         return Check(name, None, detail, fix)
     try:
-        done = subprocess.run(
-            [python, Path(__file__).parent / "simulators" / "robomme_worker.py"],
-            env={**os.environ, "PYTHONSAFEPATH": "1"},
-            capture_output=True,
-            text=True,
-            timeout=ROBOMME_S,
-            check=True,
-        )
-        found = json.loads(done.stdout.splitlines()[-1])
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError) as error:
-        return Check(name, False, f"{python} cannot be asked: {error}", fix)
-    if "problem" in found:
-        return Check(name, False, f"{python}: {found['problem']}", fix)
-    versions = f"Python {found['python']}, numpy {found['numpy']}"
-    return Check(name, True, f"{python}: {versions}, {len(found['families'])} families")
+        with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
+            versions = [f"{key} {value}" for key, value in simulator.versions.items()]
+    except InterferenceError as error:
+        return Check(name, False, first_line(error), fix)
+    return Check(name, True, f"{python}: {', '.join(versions)}")
 
 
 # --- the Hub -------------------------------------------------------------------------------------

@@ -49,8 +49,8 @@ class Executor(Protocol):
         Args:
             function: What to do of a task.
             tasks: Picklable tasks.
-            time_limit: Seconds that one task may take, the start of a worker that it has to wait
-                for included; None for no limit.
+            time_limit: Seconds that one task may take, and as many for the start of a worker; None
+                for no limit.
             attempts: How often a task is started before what went wrong is reported.
             again: Errors of this package after which a task is started again.
 
@@ -132,13 +132,13 @@ class Processes:
                     outcome = worker.settle()
                     if outcome is None:
                         continue
-                    retired = isinstance(outcome.error, WorkerRetiredError)
-                    if worker.over or retired:
+                    if worker.over:
                         worker.stop()
                         running.remove(worker)
-                    if worker.over:
                         to_start.append(worker.number)
-                    if retired:
+                    if isinstance(outcome.error, WorkerRetiredError):
+                        worker.stop()
+                        running.remove(worker)
                         waiting.appendleft((outcome.task, outcome.attempts))
                         if not running and not to_start:
                             raise outcome.error

@@ -186,6 +186,8 @@ class WorkerProcess:
             kind, *rest = message
             if kind == "ready":
                 self._ready = True
+                for what, (seconds, _) in self._limits.items():
+                    self._limits[what] = seconds, time.monotonic() + seconds
             elif kind == "limit":
                 seconds, what = rest
                 if seconds is None:
@@ -242,24 +244,17 @@ class WorkerProcess:
         return self._outcome(None, error, trace.decode(errors="replace") or None)
 
     def _death(self) -> Exception:
-        self._process.join(_CLOSE_S)  # threads of its own can keep one that is through
-        self._process.kill()
         self._process.join()
         code = self._process.exitcode or 0
         if self._ready or code < 0:  # a signal can come at any time
             return RuntimeError(f"the worker process died (exit code {code})")
-        hint = 'call under  if __name__ == "__main__":'
+        what = f"ended before its first task (exit code {code}); what it said is above"
         if code == _STARTED_AGAIN:
-            raise WorkerError(
-                "the worker processes came upon the call that starts them: each imports the "
-                "script that is running",
-                f"Put the {hint}",
-            )
+            what = "came upon the call that started it"
         raise WorkerError(
-            f"a worker process ended before its first task (exit code {code}); what it said is "
-            "above",
-            f"Worker processes import the script that starts them: it has to be a file, with the "
-            f"{hint}",
+            f"a worker process {what}",
+            "Worker processes import the script that starts them: it has to be a file, with the "
+            'call under  if __name__ == "__main__":',
         )
 
 

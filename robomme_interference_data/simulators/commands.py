@@ -117,7 +117,8 @@ class _Clip:
         bar = np.full((16, picture.shape[1], 3), colour, np.uint8)
         picture = np.concatenate([bar, picture])
         if self._encoder is None:
-            self._encoder = VideoEncoder(self._path, CLIP, FPS, *picture.shape[:2], "mp4")
+            height, width, _ = picture.shape
+            self._encoder = VideoEncoder(self._path, CLIP, FPS, height, width, container="mp4")
         self._encoder.add(picture)
 
     def close(self) -> None:

@@ -3,13 +3,13 @@
 import os
 import re
 import shutil
-import socket
 import subprocess
 import threading
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Self
+from multiprocessing.connection import Pipe
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,13 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 from robomme_interference_data.simulators import robomme_worker
 from robomme_interference_data.simulators.base import (
+    ACTION_SIZE,
     CAMERAS,
+    Begun,
     Demonstration,
     EpisodeInfo,
     Observation,
-    action_array,
+    OneAtATime,
     camera_names,
 )
 
@@ -68,14 +70,15 @@ Answer = tuple[dict[str, Any], dict[str, NDArray[Any]]]
 """Plain values, and arrays by name."""
 
 
-class RoboMMESimulator:
+class RoboMMESimulator(OneAtATime):
     """See `Simulator`. RoboMME runs in a process of its own, which is started at once.
 
     Each episode gets a fresh environment, and RoboMME plays its demonstration at every reset:
     5 to 125 s on two cores. RoboMME returns no actions of its demonstrations, so
     `Demonstration.actions` is empty, `(0, 8)`. In the families with a stick (`PatternLock`,
     `RouteStick`) the gripper's opening is 0 throughout, and its action is without effect. RoboMME
-    would let an episode go on after 1300 steps; here its status is then `timeout`.
+    would let an episode go on after 1300 steps; here its status is then `timeout`. An image of
+    another size than 256×256 is an `InvalidOptionError` of `reset`.
 
     RoboMME keeps memory of the episodes that it has played, so every few of them get a new
     process; what they return does not depend on it. When it dies, or takes too long, it is ended
@@ -105,82 +108,13 @@ class RoboMMESimulator:
     ):
         self._cameras = camera_names(self.name, cameras)
         self._python, self._answer_s = find_python(python), answer_s
-        self._episode: EpisodeId | None = None
-        self._steps = self._played = 0
-        self._closed = False
+        self._played = 0
         self._process = _Process(self._python, answer_s)
 
     @property
     def versions(self) -> dict[str, str]:
         """Versions in its interpreter: `robomme_python`, `robomme_numpy`, `robomme` if known."""
         return self._process.versions
-
-    def reset(
-        self, episode_id: str, demonstration: bool = True
-    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
-        """Start an episode; see `Simulator.reset`.
-
-        Raises:
-            InvalidOptionError: RoboMME draws images of another size than 256×256.
-        """
-        self._episode = None  # an episode that is refused, or breaks, leaves none to step
-        if self._closed:
-            raise SimulatorCrashError("the simulator is closed", "Make another one.")
-        episode, known = EpisodeId.parse(str(episode_id)), self._process.families
-        if episode.family not in known:
-            raise UnknownNameError.among("family", episode.family, self.name, known)
-        if self._process.pid is None or self._played >= EPISODES:
-            self._process.end()
-            self._process = _Process(self._python, self._answer_s)
-            self._played = 0
-        self._played += 1
-        about, arrays = self._process.call(
-            "reset",
-            family=episode.family,
-            split=episode.split,
-            index=episode.index,
-            max_steps=MAX_STEPS,
-            cameras=self._cameras,
-            demonstration=demonstration,
-        )
-        first = self._observation(arrays, self._cameras)
-        images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
-        states = arrays["states"][:-1]
-        self._episode, self._steps = episode, 0
-        goals = tuple(about["goals"])
-        return (
-            Demonstration(images, states, np.empty((0, 8), np.float32)),
-            first,
-            EpisodeInfo(goals[0], goals, about["difficulty"], about["seed"], self.name),
-        )
-
-    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
-        """Execute one action; see `Simulator.step`.
-
-        Raises:
-            SimulatorCrashError: Also where RoboMME's own status is `error`, with its message.
-        """
-        if self._episode is None:
-            raise SimulatorCrashError(
-                "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
-            )
-        action = action_array(action)
-        running, self._episode = self._episode, None  # an episode that breaks is over
-        where = str(running)
-        answer, arrays = self._process.call(
-            "step", {"action": action[None]}, where=where, observe=observe
-        )
-        status = Status(answer["status"])
-        self._steps += 1
-        if status is Status.ERROR:
-            raise self._process.error(
-                f"reports an error at step {self._steps}: {answer['message']}", where
-            )
-        if status is Status.ONGOING and self._steps >= MAX_STEPS:
-            status = Status.TIMEOUT
-        if status is Status.ONGOING:
-            self._episode = running
-        return self._observation(arrays, self._cameras if observe else ()), status
 
     def act(self, policy: str) -> NDArray[np.float32]:
         """Refuse: RoboMME has no built-in policy.
@@ -199,16 +133,49 @@ class RoboMMESimulator:
         return self._process.pid
 
     def close(self) -> None:
-        """End RoboMME's process."""
-        self._closed = True
-        self._episode = None
+        """End RoboMME's process; further calls but `close` are errors."""
+        super().close()
         self._process.end()
 
-    def __enter__(self) -> Self:
-        return self
+    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+        known = self._process.families
+        if episode.family not in known:
+            raise UnknownNameError.among("family", episode.family, self.name, known)
+        if self._process.pid is None or self._played >= EPISODES:
+            self._process.end()
+            self._process = _Process(self._python, self._answer_s)
+            self._played = 0
+        self._played += 1
+        about, arrays = self._process.call(
+            "reset",
+            family=episode.family,
+            split=episode.split,
+            index=episode.index,
+            max_steps=MAX_STEPS,
+            cameras=self._cameras,
+            demonstration=demonstration,
+        )
+        first = self._observation(arrays, self._cameras)
+        images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
+        states, no_actions = arrays["states"][:-1], np.empty((0, ACTION_SIZE), np.float32)
+        goals = tuple(about["goals"])
+        return (
+            Demonstration(images, states, no_actions),
+            first,
+            EpisodeInfo(goals[0], goals, about["difficulty"], about["seed"], self.name),
+        )
 
-    def __exit__(self, *_: Any) -> None:
-        self.close()
+    def _execute(
+        self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
+    ) -> tuple[Observation, Status]:
+        answer, arrays = self._process.call(
+            "step", {"action": [action]}, where=str(episode), observe=observe
+        )
+        status = Status(answer["status"])
+        if status is Status.ERROR:
+            what = f"reports an error at step {self._steps}: {answer['message']}"
+            raise self._process.error(what, str(episode))
+        return self._observation(arrays, self._cameras if observe else ()), status
 
     def _observation(
         self, arrays: dict[str, NDArray[Any]], cameras: tuple[str, ...]
@@ -243,8 +210,7 @@ class _Process:
     def __init__(self, python: str, answer_s: float):
         self._python, self._answer_s = python, answer_s
         self._log: deque[bytes] = deque(maxlen=_LOG_LINES)
-        self._channel, theirs = socket.socketpair()
-        self._channel.settimeout(answer_s)
+        self._channel, theirs = Pipe()
         try:
             with theirs:
                 self._process = subprocess.Popen(
@@ -279,7 +245,7 @@ class _Process:
     def call(
         self,
         call: str,
-        arrays: dict[str, NDArray[Any]] | None = None,
+        arrays: dict[str, list[NDArray[Any]]] | None = None,
         *,
         where: str = "",
         **arguments: Any,
@@ -301,16 +267,16 @@ class _Process:
 
     def _answer(self, call: str, where: str) -> Answer:
         try:
+            if not self._channel.poll(self._answer_s):
+                self.end(now=True)
+                what = f"took more than {self._answer_s:g} s to {call}; its process was ended"
+                raise self.error(what, where)
             return robomme_worker.receive(self._channel)
-        except TimeoutError:
-            self.end(now=True)
-            what = f"took more than {self._answer_s:g} s to {call}; its process was ended"
-            raise self.error(what, where) from None
         except (EOFError, OSError) as error:
             self.end()
             what = f"died during {call}, exit code {self._process.returncode}"
             raise self.error(what, where) from error
-        except BaseException:  # such as Ctrl-C: an answer half read leaves the two out of step
+        except BaseException:  # such as Ctrl-C: what comes later would be taken for another answer
             self.end(now=True)
             raise
 
@@ -327,7 +293,7 @@ class _Process:
     def end(self, *, now: bool = False) -> None:
         """End the process, if it runs."""
         self._running = False
-        self._channel.close()  # the worker ends when it reads the end of its socket
+        self._channel.close()  # the worker ends when it reads the end of it
         if now:
             self._process.kill()
         try:

@@ -49,9 +49,10 @@ _POSSIBLE_BLIND = _POSSIBLE | {"obs_mode": ("none", "state", "state_dict"), "ren
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
     """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
 
-    `demonstrated` names the cameras that draw the demonstration. `reset` takes seeds from 0 to
-    2**32 - 1 and the options `difficulty`, and `answer`, the index of the hidden answer to use
-    instead of the seed's own. Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
+    `demonstrated` names the cameras that draw the demonstration; where `demonstrating` is False it
+    is not even played. `reset` takes seeds from 0 to 2**32 - 1 and the options `difficulty`, and
+    `answer`, the index of the hidden answer to use instead of the seed's own. Its info holds
+    `goal`, `goals`, `difficulty` and `demonstration`.
 
     Args:
         family: Task family to start with; `family` may be set before a reset.
@@ -72,7 +73,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.family = family
         self.drawing = render
         self.demonstrated: Sequence[str] = CAMERAS
-        self._demonstrating = False
+        self.demonstrating = False
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
             if options.setdefault(name, values[0]) not in values:
                 expected = " or ".join(map(repr, values))
@@ -80,7 +81,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         options.setdefault("render_backend", "cpu" if render else "none")
         make_renderer()  # sapien wants one even where nothing is drawn
         super().__init__(**options)
-        self._demonstrating = True
+        self.demonstrating = True
 
     # --- what ManiSkill asks for ---------------------------------------------------------------
 
@@ -147,10 +148,10 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         answers = episode.answers
         turn = turn_of(number, len(answers))
         answer = _index(options.get("answer", turn), -len(answers), len(answers), "answer")
-        self.episode, self._answer = episode, answers[answer]
-        self._guess = answers[guess_of(number, len(answers))]
+        self.episode, self.answer = episode, answers[answer]
+        self.guess = answers[guess_of(number, len(answers))]
         observed, info = super().reset(seed=number, options=options)
-        if self._demonstrating:
+        if self.demonstrating:
             info["demonstration"] = self._demonstrate()
             observed = self.get_obs(self.get_info())
         goals = self.episode.goals()
@@ -160,13 +161,13 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def _step_action(self, action: Any) -> Any:
         done = super()._step_action(action)
         if self.status is Status.ONGOING:
-            self.status = self.episode.judge(self.arm, self._answer)
+            self.status = self.episode.judge(self.arm, self.answer)
         return done
 
     def act(self, policy: str) -> NDArray[np.float32]:
         """Return the next action of the policy `oracle` or `guess`, `(8,) float32`."""
         if policy not in self._scripts:
-            answer = self._answer if policy == "oracle" else self._guess
+            answer = self.answer if policy == "oracle" else self.guess
             self.arm.reset()
             self._scripts[policy] = self.episode.solve(self.arm, answer)
         next(self._scripts[policy], None)  # a script that is through holds its last pose
@@ -191,7 +192,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
     def _demonstrate(self) -> Demonstration:
         seen, actions = [], []
-        for _ in self.episode.demonstrate(self.arm, self._answer):
+        for _ in self.episode.demonstrate(self.arm, self.answer):
             seen.append(self.observe(self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])

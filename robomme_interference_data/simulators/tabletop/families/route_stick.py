@@ -1,5 +1,6 @@
 """RouteStick: remember a route round posts."""
 
+from functools import cache
 from itertools import pairwise, product
 
 import numpy as np
@@ -106,6 +107,7 @@ class RouteStick(Family):
         return False
 
 
+@cache
 def routes(turns: int) -> list[Route]:
     """All routes with a number of turns: targets, and the sides on which posts are passed."""
     walks: list[tuple[int, ...]] = [(start,) for start in range(COUNT)]
