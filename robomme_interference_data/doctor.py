@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata, util
 from pathlib import Path
@@ -156,15 +157,16 @@ def _problems(requirement: Requirement) -> Iterator[str]:
 
 def check_opencv() -> Check:
     """Look whether two packages of OpenCV overwrite each other's files."""
-    installed = {each.name: each.version for each in metadata.distributions() if each.name}
-    names = [name for name in ("opencv-python", "opencv-python-headless") if name in installed]
-    found = ", ".join(f"{name} {installed[name]}" for name in names)
-    if len(names) < 2:
-        return Check("OpenCV", True if names else None, found or "not installed")
+    found = []
+    for name in ("opencv-python", "opencv-python-headless"):
+        with suppress(metadata.PackageNotFoundError):
+            found.append(f"{name} {metadata.version(name)}")
+    if len(found) < 2:
+        return Check("OpenCV", True if found else None, "".join(found) or "not installed")
     return Check(
         "OpenCV",
         False,
-        f"{found} overwrite each other's files",
+        f"{', '.join(found)} overwrite each other's files",
         "pip uninstall -y opencv-python opencv-python-headless && "
         'pip install "opencv-python-headless<4.14"',
     )

@@ -29,11 +29,13 @@ install() {
 
 # --- Vulkan: sapien needs Mesa 24.3, or the driver of a GPU --------------------------------------
 
+is_new() { [[ -n $1 ]] && dpkg --compare-versions "$1" ge 24.3; }
+
 has_vulkan() {
   local state version
   read -r state version < <(
     dpkg-query -W -f '${db:Status-Status} ${Version}\n' mesa-vulkan-drivers 2>/dev/null)
-  [[ ${state:-} == installed ]] && dpkg --compare-versions "$version" ge 24.3 && return
+  [[ ${state:-} == installed ]] && is_new "$version" && return
   [[ -x .venv/bin/python ]] && timeout 60 .venv/bin/python -m \
     robomme_interference_data.simulators.tabletop.renderer &>/dev/null
 }
@@ -60,14 +62,15 @@ with_suite() {
 
 # Debian 12's own Mesa is too old, that of its backports is not.
 install_vulkan() {
-  local release suite entry folder added=
-  release=$(. /etc/os-release && echo "${VERSION_CODENAME:-}")
-  if [[ $release != bookworm ]]; then install mesa-vulkan-drivers; return; fi
-  suite=$release-backports
+  local suite=bookworm-backports entry folder added
   apt update
+  if is_new "$(apt-cache policy mesa-vulkan-drivers | sed -n 's/^ *Candidate: //p')"; then
+    install mesa-vulkan-drivers
+    return
+  fi
   if [[ -z $(entry_of "$suite") ]]; then
-    entry=$(entry_of "$release")
-    if [[ -z $entry ]]; then problem="apt knows no Debian archive of $release"; return 1; fi
+    entry=$(entry_of bookworm)
+    if [[ -z $entry ]]; then problem="apt knows no Mesa of 24.3 or newer"; return 1; fi
     eval "$(apt-config shell folder Dir::Etc::sourceparts/d)"
     added=$folder$suite.${entry##*.}
     added=${added%:*}

@@ -1,38 +1,94 @@
-"""The software Vulkan driver is installed with the machine's own package sources, or not at all."""
+"""Vulkan driver and Chromium come from the machine's own package sources, or it is said why not."""
 
-import importlib.util
+import os
+import shutil
+import subprocess
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "scripts" / "system_packages.sh"
+TOOLS = ("awk", "bash", "dirname", "env", "grep", "head", "rm", "sed", "tail", "touch")
+
+# Each stands in for a command of Debian's. `apt-get install` makes the file that says that
+# something is there, unless it is told to fail; it notes the sources that it was given.
+FAKES = {
+    "apt-get": """
+echo "$*" >> "$STATE/calls"
+case "$*" in
+  *"Codename: bookworm-backports"*) [[ ! -e $STATE/backports ]] || echo "known:1" ;;
+  *"Codename: bookworm"*) echo "$ENTRY" ;;
+  *update*) [[ -z ${NO_UPDATE:-} ]] || { echo "E: no mirror"; exit 100; } ;;
+  *install*)
+    cat "$STATE"/parts/bookworm-backports.* > "$STATE/source" 2>/dev/null
+    [[ -z ${FAILS:-} ]] || { echo chatter; echo "E: cause"; echo "E: consequence"; exit 100; }
+    case "$*" in *chromium*) cp "$0" "$(dirname "$0")/chromium" ;; *) touch "$STATE/mesa" ;; esac
+esac
+""",
+    "apt-cache": 'echo "  Candidate: ${CANDIDATE:-22.3.6-1}"',
+    "apt-config": "echo \"folder='$STATE/parts/'\"",
+    "dpkg-query": '[[ -e $STATE/mesa ]] && echo "installed ${MESA:-25.0.7-2~bpo12+1}"',
+    "dpkg": '[[ $(printf "%s\\n" "$2" "$4" | sort -V | head -n 1) == "$4" ]]',
+    "id": 'echo "${USER_ID:-0}"',
+}
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    path = ROOT / "scripts" / "software_vulkan.py"
-    spec = importlib.util.spec_from_file_location("software_vulkan", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+class Machine:
+    """A Debian machine with nothing installed."""
+
+    def __init__(self, folder: Path):
+        self.state, self.bin = folder / "state", folder / "bin"
+        (self.state / "parts").mkdir(parents=True)
+        self.bin.mkdir()
+        for name in (*TOOLS, "cat", "cp", "sort"):
+            (self.bin / name).symlink_to(shutil.which(name) or name)
+        for name, text in FAKES.items():
+            (self.bin / name).write_text(f"#!/usr/bin/env bash\n{text}\n", encoding="utf-8")
+            (self.bin / name).chmod(0o755)
+        # Elsewhere than the checkout, whose .venv may be able to draw.
+        (folder / "scripts").mkdir()
+        self.script = Path(shutil.copy(SCRIPT, folder / "scripts"))
+
+    def set_up(self, *words: str, **environment: str) -> str:
+        """Run the script; return what it said. It never fails."""
+        done = subprocess.run(
+            [str(self.script), *words],
+            env={"PATH": str(self.bin), "STATE": str(self.state), "ENTRY": "", **environment},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert done.stdout == ""
+        return done.stderr
+
+    def calls(self) -> list[str]:
+        """What apt-get installed, and from which suite."""
+        lines = (self.state / "calls").read_text(encoding="utf-8").splitlines()
+        return [
+            line.rpartition("--no-install-recommends ")[2] for line in lines if " install " in line
+        ]
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
 
 
 DEB822 = """\
-# The archive.
-Types: deb deb-src
-URIs: file:///mirror/debian
-# Not this one.
-Suites: bookworm bookworm-updates
-Components: main contrib
-Signed-By: /keys/debian-archive-keyring.gpg
+# Modernized.
 
 Types: deb
 URIs: file:///mirror/debian-security
 Suites: bookworm-security
 Components: main
+Signed-By: /keys/debian-archive-keyring.gpg
+
+Types: deb deb-src
+URIs: file:///mirror/debian
+# Not this one.
+Suites: bookworm bookworm-updates
+Components: main contrib
 Signed-By: /keys/debian-archive-keyring.gpg
 """
 DEB822_BACKPORTS = """\
@@ -44,153 +100,108 @@ Signed-By: /keys/debian-archive-keyring.gpg
 """
 INLINE_KEY = """\
 Types: deb
-URIs: file:///mirror/debian
 Suites:
  bookworm
  bookworm-updates
+URIs: file:///mirror/debian
 Components: main
 Signed-By:
  -----BEGIN PGP PUBLIC KEY BLOCK-----
  .
  mQINBF
- -----END PGP PUBLIC KEY BLOCK-----
 """
-LIST = "deb file:///mirror/debian bookworm main  # the archive"
-SIGNED_LIST = "deb [arch=amd64 signed-by=/keys/debian-archive-keyring.gpg] file:///m/ bookworm main"
-THIRD_PARTY = "deb [signed-by=/keys/other.gpg] file:///other bookworm main"
+INLINE_BACKPORTS = INLINE_KEY.replace("\n bookworm\n bookworm-updates", " bookworm-backports")
+LIST = "# local\ndeb [arch=amd64 signed-by=/keys/archive.gpg] file:///m/ bookworm main\n"
+LIST_BACKPORTS = "deb [arch=amd64 signed-by=/keys/archive.gpg] file:///m/ bookworm-backports main\n"
 
 
 @pytest.mark.parametrize(
-    ("files", "added", "text"),
+    ("name", "number", "text", "backports"),
     [
-        ({"sources.list.d/debian.sources": DEB822}, ".sources", DEB822_BACKPORTS),
+        ("debian.sources", 2, DEB822, DEB822_BACKPORTS),
+        ("inline.sources", 1, INLINE_KEY, INLINE_BACKPORTS),
+        ("sources.list", 2, LIST, LIST_BACKPORTS),
         (
-            {"sources.list.d/debian.sources": INLINE_KEY},
-            ".sources",
-            INLINE_KEY.replace("\n bookworm\n bookworm-updates", " bookworm-backports"),
+            "plain.list",
+            1,
+            "deb file:///d bookworm main\n",
+            "deb file:///d bookworm-backports main\n",
         ),
-        (
-            {"sources.list": f"# local\n{LIST}\n"},
-            ".list",
-            "deb file:///mirror/debian bookworm-backports main\n",
-        ),
-        (
-            {"sources.list": THIRD_PARTY, "sources.list.d/archive.list": SIGNED_LIST},
-            ".list",
-            SIGNED_LIST.replace("bookworm", "bookworm-backports") + "\n",
-        ),
-        # Already there: nothing is added.
-        ({"sources.list": LIST, "sources.list.d/b.sources": DEB822_BACKPORTS}, None, None),
     ],
-    ids=["deb822", "deb822 with its key inside", "list", "third party", "already there"],
 )
 @pytest.mark.parametrize("works", [True, False])
 def test_the_backports_have_the_mirror_and_key_of_the_release(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    script: ModuleType,
-    files: dict[str, str],
-    added: str | None,
-    text: str | None,
-    works: bool,
+    machine: Machine, name: str, number: int, text: str, backports: str, works: bool
 ) -> None:
-    (tmp_path / "sources.list.d").mkdir()
-    for name, content in files.items():
-        (tmp_path / name).write_text(content, encoding="utf-8")
-    commands: list[str] = []
-    seen: list[str] = []
+    (machine.state / name).write_text(text, encoding="utf-8")
+    entry = f"{machine.state / name}:{number}"
+    said = machine.set_up("vulkan", ENTRY=entry, FAILS="" if works else "1")
+    assert machine.calls() == ["--target-release bookworm-backports mesa-vulkan-drivers"]
+    assert (machine.state / "source").read_text(encoding="utf-8") == backports
+    kept = [path.name for path in (machine.state / "parts").iterdir()]
+    if works:
+        assert kept == [f"bookworm-backports.{name.partition('.')[2]}"]
+        assert said == "setup: installing vulkan ...\n"
+    else:  # leaves the package sources as they were
+        assert kept == []
+        assert said.endswith("installing vulkan failed: E: cause\n")
 
-    def run(*command: str) -> str | None:
-        commands.append(command[-1])
-        folder = tmp_path / "sources.list.d"
-        seen.extend(f"{path.name}\n{path.read_text()}" for path in folder.glob("*-backports.*"))
-        return None if works else f"{command[-1]} failed"
 
-    monkeypatch.setattr(script, "run", run)
-    release = {"VERSION_CODENAME": "bookworm"}
-    monkeypatch.setattr(script.platform, "freedesktop_os_release", lambda: release)
+def test_backports_that_are_there_are_used(machine: Machine) -> None:
+    (machine.state / "backports").touch()
+    machine.set_up("vulkan")
+    assert machine.calls() == ["--target-release bookworm-backports mesa-vulkan-drivers"]
+    assert list((machine.state / "parts").iterdir()) == []
 
-    assert script.install(tmp_path) == (None if works else "update failed")
-    assert commands == ["update", "mesa-vulkan-drivers"]
-    new = [] if added is None else [f"bookworm-backports{added}\n{text}"]
-    assert seen == new * 2
-    # A failed attempt leaves the package sources as they were.
-    kept = [path.name for path in (tmp_path / "sources.list.d").glob("*-backports.*")]
-    assert len(kept) == (len(new) if works else 0)
+
+def test_a_release_that_is_new_enough_needs_no_backports(machine: Machine) -> None:
+    machine.set_up("vulkan", CANDIDATE="25.2.1-1")
+    assert machine.calls() == ["mesa-vulkan-drivers"]
+
+
+def test_nothing_is_said_where_nothing_is_missing(machine: Machine) -> None:
+    said = machine.set_up(CANDIDATE="25.2.1-1")
+    assert said == "setup: installing vulkan ...\nsetup: installing chromium ...\n"
+    assert machine.calls() == ["mesa-vulkan-drivers", "chromium"]
+    assert machine.set_up() == ""
+    assert len(machine.calls()) == 2
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("environment", "said"),
     [
-        "",
-        "# " + LIST,
-        LIST.replace("bookworm", "bookworm-security"),
-        LIST.replace("main", "contrib"),
-        LIST.replace("deb ", "deb-src "),
+        ({}, "apt knows no Mesa of 24.3 or newer"),
+        ({"CANDIDATE": "25.2.1-1", "MESA": "22.3.6-1"}, "will not do"),
+        ({"CANDIDATE": "25.2.1-1", "FAILS": "1"}, "failed: E: cause"),
+        ({"CANDIDATE": "25.2.1-1", "FAILS": "1", "NO_UPDATE": "1"}, "failed: E: no mirror"),
+        ({"USER_ID": "1000"}, "run: sudo make vulkan"),
     ],
 )
-def test_without_a_fitting_package_source_it_says_so(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: ModuleType, text: str
+def test_what_stands_in_the_way_of_vulkan_is_one_line(
+    machine: Machine, environment: dict[str, str], said: str
 ) -> None:
-    (tmp_path / "sources.list").write_text(text, encoding="utf-8")
-    release = {"VERSION_CODENAME": "bookworm"}
-    monkeypatch.setattr(script.platform, "freedesktop_os_release", lambda: release)
-    assert script.install(tmp_path) == f"{tmp_path} has no entry for bookworm main"
+    lines = machine.set_up("vulkan", **environment).splitlines()
+    assert lines[-1].startswith("setup: no Vulkan device can render (simulators need one): ")
+    assert lines[-1].endswith(said)
 
 
-def test_a_switched_off_paragraph_does_not_count(tmp_path: Path, script: ModuleType) -> None:
-    (tmp_path / "sources.list.d").mkdir()
-    path = tmp_path / "sources.list.d" / "debian.sources"
-    path.write_text("Enabled: no\n" + DEB822, encoding="utf-8")
-    assert list(script.entries(tmp_path, "bookworm")) == []
-    path.write_text("Enabled: yes\n" + DEB822, encoding="utf-8")
-    assert len(list(script.entries(tmp_path, "bookworm"))) == 1
+def test_what_to_do_without_apt_and_without_root(machine: Machine) -> None:
+    assert machine.set_up("chromium", USER_ID="1000") == (
+        "setup: no Chromium (browser tests are skipped): run: sudo apt-get install chromium\n"
+    )
+    (machine.bin / "apt-get").unlink()
+    vulkan, chromium = machine.set_up().splitlines()
+    assert vulkan.endswith(
+        "install the driver of your GPU, or Mesa's software driver, 24.3 or newer"
+    )
+    assert chromium.endswith("install Chromium or Chrome")
 
 
-@pytest.mark.parametrize(
-    ("renders", "apt", "user", "problem", "said"),
-    [
-        ([True], "apt-get", 0, None, ""),
-        ([False], None, 0, None, "install the Vulkan driver of your GPU"),
-        ([False], "apt-get", 1000, None, "run: sudo make vulkan"),
-        ([False, True], "apt-get", 0, None, "installing Mesa's software Vulkan driver ..."),
-        ([False, False], "apt-get", 0, None, "the Mesa that apt installs is too old"),
-        ([False], "apt-get", 0, "E: no mirror", "failed: E: no mirror"),
-    ],
-)
-def test_set_up_goes_on_whatever_happens_to_vulkan(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    script: ModuleType,
-    renders: list[bool],
-    apt: str | None,
-    user: int,
-    problem: str | None,
-    said: str,
-) -> None:
-    answers = iter(renders)
-    monkeypatch.setattr(script.sys, "platform", "linux")
-    monkeypatch.setattr(script, "can_render", lambda: next(answers))
-    monkeypatch.setattr(script.shutil, "which", lambda name: apt)
-    monkeypatch.setattr(script.os, "geteuid", lambda: user)
-    monkeypatch.setattr(script, "install", lambda folder: problem)
-    script.main()
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert next(answers, None) is None
-    assert said in err.splitlines()[-1] if said else err == ""
-
-
-@pytest.mark.parametrize(
-    ("command", "problem"),
-    [
-        ("echo fine", None),
-        ("echo one; echo two >&2; exit 3", "two"),
-        ("echo one; echo 'E: cause'; echo 'E: consequence'; exit 3", "E: cause"),
-        ("exit 3", "bash exited with 3"),
-    ],
-)
-def test_a_failed_command_gives_one_line(
-    script: ModuleType, command: str, problem: str | None
-) -> None:
-    assert script.run("bash", "-c", command) == problem
+@pytest.mark.skipif(not os.access("/var/lib/apt/lists", os.R_OK), reason="no apt here")
+def test_apt_tells_where_its_entries_stand() -> None:
+    """What the script asks of apt, which the stand-in above only repeats."""
+    command = ["apt-get", "indextargets", "--format", "$(SOURCESENTRY)", "Created-By: Packages"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    for entry in done.stdout.splitlines():
+        path, _, number = entry.rpartition(":")
+        assert Path(path).is_file() and number.isdigit()
