@@ -43,7 +43,7 @@ has_vulkan() {
 # Prints where apt has a release's main component from, as `file:number`; after an update.
 entry_of() {
   apt-get indextargets --format '$(SOURCESENTRY)' \
-    'Created-By: Packages' 'Component: main' 'Origin: Debian' "Codename: $1" | head -n 1
+    'Created-By: Packages' 'Component: main' "Origin: $1" "Codename: $2" | head -n 1
 }
 
 # Prints that entry, mirror and key included, for another suite. A .list file has an entry in each
@@ -68,8 +68,8 @@ install_vulkan() {
     install mesa-vulkan-drivers
     return
   fi
-  if [[ -z $(entry_of "$suite") ]]; then
-    entry=$(entry_of bookworm)
+  if [[ -z $(entry_of 'Debian Backports' "$suite") ]]; then
+    entry=$(entry_of Debian bookworm)
     if [[ -z $entry ]]; then problem="apt knows no Mesa of 24.3 or newer"; return 1; fi
     eval "$(apt-config shell folder Dir::Etc::sourceparts/d)"
     added=$folder$suite.${entry##*.}
