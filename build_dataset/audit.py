@@ -1,14 +1,16 @@
 """Audit the distractors of a split: how units are used, and whether anything leaks."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from statistics import mean
 from typing import Any
 
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, DISTRACTORS
-from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema import BufferManifest
+from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.split import Split
+from robomme_interference_data.tables import Column, Table
 
 __all__ = ["Audit", "Leak", "audit_split"]
 
@@ -32,115 +34,112 @@ class Audit:
     """How often what is used.
 
     Attributes:
-        units: For each k, how often each unit of the pool is used over all queries, 0 included.
-        positions: For each place after the lesson (from 1), how often each family stands there,
-            over the buffers with the largest k.
+        uses: For each condition, how often each unit of the pool is used over all queries, 0
+            included.
+        places: For each condition, how often each family of a unit stands at each place among
+            the units of a buffer, from 1.
         leaks: All leaks found.
     """
 
-    units: dict[int, dict[EpisodeId, int]]
-    positions: dict[int, Counter[str]] = field(default_factory=dict)
+    uses: dict[str, dict[EpisodeId, int]]
+    places: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
     leaks: list[Leak] = field(default_factory=list)
 
-    def usage(self, k: int) -> dict[str, float]:
-        """Return minimum, mean and maximum uses of a unit, and how many are unused, at one k."""
-        counts = list(self.units[k].values())
-        return {
-            "min": min(counts),
-            "mean": sum(counts) / len(counts),
-            "max": max(counts),
-            "unused": counts.count(0),
-        }
+    @property
+    def fullest(self) -> str:
+        """The condition whose buffers hold the most units."""
+        return max(self.uses, key=lambda name: len(self.places.get(name, {})))
 
-    def family_usage(self, k: int) -> dict[str, dict[str, float]]:
-        """Return the same by family of the unit."""
+    def tables(self) -> tuple[Table, Table]:
+        """Return the uses of a unit by condition, and the families at each place."""
+        counts = ("units", "min", "mean", "max", "unused")
+        columns = tuple(Column(name, "ratio" if name == "mean" else "count") for name in counts)
+        rows = tuple((name, *_usage(uses.values())) for name, uses in self.uses.items())
+        uses = Table("uses", "Uses of a unit", (Column("condition"), *columns), rows)
+        places = self.places.get(self.fullest, {})
         families: dict[str, list[int]] = {}
-        for unit, count in self.units[k].items():
+        for unit, count in sorted(self.uses[self.fullest].items()):
             families.setdefault(unit.family, []).append(count)
-        return {
-            family: {
-                "units": len(counts),
-                "min": min(counts),
-                "mean": sum(counts) / len(counts),
-                "max": max(counts),
-            }
-            for family, counts in sorted(families.items())
-        }
+        numbered = tuple(Column(str(place), "count") for place in sorted(places))
+        mix = tuple(
+            (family, *_usage(found)[:4], *(places[place][family] for place in sorted(places)))
+            for family, found in families.items()
+        )
+        return uses, Table(
+            "families",
+            f"Families of the units under {self.fullest}",
+            (Column("family"), *columns[:4], *numbered),
+            mix,
+            "Columns 1, 2, …: buffers with the family at that place among their units.",
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the audit as plain values, for JSON."""
+        uses, families = self.tables()
         return {
-            "usage": {str(k): self.usage(k) for k in self.units},
-            "families": self.family_usage(max(self.units)),
-            "positions": {
-                str(place): dict(sorted(counts.items()))
-                for place, counts in sorted(self.positions.items())
-            },
-            "units": {str(u): n for u, n in sorted(self.units[max(self.units)].items())},
-            "leaks": [{"kind": leak.kind, "where": leak.where} for leak in self.leaks],
+            "uses": uses.records(),
+            "families": families.records(),
+            "units": {str(unit): n for unit, n in sorted(self.uses[self.fullest].items())},
+            "leaks": [asdict(leak) for leak in self.leaks],
         }
 
 
-def audit_split(
-    manifests: Iterable[BufferManifest], datasets: dict[str, Dataset], k_values: tuple[int, ...]
-) -> Audit:
-    """Count the use of units and look for leaks.
+def _usage(counts: Any) -> tuple[Any, ...]:
+    found = list(counts)
+    return len(found), min(found), mean(found), max(found), found.count(0)
 
-    Args:
-        manifests: All buffers of the split.
-        datasets: Its `demonstrations` and `distractors`.
-        k_values: The planned numbers of distractor sessions.
-    """
-    pool = [record.id for record in datasets[DISTRACTORS].records()]
-    audit = Audit({k: dict.fromkeys(pool, 0) for k in k_values})
-    audit.leaks += _pool_leaks(datasets)
-    for manifest in manifests:
+
+def audit_split(split: Split) -> Audit:
+    """Count the use of units and look for leaks."""
+    units = list(split.datasets[DISTRACTORS].records())
+    queries = list(split.datasets[DEMONSTRATIONS].records())
+    pool = sorted(unit.episode_id for unit in units)
+    audit = Audit({name: dict.fromkeys(pool, 0) for name in split.conditions})
+    audit.leaks += _pool_leaks(units, queries)
+    for manifest in split.manifests():
         audit.leaks += _buffer_leaks(manifest)
-        others = [session for session in manifest.sessions if session.role != "lesson"]
-        uses = audit.units.setdefault(manifest.k, dict.fromkeys(pool, 0))
-        for place, session in enumerate(others, 1):
+        distractors = [one for one in manifest.sessions if one.role == "distractor"]
+        uses = audit.uses[manifest.condition]
+        places = audit.places.setdefault(manifest.condition, {})
+        for place, session in enumerate(distractors, 1):
             uses[session.source] = uses.get(session.source, 0) + 1
-            if manifest.k == max(k_values):
-                audit.positions.setdefault(place, Counter())[session.family] += 1
+            places.setdefault(place, Counter())[session.family] += 1
     return audit
 
 
 def _buffer_leaks(manifest: BufferManifest) -> Iterator[Leak]:
-    name = f"{manifest.episode_id} at k={manifest.k}"
     distractors = [session for session in manifest.sessions if session.role == "distractor"]
     for session in distractors:
-        if manifest.family in (session.family, session.source.family):
-            yield Leak("same family", f"{name}: {session.source}")
+        if manifest.episode_id.family in (session.family, session.source.family):
+            yield Leak("same family", f"{manifest}: {session.source}")
         if session.source.split != "train":
-            yield Leak("not a train episode", f"{name}: {session.source}")
+            yield Leak("not a train episode", f"{manifest}: {session.source}")
     for source, count in Counter(session.source for session in distractors).items():
         if count > 1:
-            yield Leak("repeated unit", f"{name}: {source}, {count} times")
+            yield Leak("repeated unit", f"{manifest}: {source}, {count} times")
 
 
-def _pool_leaks(datasets: dict[str, Dataset]) -> Iterator[Leak]:
-    units = list(datasets[DISTRACTORS].records())
-    queries = list(datasets[DEMONSTRATIONS].records())
+def _pool_leaks(units: Sequence[EpisodeRecord], queries: Sequence[EpisodeRecord]) -> Iterator[Leak]:
     for unit in units:
-        if unit.id.split != "train":
-            yield Leak("not a train episode", f"unit {unit.id}")
+        if unit.episode_id.split != "train":
+            yield Leak("not a train episode", f"unit {unit.episode_id}")
     # The same scene under another split or number: official seeds name the scene.
-    scenes = {
-        (query.simulator, query.id.family, query.seed): query.id
+    scenes: dict[tuple[str | None, str, int | None], EpisodeId] = {
+        (query.simulator, query.episode_id.family, query.seed): query.episode_id
         for query in queries
-        if query.seed is not None and query.id.split == "test"
+        if query.seed is not None and query.episode_id.split == "test"
     }
     for unit in units:
-        query = (
-            None if unit.seed is None else scenes.get((unit.simulator, unit.id.family, unit.seed))
-        )
-        if query is not None:
-            yield Leak("same scene", f"unit {unit.id} and query {query} (seed {unit.seed})")
+        scene = scenes.get((unit.simulator, unit.episode_id.family, unit.seed))
+        if scene is not None:
+            where = f"unit {unit.episode_id} and query {scene} (seed {unit.seed})"
+            yield Leak("same scene", where)
     for records in (units, queries):
         seen: dict[tuple[str, str], EpisodeId] = {}
         for record in records:
             for feature, digest in record.feature_sha256.items():
                 if feature.startswith(CAMERA_PREFIX):
-                    first = seen.setdefault((feature, digest), record.id)
-                    if first != record.id:
-                        yield Leak("identical frames", f"{first} and {record.id} ({feature})")
+                    first = seen.setdefault((feature, digest), record.episode_id)
+                    if first != record.episode_id:
+                        where = f"{first} and {record.episode_id} ({feature})"
+                        yield Leak("identical frames", where)

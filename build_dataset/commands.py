@@ -1,24 +1,30 @@
-"""Commands that make splits: `build …`."""
+"""Commands that make splits and check them: `build …`, `verify`, `audit`."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from robomme_interference_data.build_dataset.config import BuildConfig, PlanConfig
+from robomme_interference_data.console import (
+    MESSAGES,
+    AsJson,
+    WorkProgress,
+    print_json,
+    stoppable,
+)
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
     MANIFESTS,
-    POSITION_LIMIT,
+    REPORT_PATH,
 )
-from robomme_interference_data.progress import MESSAGES
+from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
-    pass
+    from robomme_interference_data.build_dataset.build import BuildPlan, BuildResult
 
-__all__ = ["app"]
-
+__all__ = ["app", "audit", "verify"]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -29,7 +35,7 @@ app = typer.Typer(
 ```
 robomme-interference build all --source robomme-h5:recordings/ --out my-split
 robomme-interference verify my-split
-robomme-interference show MoveCube/train/0 --split my-split --k 3 --out strip.png
+robomme-interference show MoveCube/train/0 k3 --split my-split --out strip.png
 ```
 
 `build all` is these three, with S=my-split:
@@ -37,205 +43,186 @@ robomme-interference show MoveCube/train/0 --split my-split --k 3 --out strip.pn
 ```
 robomme-interference build demonstrations --source robomme-h5:recordings/ --out $S/demonstrations
 robomme-interference build distractors --source robomme-h5:recordings/ --out $S/distractors
-robomme-interference build manifests --demonstrations $S/demonstrations \\
-    --distractors $S/distractors --out $S/manifests --k 0 1 3 7 --seed 0
+robomme-interference build manifests $S --conditions no-history k0 k1 k3 k7
 ```
 """,
 )
 
-Sources = Annotated[
-    list[str],
-    typer.Option(
-        "--source",
-        help="KIND:LOCATION, with kind robomme-h5, lerobot or frames, or the name of a simulator: "
-        "tabletop, or, for demonstrations, robomme; may be given several times.",
-    ),
-]
-Families = Annotated[
-    str | None, typer.Option(help="Families to take, comma-separated; all by default.")
-]
-Episodes = Annotated[
-    str | None, typer.Option(help="Episode numbers to take, such as 0-49 or 0,3,10-12.")
-]
-Cameras = Annotated[
-    str | None, typer.Option(help="Cameras to store, such as front; all by default.")
-]
-CodecName = Annotated[
-    str, typer.Option(help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).")
-]
-Version = Annotated[str, typer.Option(help="Version that the dataset carries.")]
-Workers = Annotated[
-    int, typer.Option(help="Processes that encode side by side.", show_default="all processors")
-]
-TimeLimit = Annotated[
-    float | None,
-    typer.Option(
-        help="Seconds that one episode may take before it is tried once more.",
-        show_default="120 to play one on tabletop; 1800 otherwise",
-    ),
-]
-Columns = Annotated[
-    str | None,
-    typer.Option(help="lerobot sources: NAME=COLUMN,… where the dataset's columns differ."),
-]
-FamiliesFile = Annotated[
-    Path | None, typer.Option(help="lerobot sources: file that names each episode's family.")
-]
-RoboMMEPython = Annotated[
-    str | None,
-    typer.Option(help="Source robomme: interpreter that has RoboMME.", envvar="ROBOMME_PYTHON"),
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-K = Annotated[
-    list[int] | None,
-    typer.Option("--k", help="Numbers of distractor sessions.", show_default="0 1 3 7"),
-]
-Seed = Annotated[int, typer.Option(help="Seed of the draw.")]
-Limit = Annotated[
-    str,
-    typer.Option(help="Positions that the systems hold for history and rollout, or none."),
-]
-
-_CPUS = os.cpu_count() or 1
+_TOLD = 10
+"""Episodes that are named when they are left out."""
 
 
 @app.command()
-def demonstrations(
-    source: Sources,
-    out: Annotated[Path, typer.Option(help="Folder of the dataset; made by the build.")],
-    families: Families = None,
-    split: Annotated[str | None, typer.Option(help="Only train, val or test.")] = None,
-    episodes: Episodes = None,
-    cameras: Cameras = None,
-    codec: CodecName = "av1-lossless",
-    version: Version = "1.0.0",
-    workers: Workers = _CPUS,
-    time_limit: TimeLimit = None,
-    columns: Columns = None,
-    families_file: FamiliesFile = None,
-    robomme_python: RoboMMEPython = None,
-    as_json: AsJson = False,
-) -> None:
-    """Build the query episodes' demonstrations, each with its first live observation at the end.
+@with_settings
+def demonstrations(config: BuildConfig, as_json: AsJson = False) -> None:
+    r"""Build the query episodes' demonstrations, each with its first live observation at the end.
 
-    Stopped with Ctrl-C, or killed, a build goes on where it was when the command is run again.
+    Stopped with Ctrl-C, or killed, a build goes on where it was when the command is run again. A
+    dataset that is there grows by what it lacks.
+
+    Examples:
+    ```
+    robomme-interference build demonstrations --source robomme-h5:recordings/ --split test \
+        --out S/demonstrations
+    robomme-interference build demonstrations --source tabletop --split test --episodes 0-4 \
+        --cameras front --out S/demonstrations
+    ```
     """
-    from robomme_interference_data.build_dataset.steps import build_one
-
-    filters = (families, split, episodes)
-    settings = (codec, cameras, version, workers, time_limit)
-    opening = (columns, families_file, robomme_python)
-    build_one(DEMONSTRATIONS, source, out, filters, settings, opening, as_json=as_json)
+    _build_one(DEMONSTRATIONS, config, as_json=as_json)
 
 
 @app.command()
-def distractors(
-    source: Sources,
-    out: Annotated[Path, typer.Option(help="Folder of the dataset; made by the build.")],
-    families: Families = None,
-    split: Annotated[str, typer.Option(help="train; others leak query episodes.")] = "train",
-    episodes: Episodes = None,
-    cameras: Cameras = None,
-    codec: CodecName = "av1-lossless",
-    version: Version = "1.0.0",
-    workers: Workers = _CPUS,
-    time_limit: TimeLimit = None,
-    columns: Columns = None,
-    families_file: FamiliesFile = None,
-    as_json: AsJson = False,
-) -> None:
-    """Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
+@with_settings
+def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
+    r"""Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
 
     Episodes of fewer than 249 raw frames yield no unit; they are listed in meta/build_report.json.
-    """
-    from robomme_interference_data.build_dataset.steps import build_one
 
-    filters = (families, split, episodes)
-    settings = (codec, cameras, version, workers, time_limit)
-    opening = (columns, families_file, None)
-    build_one(DISTRACTORS, source, out, filters, settings, opening, as_json=as_json)
+    Examples:
+    ```
+    robomme-interference build distractors --source lerobot:NAMESPACE/NAME --out S/distractors
+    robomme-interference build distractors --source robomme-h5:recordings/ frames:mine/ \
+        --cameras front --out S/distractors
+    ```
+    """
+    _build_one(DISTRACTORS, config, as_json=as_json)
 
 
 @app.command()
+@with_settings
 def manifests(
-    demonstrations: Annotated[Path, typer.Option(help="Dataset of demonstrations.")],
-    distractors: Annotated[Path, typer.Option(help="Dataset of distractor units.")],
-    out: Annotated[Path, typer.Option(help="Folder of the manifests.")],
-    k: K = None,
-    seed: Seed = 0,
-    position_limit: Limit = str(POSITION_LIMIT),
+    split: Annotated[Path, typer.Argument(help="Folder with both datasets.")],
+    config: PlanConfig,
     as_json: AsJson = False,
 ) -> None:
-    """Plan the history buffers of all query episodes: the same inputs give the same bytes."""
-    from robomme_interference_data.build_dataset.steps import plan_buffers
+    """Plan the history buffers of all query episodes: the same inputs give the same bytes.
 
-    plan_buffers(demonstrations, distractors, out, k, seed, position_limit, as_json=as_json)
+    Example:
+    ```
+    robomme-interference build manifests my-split --conditions no-history k0 k1 k3 k7 --seed 0
+    ```
+    """
+    _plan(split, config, as_json=as_json)
 
 
 @app.command(name="all")
-def build_all(
-    source: Sources,
-    out: Annotated[Path, typer.Option(help="Folder of the split.")],
-    families: Annotated[
-        str | None, typer.Option(help="Families of the query episodes; all by default.")
-    ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="Split of the query episodes; distractors are train's.")
-    ] = None,
-    episodes: Annotated[
-        str | None, typer.Option(help="Numbers of the query episodes, such as 0-49.")
-    ] = None,
-    cameras: Cameras = None,
-    codec: CodecName = "av1-lossless",
-    version: Version = "1.0.0",
-    k: K = None,
-    seed: Seed = 0,
-    position_limit: Limit = str(POSITION_LIMIT),
-    workers: Workers = _CPUS,
-    time_limit: TimeLimit = None,
-    columns: Columns = None,
-    families_file: FamiliesFile = None,
+@with_settings
+def build_all(config: BuildConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
+    """Build demonstrations, distractors and manifests from the same sources.
+
+    Filters choose the query episodes; the units are of all families' train episodes.
+
+    Example:
+    ```
+    robomme-interference build all --source robomme-h5:recordings/ --out my-split
+    ```
+    """
+    from robomme_interference_data.build_dataset.config import plan_all
+
+    for kind, step in plan_all(config, plan).items():
+        _build(step, config.out / kind, config.workers)
+    _plan(config.out, plan, as_json=as_json)
+    MESSAGES.print(f"Next: robomme-interference verify {config.out}")
+
+
+def _build_one(kind: str, config: BuildConfig, *, as_json: bool) -> None:
+    from robomme_interference_data.build_dataset.config import plan_build
+
+    result = _build(plan_build(kind, config), config.out, config.workers)
+    if as_json:
+        print_json({**vars(result), "out": str(result.out)})
+
+
+def _build(plan: "BuildPlan", out: Path, workers: int) -> "BuildResult":
+    from robomme_interference_data.build_dataset.build import build_dataset
+    from robomme_interference_data.execution import Processes
+
+    with stoppable("Finished episodes are kept"), WorkProgress(unit="episodes") as progress:
+        result = build_dataset(plan, out, Processes(workers), progress)
+    done = f"{result.added} added" if result.added else "was built before"
+    MESSAGES.print(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
+    for number, (name, why) in enumerate(sorted(result.skipped.items())):
+        if number == _TOLD:
+            MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
+            break
+        MESSAGES.print(f"  left out {name}: {why}")
+    return result
+
+
+def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
+    from robomme_interference_data.build_dataset.config import position_limit
+    from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+    from robomme_interference_data.split import load_split
+
+    plan = plan_manifests(split, config.conditions, config.seed, position_limit(config))
+    with WorkProgress(unit="buffers") as progress:
+        total = len(plan.demonstrations) * len(plan.conditions)
+        progress.start("Planning buffers", total)
+        for done in write_manifests(plan, split):
+            progress.advance(done)
+    counts = load_split(split).header.counts
+    if as_json:
+        print_json({"out": str(split / MANIFESTS), **counts})
+    else:
+        MESSAGES.print(
+            f"{split / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries"
+        )
+
+
+def verify(
+    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    decode: Annotated[
+        bool, typer.Option(help="Decode all frames; without, files, tables and rules are checked.")
+    ] = True,
+    as_json: AsJson = False,
 ) -> None:
-    """Build demonstrations, distractors and manifests from the same sources."""
-    from robomme_interference_data.build_dataset.steps import (
-        build_one,
-        check_simulators,
-        plan_buffers,
-    )
+    """Recompute every hash and rule of a split and name each violation; fails if there is one.
 
-    settings = (codec, cameras, version, workers, time_limit)
-    opening = (columns, families_file, None)
-    check_simulators(DISTRACTORS, source)  # before the demonstrations are played
-    for kind, filters in (
-        (DEMONSTRATIONS, (families, split, episodes)),
-        (DISTRACTORS, (None, "train", None)),
-    ):
-        build_one(kind, source, out / kind, filters, settings, opening, as_json=False)
-    plan_buffers(
-        out / DEMONSTRATIONS,
-        out / DISTRACTORS,
-        out / MANIFESTS,
-        k,
-        seed,
-        position_limit,
-        as_json=False,
-    )
-    MESSAGES.print(f"Next: robomme-interference verify {out}")
+    Example:
+    ```
+    robomme-interference verify my-split
+    ```
+    """
+    from robomme_interference_data.build_dataset.verify import frames_of, verify_split
+
+    with WorkProgress() as progress:
+        progress.start("Verifying", frames_of(split) if decode else 0)
+        violations = list(verify_split(split, decode=decode, advance=progress.advance))
+    if as_json:
+        print_json([vars(violation) for violation in violations])
+    else:
+        for violation in violations:
+            typer.echo(f"{violation.where}: {violation.what}")
+        what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
+        MESSAGES.print(
+            f"{len(violations)} violations" if violations else f"All {what} of {split} hold."
+        )
+    if violations:
+        raise typer.Exit(1)
 
 
-@app.command()
-def sample(
-    out: Annotated[Path, typer.Option(help="Folder to write.")],
-    train: Annotated[int, typer.Option(help="Train episodes of each family.")] = 2,
-    test: Annotated[int, typer.Option(help="Test episodes of each family.")] = 1,
+def audit(
+    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    as_json: AsJson = False,
 ) -> None:
-    """Record a small made-up sample, to try everything: --source frames:OUT."""
-    from robomme_interference_data.build_dataset.sample import write_sample
-    from robomme_interference_data.constants import FAMILIES
-    from robomme_interference_data.progress import BuildProgress
+    """Print how often units are used and where families stand; fails on any leak.
 
-    with BuildProgress(unit="episodes") as progress:
-        progress.start("Recording the sample", len(FAMILIES) * (train + test))
-        for _ in write_sample(out, train=train, test=test):
-            progress.advance(1)
-    MESSAGES.print(f"Next: robomme-interference build all --source frames:{out} --out my-split")
+    Example:
+    ```
+    robomme-interference audit my-split
+    ```
+    """
+    from robomme_interference_data.build_dataset.audit import audit_split
+    from robomme_interference_data.split import load_split
+
+    report = audit_split(load_split(split))
+    if as_json:
+        print_json(report.as_dict())
+    else:
+        for table in report.tables():
+            typer.echo(table.text() + "\n")
+        for leak in report.leaks:
+            typer.echo(f"LEAK, {leak.kind}: {leak.where}")
+        MESSAGES.print(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
+    if report.leaks:
+        raise typer.Exit(1)

@@ -1,169 +1,295 @@
-"""Write the manifests of a split: for every query episode and every k, what its buffer holds.
+"""Plan the buffers of a split: for every query episode and every condition, what it holds.
 
-The rows are made in `manifest_rows.py`; here a plan is checked, and the files are written whole.
+Rules 1 to 5 and 8 of the protocol; the draw itself is `draw.py`, what a condition holds is
+`conditions.py`.
 """
 
 import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import batched
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 
-from robomme_interference_data.build_dataset import manifest_rows
-from robomme_interference_data.build_dataset.locks import locked
-from robomme_interference_data.build_dataset.manifest_rows import ManifestPlan, ManifestRows
+from robomme_interference_data.build_dataset.build import work_folder
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.constants import (
     ACTION,
     DEMONSTRATIONS,
     DISTRACTORS,
     FORMAT_VERSION,
-    MANIFEST_JSON,
-    MANIFEST_JSONL,
-    MANIFEST_PARQUET,
-    MAX_K,
+    IDENTITY_PATH,
+    MANIFEST_HEADER,
+    MANIFEST_ROWS,
+    MANIFESTS,
+    MAX_STEPS,
     POSITION_LIMIT,
     RULE_VERSION,
 )
 from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.digest import combine
+from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import (
     BuildError,
+    FormatError,
+    HistoryTooLongError,
     InvalidOptionError,
     SourceError,
 )
-from robomme_interference_data.files import atomic_path, sha256_file, write_json
-from robomme_interference_data.manifest_io import SCHEMA
+from robomme_interference_data.files import (
+    LocalFiles,
+    atomic_path,
+    hold,
+    sha256_file,
+    write_json,
+)
+from robomme_interference_data.query import Query
+from robomme_interference_data.records import (
+    BufferManifest,
+    EpisodeRecord,
+    ManifestDataset,
+    ManifestHeader,
+    SessionEntry,
+    place_sessions,
+)
+from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+from robomme_interference_data.sampling import lesson_frames, lesson_share
 
-__all__ = ["ManifestPlan", "expected_rows", "plan_manifests", "write_manifests"]
+__all__ = ["ManifestPlan", "plan_manifests", "planned_buffers", "write_manifests"]
 
-_FILES = (MANIFEST_PARQUET, MANIFEST_JSONL, MANIFEST_JSON)
+_BATCH = 1024
+"""Rows in a row group: few bytes find one buffer."""
+
+
+@dataclass(frozen=True)
+class ManifestPlan:
+    """All that decides the manifests.
+
+    Attributes:
+        demonstrations: The query episodes.
+        distractors: The units.
+        conditions: For which buffers are planned, in order.
+        seed: Seed of the draw.
+        position_limit: Longest history plus rollout that the systems hold; None for no limit.
+    """
+
+    demonstrations: Dataset
+    distractors: Dataset
+    conditions: tuple[Condition, ...]
+    seed: int = 0
+    position_limit: int | None = POSITION_LIMIT
 
 
 def plan_manifests(
-    demonstrations: Dataset,
-    distractors: Dataset,
-    k: Sequence[int] = (0, 1, 3, 7),
+    root: Path,
+    conditions: Sequence[str | Condition] = DEFAULT_CONDITIONS,
     seed: int = 0,
     position_limit: int | None = POSITION_LIMIT,
 ) -> ManifestPlan:
-    """Check that two datasets and the options make a split.
+    """Check that the datasets of a split and the options fit each other.
 
     Raises:
-        InvalidOptionError: A k is not from 0 to 63 or comes twice, or a dataset is of the wrong
-            kind.
+        InvalidIdError, InvalidOptionError: A condition is none, or comes twice.
+        MissingFileError, FormatError: A dataset is missing or damaged.
         SourceError: The datasets do not fit each other, or a unit is not of the train split.
     """
-    ordered = tuple(sorted(k))
-    if not ordered or len(set(ordered)) != len(ordered) or ordered[0] < 0 or ordered[-1] > MAX_K:
-        raise InvalidOptionError(
-            f"--k {' '.join(map(str, k))}; expected distinct numbers from 0 to {MAX_K}"
-        )
-    for option, dataset in ((DEMONSTRATIONS, demonstrations), (DISTRACTORS, distractors)):
-        if dataset.kind != option:
+    ordered = in_order(conditions)
+    opened = {}
+    for name in (DEMONSTRATIONS, DISTRACTORS):
+        opened[name] = dataset = Dataset(LocalFiles(root / name))
+        if dataset.kind != name:
             raise InvalidOptionError(
-                f"--{option} {dataset.files.describe()} is a dataset of {dataset.kind}",
-                f"Give the folder that robomme-interference build {option} made.",
+                f"{root / name} is a dataset of {dataset.kind}",
+                f"Put there what robomme-interference build {name} made.",
             )
-    shown, others = _shown(demonstrations), _shown(distractors)
-    if shown != others:
+    shown = {
+        name: {feature: s for feature, s in one.features.items() if feature != ACTION}
+        for name, one in opened.items()
+    }
+    if shown[DEMONSTRATIONS] != shown[DISTRACTORS]:
         raise SourceError(
-            f"sessions of both datasets cannot follow one another in a buffer: the demonstrations "
-            f"have {shown}, the distractors {others}",
+            "sessions of both datasets cannot follow one another in a buffer: the demonstrations "
+            f"have {shown[DEMONSTRATIONS]}, the distractors {shown[DISTRACTORS]}",
             "Build both with the same --cameras, from sources with the same sizes.",
         )
-    splits = set(distractors.episodes["split"].to_pylist())
+    splits = {record.episode_id.split for record in opened[DISTRACTORS].records()}
     if splits != {"train"}:
         raise SourceError(
-            f"distractor units must come from train episodes, so that no query's own scene leaks "
+            "distractor units must come from train episodes, so that no query's own scene leaks "
             f"into another buffer; found {', '.join(sorted(splits))}",
             "Build the distractors with --split train.",
         )
-    return ManifestPlan(demonstrations, distractors, ordered, seed, position_limit)
+    return ManifestPlan(opened[DEMONSTRATIONS], opened[DISTRACTORS], ordered, seed, position_limit)
 
 
-def _shown(dataset: Dataset) -> dict[str, tuple[int, ...]]:
-    """Return the features that a buffer shows, with their shapes: cameras and state."""
-    return {name: shape for name, shape in dataset.features.items() if name != ACTION}
+class _Material:
+    """What the conditions' rules make the history of one query of; see `conditions.Material`."""
+
+    def __init__(self, split: "_Sessions", record: EpisodeRecord):
+        self._split = split
+        self._record = record
+        self._units: list[SessionEntry] = []
+
+    @cached_property
+    def _lesson(self) -> SessionEntry:
+        record, dataset = self._record, self._split.plan.demonstrations
+        if record.exec_start_idx is None or record.lesson_sha256 is None:
+            raise FormatError.damaged(dataset.files.describe(), f"{record.episode_id}: no lesson")
+        sha = combine(record.lesson_sha256)
+        return _entry("lesson", dataset, record, record.exec_start_idx, sha)
+
+    def lesson(self) -> SessionEntry:
+        return self._lesson
+
+    def units(self, k: int) -> Sequence[SessionEntry]:
+        if k > len(self._units):  # drawn once for the largest k: smaller ones begin it
+            most = max(k, *(condition.k for condition in self._split.plan.conditions))
+            drawn = self._split.pool.draw(self._record.episode_id, most)
+            self._units = [self._split.units[unit] for unit in drawn]
+        return self._units[:k]
 
 
-def write_manifests(plan: ManifestPlan, out: Path) -> Iterator[int]:
-    """Write the manifest files; yields the number of queries done after each batch.
+class _Sessions:
+    """The units of a split as sessions, and the pool that they are drawn from."""
 
-    The files appear together when all are complete; `manifest.json` is the last, and names the
-    SHA-256 of the others.
+    def __init__(self, plan: ManifestPlan):
+        self.plan = plan
+        records = list(plan.distractors.records())
+        self.pool = UnitPool((record.episode_id for record in records), plan.seed)
+        self.units = {
+            record.episode_id: _entry(
+                "distractor",
+                plan.distractors,
+                record,
+                record.length,
+                combine(record.feature_sha256),
+            )
+            for record in records
+        }
+        self.exact = {record.episode_id: record.exact for record in records}
 
-    Args:
-        plan: What to write.
-        out: Folder of the manifests; files of an earlier run are replaced.
+
+def _entry(
+    role: str, dataset: Dataset, record: EpisodeRecord, stop: int, sha256: str
+) -> SessionEntry:
+    """Return the session that an episode is from its beginning on."""
+    name = record.episode_id
+    place = dataset.kind, dataset.revision, record.episode_index
+    return SessionEntry(role, name.family, name, *place, 0, stop, 1, sha256)
+
+
+def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
+    """Yield the manifests of all buffers: queries in canonical order, conditions as planned.
 
     Raises:
         PoolTooSmallError: A query needs more units than the other families have.
         HistoryTooLongError: A buffer exceeds the position limit.
-        BuildError: `out` holds something else, or is being written by another process.
     """
-    out = out.resolve()
-    with locked(out) as work:
+    sessions = _Sessions(plan)
+    for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
+        query, material = Query(plan.demonstrations, record), _Material(sessions, record)
+        for condition in plan.conditions:
+            entries = condition.sessions(material)
+            placed = place_sessions(entries)
+            frames = placed[-1].stop if placed else 0
+            _check_length(plan, record, condition, frames)
+            yield BufferManifest(
+                episode_id=record.episode_id,
+                condition=condition.name,
+                k=condition.k,
+                goals=record.goals,
+                seed=record.seed,
+                difficulty=record.difficulty,
+                simulator=record.simulator,
+                exact=record.exact and all(sessions.exact.get(e.source, True) for e in entries),
+                lesson_frames=lesson_frames(placed, 0, frames),
+                history_frames=frames,
+                lesson_share=lesson_share(placed, 0, frames),
+                query=query.place,
+                sessions=entries,
+            )
+
+
+def _check_length(
+    plan: ManifestPlan, record: EpisodeRecord, condition: Condition, frames: int
+) -> None:
+    """Check that a buffer and its rollout fit the systems' position embeddings (rule 8)."""
+    needed, limit = frames + MAX_STEPS, plan.position_limit
+    if limit is not None and needed > limit:
+        raise HistoryTooLongError(
+            f"{record.episode_id} under {condition} needs {needed} positions ({frames} history "
+            f"frames + {MAX_STEPS} steps); the released servers hold {limit}",
+            "Leave out that condition, or --position-limit none for systems without such a limit.",
+        )
+
+
+def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
+    """Write the manifests of a split; yields the number of buffers done after each batch.
+
+    The files appear whole; `manifest.json` is the last, and names the SHA-256 of the rows.
+
+    Args:
+        plan: What to write.
+        root: The split; manifests of an earlier run are replaced.
+
+    Raises:
+        PoolTooSmallError, HistoryTooLongError: As `planned_buffers`.
+        BuildError: The folder holds something else, or is being written by another process.
+    """
+    out = root.resolve() / MANIFESTS
+    work = work_folder(out)
+    work.mkdir(parents=True, exist_ok=True)
+    busy = BuildError(f"another process is writing {out}", "Wait for it to end, or stop it.")
+    with hold(work / "lock", busy):
         try:
-            _clear(out)
+            _check_folder(out)
             yield from _write(plan, out)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
 
-def _clear(out: Path) -> None:
+def _check_folder(out: Path) -> None:
     """Make the folder, and remove what a killed run left half-written in it."""
-    if out.is_file():
-        raise BuildError(f"{out} is a file", "Choose another --out.")
     out.mkdir(parents=True, exist_ok=True)
-    partial = {path for name in _FILES for path in out.glob(f".{name}.*.partial")}
-    others = set(out.iterdir()) - partial - {out / name for name in _FILES}
-    if others and not (out / MANIFEST_JSON).is_file():
-        raise BuildError(
-            f"{out} exists and holds no manifests, but {min(others).name}", "Choose another --out."
-        )
-    for path in partial:
-        path.unlink()
+    for left in out.glob(".*.partial"):
+        left.unlink()
+    strangers = {path.name for path in out.iterdir()} - {MANIFEST_ROWS, MANIFEST_HEADER}
+    if strangers and not (out / MANIFEST_HEADER).is_file():
+        raise BuildError(f"{out} exists and holds no manifests, but {min(strangers)}")
 
 
 def _write(plan: ManifestPlan, out: Path) -> Iterator[int]:
-    rows = ManifestRows(plan)
+    schema = arrow_schema(BufferManifest)
+    buffers = sessions = 0
     with (
-        atomic_path(out / MANIFEST_PARQUET) as parquet,
-        atomic_path(out / MANIFEST_JSONL) as jsonl,
-        pq.ParquetWriter(parquet, SCHEMA, compression="zstd") as writer,
-        jsonl.open("w", encoding="utf-8") as lines,
+        atomic_path(out / MANIFEST_ROWS) as partial,
+        pq.ParquetWriter(partial, schema, compression="zstd") as writer,
     ):
-        for batch in rows.batches():
-            writer.write_batch(batch.table, row_group_size=manifest_rows.BATCH)
-            lines.writelines(batch.lines)
-            yield batch.queries
-        # An old manifest.json must not vouch for new files, should writing stop here.
-        (out / MANIFEST_JSON).unlink(missing_ok=True)
-    write_json(
-        out / MANIFEST_JSON,
-        {
-            "format_version": FORMAT_VERSION,
-            "rule_version": RULE_VERSION,
-            "seed": plan.seed,
-            "k": list(plan.k),
-            "position_limit": plan.position_limit,
-            "datasets": {
-                dataset.kind: {
-                    name: dataset.identity[name]
-                    for name in ("name", "version", "revision", "exact", "counts", "simulators")
-                }
-                for dataset in (plan.demonstrations, plan.distractors)
-            },
-            "counts": rows.counts,
-            "files": {
-                name: {"sha256": sha256_file(out / name), "bytes": (out / name).stat().st_size}
-                for name in (MANIFEST_PARQUET, MANIFEST_JSONL)
-            },
+        for batch in batched(planned_buffers(plan), _BATCH):
+            writer.write_table(to_table(batch, schema), row_group_size=_BATCH)
+            buffers += len(batch)
+            sessions += sum(len(manifest.sessions) for manifest in batch)
+            yield len(batch)
+        # An old header must not vouch for new rows, should writing stop here.
+        (out / MANIFEST_HEADER).unlink(missing_ok=True)
+    header = ManifestHeader(
+        format_version=FORMAT_VERSION,
+        rule_version=RULE_VERSION,
+        seed=plan.seed,
+        conditions=tuple(condition.name for condition in plan.conditions),
+        position_limit=plan.position_limit,
+        datasets={
+            dataset.kind: ManifestDataset(
+                dataset.kind,
+                dataset.identity.version,
+                dataset.revision,
+                sha256_file(dataset.files.path(IDENTITY_PATH)),
+            )
+            for dataset in (plan.demonstrations, plan.distractors)
         },
+        counts={"queries": len(plan.demonstrations), "buffers": buffers, "sessions": sessions},
+        rows=sha256_file(out / MANIFEST_ROWS),
     )
-
-
-def expected_rows(plan: ManifestPlan) -> Iterator[dict[str, Any]]:
-    """Yield the rows that `write_manifests` would write, in order, as plain values."""
-    for batch in ManifestRows(plan).batches():
-        yield from batch.table.to_pylist()
+    write_json(out / MANIFEST_HEADER, to_dict(header))

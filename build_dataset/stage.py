@@ -1,54 +1,75 @@
-"""Stage one episode: encode it beside the build, decode it again, and record its hashes.
+"""Stage one episode: cut and encode it while it is read, decode it again, record its hashes.
 
 A staged episode is a folder that appears under its final name only when it is complete and
 checked, so an interrupted build goes on from the folders that it finds.
 """
 
 import hashlib
-import json
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.encode import Codec, ImageStats, VideoEncoder
-from robomme_interference_data.build_dataset.plan import PlannedEpisode
-from robomme_interference_data.build_dataset.sources.base import Frame, Source
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, STATE
+from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
+from robomme_interference_data.build_dataset.image_stats import ImageStats
+from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, DEMONSTRATIONS, FPS, STATE
 from robomme_interference_data.digest import FeatureDigests
-from robomme_interference_data.errors import BuildError, SourceError
-from robomme_interference_data.files import canonical_json
+from robomme_interference_data.encode import Codec, VideoEncoder
+from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
+from robomme_interference_data.execution import Worker
+from robomme_interference_data.files import canonical_json, write_json
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.video import iter_frames
 
-__all__ = ["StagedEpisode", "read_staged", "stage_episode", "stage_name"]
+__all__ = ["StageTask", "Staged", "StagedEpisode", "read_staged"]
 
 _RECORD = "record.json"
+_LAYOUT = 2
+"""Version of a staged episode's folder."""
+
+Task = tuple[int, SourceEpisode]
+"""The number of its source, and an episode."""
+
+
+@dataclass(frozen=True)
+class Staged:
+    """What is known of a staged episode; see `EpisodeRecord` for what is not said here.
+
+    Attributes:
+        skipped: Why the episode yields nothing; None if it yields something.
+        features: Shape of one value by feature.
+        stats: Image statistics by feature.
+    """
+
+    episode_id: EpisodeId
+    skipped: str | None
+    length: int
+    goals: tuple[str, ...]
+    seed: int | None
+    difficulty: str | None
+    simulator: str | None
+    exec_start_idx: int | None
+    exact: bool
+    features: dict[str, tuple[int, ...]]
+    feature_sha256: dict[str, str]
+    lesson_sha256: dict[str, str] | None
+    stats: dict[str, dict[str, tuple[float, ...]]]
 
 
 @dataclass(frozen=True)
 class StagedEpisode:
-    """A staged episode.
+    """A staged episode and the folder that holds its videos and vectors."""
 
-    Attributes:
-        folder: Folder with `<camera>.mp4`, `state.npy`, `action.npy` (if there are actions).
-        length: Stored frames.
-        feature_sha256: Digest over all frames by feature.
-        lesson_feature_sha256: Digest over the frames before the query frame; empty in a unit.
-        stats: Image statistics by feature.
-    """
-
+    staged: Staged
     folder: Path
-    length: int
-    feature_sha256: dict[str, str]
-    lesson_feature_sha256: dict[str, str]
-    stats: dict[str, dict[str, list[float]]]
 
     def video(self, camera: str) -> Path:
         """Return the video file of a camera."""
@@ -60,216 +81,213 @@ class StagedEpisode:
         return values
 
 
-def stage_name(planned: PlannedEpisode, cameras: tuple[str, ...], codec: Codec) -> str:
-    """Return the folder name of a staged episode: a hash of all that decides its content."""
-    episode = asdict(planned.episode)
-    content = {
-        "episode": {**episode, "id": str(planned.episode.id), "key": repr(planned.episode.key)},
-        "indices": [planned.indices.start, planned.indices.stop, planned.indices.step],
-        "exec_start_idx": planned.exec_start_idx,
-        "cameras": list(cameras),
-        "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
-        "layout": 1,
-    }
-    return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
+@dataclass(frozen=True)
+class StageTask:
+    """Stages one episode after the other, as a task of an executor.
+
+    Attributes:
+        kind: `demonstrations` or `distractors`.
+        sources: Where to read.
+        cameras: Cameras to store; None for all.
+        codec: Video settings.
+        folder: Where staged episodes appear.
+    """
+
+    kind: str
+    sources: tuple[Source, ...]
+    cameras: tuple[str, ...] | None
+    codec: Codec
+    folder: Path
+
+    def place(self, task: Task) -> Path:
+        """Return the folder of a staged episode: named by a hash of all that decides it."""
+        number, episode = task
+        content = {
+            "kind": self.kind,
+            "source": self.sources[number].provenance,
+            "episode": [str(episode.id), repr(episode.key)],
+            "cameras": self.cameras,
+            "codec": [self.codec.vcodec, self.codec.pix_fmt, dict(self.codec.options)],
+            "layout": _LAYOUT,
+        }
+        return self.folder / hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
+
+    def __call__(self, task: Task, worker: Worker) -> StagedEpisode:
+        """Cut, encode, check and record one episode.
+
+        Raises:
+            InvalidOptionError: It has no such camera.
+            SourceError: The recording breaks off, or holds what cannot be stored.
+            BuildError: A video does not decode to what went in.
+        """
+        place = self.place(task)
+        done = read_staged(place)
+        if done is not None:
+            return done
+        number, episode = task
+        place.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(dir=place.parent, prefix=f".{place.name}."))
+        try:
+            recording = self.sources[number].read(episode, self.cameras)
+            with closing(recording.frames):
+                staged = self._write(episode.id, recording, partial)
+            write_json(partial / _RECORD, to_dict(staged))
+            for path in partial.iterdir():  # the data must reach the disk before the name does
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+            partial.rename(place)
+        except InterferenceError as error:
+            named = error.message.startswith(str(episode.id))
+            raise error if named else error.about(episode.id) from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        return StagedEpisode(staged, place)
+
+    def close(self) -> None:
+        """Release what sources hold."""
+        for source in self.sources:
+            source.close()
+
+    def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
+        writer = _Writer(self.codec, folder)
+        lesson: dict[str, str] | None = None
+        skipped = None
+        try:
+            for frame in CUTS[self.kind](recording.frames):
+                if self.kind == DEMONSTRATIONS and not frame.is_demonstration:
+                    lesson = writer.digests.current()
+                writer.add(frame)
+        except NothingToStore as reason:
+            skipped = str(reason)
+        writer.close()
+        start = writer.length - 1 if lesson is not None else None
+        digests = writer.digests.current()
+        if skipped is None:
+            decoded, decoded_lesson = _decode(writer, start)
+            if self.codec.exact and any(digests[name] != sha for name, sha in decoded.items()):
+                raise BuildError(
+                    f"a video does not decode to the frames that were encoded with "
+                    f"{self.codec.name}",
+                    "Please report this with the versions that robomme-interference doctor prints.",
+                )
+            # Of a lossy codec, what a reader gets is what is hashed.
+            digests |= decoded
+            lesson = None if lesson is None else lesson | decoded_lesson
+        return Staged(
+            episode_id=episode,
+            skipped=skipped,
+            length=writer.length,
+            goals=recording.goals,
+            seed=recording.seed,
+            difficulty=recording.difficulty,
+            simulator=recording.simulator,
+            exec_start_idx=start,
+            exact=recording.exact and self.codec.exact,
+            features=writer.features,
+            feature_sha256=digests,
+            lesson_sha256=lesson,
+            stats={
+                CAMERA_PREFIX + camera: {
+                    name: tuple(map(float, values)) for name, values in stats.result().items()
+                }
+                for camera, stats in writer.stats.items()
+            },
+        )
 
 
 def read_staged(folder: Path) -> StagedEpisode | None:
     """Return the staged episode in a folder; None if there is no such folder."""
-    try:
-        record = json.loads((folder / _RECORD).read_text())
-    except FileNotFoundError:
-        return None
-    return StagedEpisode(folder=folder, **record)
-
-
-def stage_episode(
-    source: Source,
-    planned: PlannedEpisode,
-    cameras: tuple[str, ...],
-    codec: Codec,
-    fps: int,
-    folder: Path,
-) -> StagedEpisode:
-    """Encode, check and record one episode.
-
-    Args:
-        source: Source to read from.
-        planned: The episode and which of its frames.
-        cameras: Cameras to store.
-        codec: Video settings.
-        fps: Frame rate of the dataset, in Hz.
-        folder: Where the staged episode appears when complete; left as it is if it exists.
-
-    Raises:
-        SourceError: The recording breaks off or contradicts what its source listed.
-        BuildError: A video does not decode to what went in.
-    """
-    done = read_staged(folder)
-    if done is not None:
-        return done
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        record = _write(source, planned, cameras, codec, fps, partial)
-        (partial / _RECORD).write_text(json.dumps(record))
-        for path in partial.iterdir():  # the data must reach the disk before the name does
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-        try:
-            partial.rename(folder)
-        except OSError:  # another process staged the same episode meanwhile
-            if read_staged(folder) is None:
-                raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return StagedEpisode(folder=folder, **record)
-
-
-def _write(
-    source: Source,
-    planned: PlannedEpisode,
-    cameras: tuple[str, ...],
-    codec: Codec,
-    fps: int,
-    folder: Path,
-) -> dict[str, Any]:
-    writer = _Writer(planned, cameras, codec, fps, folder)
-    lesson: dict[str, str] = {}
-    for position, frame in enumerate(_chosen(source, planned)):
-        if position == planned.exec_start_idx:
-            lesson = writer.digests.current()
-        _check(planned, position, frame)
-        writer.add(frame)
-    writer.close()
-    written = writer.digests.current()
-    decoded, decoded_lesson = _decode(planned, cameras, fps, folder)
-    if codec.exact:
-        for feature, digest in decoded.items():
-            if digest != written[feature]:
-                raise BuildError(
-                    f"{planned.episode.id}: {feature} does not decode to the frames that were "
-                    f"encoded with {codec.name}",
-                    "Please report this with the versions that robomme-interference doctor prints.",
-                )
-    else:  # what a reader gets is what is hashed
-        written |= decoded
-        lesson |= decoded_lesson
-    return {
-        "length": len(planned.indices),
-        "feature_sha256": written,
-        "lesson_feature_sha256": lesson,
-        "stats": {
-            CAMERA_PREFIX + camera: {name: v.tolist() for name, v in stat.result().items()}
-            for camera, stat in writer.stats.items()
-        },
-    }
+    path = folder / _RECORD
+    return StagedEpisode(read_header(path, Staged), folder) if path.is_file() else None
 
 
 class _Writer:
     """The files of a staged episode while they are written."""
 
-    def __init__(
-        self,
-        planned: PlannedEpisode,
-        cameras: tuple[str, ...],
-        codec: Codec,
-        fps: int,
-        folder: Path,
-    ):
+    def __init__(self, codec: Codec, folder: Path):
+        self._codec = codec
         self._folder = folder
-        sizes = planned.episode.cameras
-        self._encoders = {
-            camera: VideoEncoder(folder / f"{camera}.mp4", codec, fps, *sizes[camera])
-            for camera in cameras
-        }
-        self._vectors: dict[str, list[NDArray[np.float32]]] = {STATE: []}
-        if planned.episode.action_size is not None:
-            self._vectors[ACTION] = []
-        self.stats = {camera: ImageStats() for camera in cameras}
+        self._encoders: dict[str, VideoEncoder] = {}
+        self._vectors: dict[str, list[NDArray[np.float32]]] = {}
+        self.features: dict[str, tuple[int, ...]] = {}
+        self.stats: dict[str, ImageStats] = {}
         self.digests = FeatureDigests()
+        self.length = 0
 
     def add(self, frame: Frame) -> None:
-        for camera, encoder in self._encoders.items():
-            image = frame.images[camera]
-            encoder.add(image)
+        """Take the next frame.
+
+        Raises:
+            SourceError: It is not as the first one, or holds what is no finite number.
+        """
+        if not self.length:
+            self._begin(frame)
+        vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
+        found = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()} | vectors
+        shapes = {name: value.shape for name, value in found.items()}
+        if shapes != self.features:
+            raise SourceError(
+                f"stored frame {self.length} has {shapes}; the first one {self.features}",
+                "All frames of an episode must have the same cameras and sizes.",
+            )
+        for camera, image in frame.images.items():
+            self._encoders[camera].add(image)
             self.stats[camera].add(image)
             self.digests.update(CAMERA_PREFIX + camera, image)
-        for feature, value in ((STATE, frame.state), (ACTION, frame.action)):
-            if feature in self._vectors and value is not None:
-                self._vectors[feature].append(value)
-                self.digests.update(feature, value)
+        for name, value in vectors.items():
+            if value.dtype != np.float32 or not np.isfinite(value).all():
+                raise SourceError(
+                    f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
+                    "float32 numbers",
+                    "Mend the recording, or leave the episode out: --episodes",
+                )
+            self._vectors[name].append(value)
+            self.digests.update(name, value)
+        self.length += 1
 
     def close(self) -> None:
         for encoder in self._encoders.values():
             encoder.close()
-        for feature, values in self._vectors.items():
-            np.save(self._folder / f"{_file_name(feature)}.npy", np.stack(values))
+        for name, values in self._vectors.items():
+            np.save(self._folder / f"{_file_name(name)}.npy", np.stack(values))
 
+    def decoded(self) -> Iterator[tuple[str, Iterator[NDArray[np.uint8]]]]:
+        """Yield each camera's feature name, and its frames as they were written."""
+        for camera in self._encoders:
+            yield CAMERA_PREFIX + camera, iter_frames(self._folder / f"{camera}.mp4", 0, None, FPS)
 
-def _chosen(source: Source, planned: PlannedEpisode) -> Iterator[Frame]:
-    """Yield the planned frames of an episode, reading no further than the last."""
-    count = 0
-    frames = source.read(planned.episode)
-    with closing(frames):
-        for index, frame in enumerate(frames):
-            if index in planned.indices:
-                yield frame
-                count += 1
-                if count == len(planned.indices):
-                    return
-    raise SourceError(
-        f"{planned.episode.id}: the recording ends after {count} of the {len(planned.indices)} "
-        "frames that are needed",
-        "Record or download it again, or leave the episode out: --episodes",
-    )
-
-
-def _check(planned: PlannedEpisode, position: int, frame: Frame) -> None:
-    episode = planned.episode
-    found: dict[str, NDArray[Any] | None] = {
-        camera: frame.images.get(camera) for camera in episode.cameras
-    }
-    found |= {"state": frame.state, "action": frame.action}
-    expected = {camera: f"{(*size, 3)} uint8" for camera, size in episode.cameras.items()}
-    expected["state"] = f"({episode.state_size},) float32"
-    expected["action"] = (
-        "None" if episode.action_size is None else f"({episode.action_size},) float32"
-    )
-    for name, values in found.items():
-        kind = "None" if values is None else f"{values.shape} {values.dtype}"
-        if kind != expected[name]:
-            raise SourceError(
-                f"{episode.id}: {name} of frame {planned.indices[position]} is {kind}; the source "
-                f"says {expected[name]}"
+    def _begin(self, frame: Frame) -> None:
+        for camera, image in frame.images.items():
+            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+                raise SourceError(
+                    f"an image of camera {camera!r} is {image.shape} {image.dtype}; expected "
+                    "(H, W, 3) uint8"
+                )
+            path = self._folder / f"{camera}.mp4"
+            self._encoders[camera] = VideoEncoder(
+                path, self._codec, FPS, image.shape[0], image.shape[1]
             )
-    if planned.exec_start_idx is not None and frame.is_demonstration == (
-        position >= planned.exec_start_idx
-    ):
-        raise SourceError(
-            f"{episode.id}: frame {position} contradicts the demonstration length of "
-            f"{planned.exec_start_idx} that the source gives"
-        )
+            self.stats[camera] = ImageStats()
+            self.features[CAMERA_PREFIX + camera] = image.shape
+        for name, value in ((STATE, frame.state), (ACTION, frame.action)):
+            if value is not None:
+                self._vectors[name] = []
+                self.features[name] = value.shape
 
 
-def _decode(
-    planned: PlannedEpisode, cameras: tuple[str, ...], fps: int, folder: Path
-) -> tuple[dict[str, str], dict[str, str]]:
+def _decode(writer: _Writer, start: int | None) -> tuple[dict[str, str], dict[str, str]]:
     """Decode what was written; return the digests over all frames and over the lesson."""
     digests = FeatureDigests()
     lesson: dict[str, str] = {}
-    for camera in cameras:
-        path = folder / f"{camera}.mp4"
-        feature = CAMERA_PREFIX + camera
-        for position, image in enumerate(iter_frames(path, 0, None, fps)):
-            if position == planned.exec_start_idx:
+    for feature, frames in writer.decoded():
+        count = 0
+        for image in frames:
+            if count == start:
                 lesson[feature] = digests.current()[feature]
             digests.update(feature, image)
-        if position + 1 != len(planned.indices):
-            raise BuildError(
-                f"{planned.episode.id}: {feature} decodes to {position + 1} frames; "
-                f"{len(planned.indices)} were encoded"
-            )
+            count += 1
+        if count != writer.length:
+            raise BuildError(f"{feature} decodes to {count} frames; {writer.length} were encoded")
     return digests.current(), lesson
 
 

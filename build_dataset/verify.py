@@ -1,53 +1,37 @@
 """Recompute every hash and every rule of a split, and name each violation."""
 
-import json
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
-
-from robomme_interference_data.build_dataset.finish import revision_of
-from robomme_interference_data.build_dataset.manifests import expected_rows, plan_manifests
+from robomme_interference_data.build_dataset.identity import counts_of, listed_files, revision_of
+from robomme_interference_data.build_dataset.lerobot_meaning import lerobot_violations
+from robomme_interference_data.build_dataset.manifests import plan_manifests, planned_buffers
 from robomme_interference_data.constants import (
-    CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
     IDENTITY_PATH,
     INDEX_DIR,
     INDEX_HEADER,
-    MANIFEST_JSON,
-    MANIFEST_JSONL,
-    MANIFEST_PARQUET,
+    MANIFEST_HEADER,
+    MANIFEST_ROWS,
     MANIFESTS,
     RULE_VERSION,
     UNIT_FRAMES,
+    UNIT_STRIDE,
 )
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.digest import combine
-from robomme_interference_data.embeddings import index_folder
-from robomme_interference_data.errors import InterferenceError, InvalidIdError
-from robomme_interference_data.files import LocalFiles, read_json, sha256_file
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest_io import ManifestReader
-from robomme_interference_data.schema import EpisodeRecord
+from robomme_interference_data.embeddings import IndexHeader, index_folder
+from robomme_interference_data.encode import CODECS
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.files import LocalFiles, sha256_file
+from robomme_interference_data.records import EpisodeRecord, ManifestHeader
+from robomme_interference_data.rows import read_header, to_dict
+from robomme_interference_data.split import load_split
 
-__all__ = ["Violation", "verify_split"]
-
-Row = dict[str, Any]
-Rows = Iterator[Row]
-
-_LEROBOT_COLUMNS = (
-    "episode_index",
-    "tasks",
-    "length",
-    "dataset_from_index",
-    "dataset_to_index",
-)
-_LEROBOT_PREFIXES = ("data/", "videos/", "meta/", "stats/")
+__all__ = ["Violation", "frames_of", "verify_split"]
 
 
 @dataclass(frozen=True)
@@ -63,15 +47,25 @@ class Violation:
     what: str
 
 
+def frames_of(root: Path) -> int:
+    """Return how many frames a split stores; 0 if it cannot be told."""
+    try:
+        opened = [Dataset(LocalFiles(root / name)) for name in load_split(root).header.datasets]
+    except InterferenceError:
+        return 0
+    return sum(dataset.identity.counts.frames for dataset in opened)
+
+
 def verify_split(
     root: Path, *, decode: bool = True, advance: Callable[[int], None] = lambda frames: None
 ) -> Iterator[Violation]:
     """Check a split, yielding violations as they are found.
 
-    Checked are: the hashes of the manifest files; the identity of both datasets; with `decode`,
-    every frame and vector of every episode against its recorded hashes; embeddings that lie
-    beside the data, if any, against theirs (they are not made anew); and every manifest row, which
-    is made anew from the datasets, rules and seed and compared field by field.
+    Checked are: the SHA-256 of every file, and that none is missing or too many; with `decode`,
+    every frame and vector of every episode against its recorded hashes; what LeRobot's columns
+    and statistics mean; embeddings that lie beside the data, if any, against their hashes (they
+    are not made anew); and every manifest row, which is made anew from the datasets, rules and
+    seed and compared field by field.
 
     Args:
         root: Folder of the split.
@@ -79,208 +73,187 @@ def verify_split(
         advance: Called with a number of frames whenever so many have been checked.
 
     Raises:
-        MissingFileError, FormatError: The folder is not a split, or not one that can be read.
+        MissingFileError, FormatError: The folder is not a split, or its header cannot be read.
     """
-    reader = ManifestReader(LocalFiles(root / MANIFESTS))
-    for name, recorded in reader.header["files"].items():
-        path = root / MANIFESTS / name
-        if not path.is_file():
-            yield Violation(f"{MANIFESTS}/{name}", "is missing")
-        elif sha256_file(path) != recorded["sha256"]:
-            yield Violation(f"{MANIFESTS}/{name}", "does not have the SHA-256 of manifest.json")
-    datasets = {name: Dataset(LocalFiles(root / name)) for name in (DEMONSTRATIONS, DISTRACTORS)}
+    header = load_split(root).header
+    rows = root / MANIFESTS / MANIFEST_ROWS
+    if not rows.is_file():
+        yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", "is missing")
+    elif sha256_file(rows) != header.rows:
+        what = f"does not have the SHA-256 of {MANIFEST_HEADER}"
+        yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", what)
+    found: list[Violation] = []
+    datasets: dict[str, Dataset] = {}
+    for name in header.datasets:
+        with _told(name, found):
+            datasets[name] = Dataset(LocalFiles(root / name))
+    yield from found
     for name, dataset in datasets.items():
-        yield from _identity(name, dataset, reader)
-        for record, tasks in zip(
-            dataset.records(), dataset.episodes["tasks"].to_pylist(), strict=True
-        ):
-            yield from _record(name, record, tasks)
+        yield from _dataset(name, dataset, header, decode=decode, advance=advance)
+        pool = datasets.get(DISTRACTORS)
+        if pool is not None:
+            yield from _indexes(name, dataset, pool.revision)
+    if not found:
+        yield from _buffers(root, header)
+
+
+@contextmanager
+def _told(where: str, found: list[Violation]) -> Iterator[None]:
+    """Turn an error of what is read inside into a violation."""
+    try:
+        yield
+    except InterferenceError as error:
+        found.append(Violation(where, error.message))
+
+
+def _dataset(
+    name: str,
+    dataset: Dataset,
+    header: ManifestHeader,
+    *,
+    decode: bool,
+    advance: Callable[[int], None],
+) -> Iterator[Violation]:
+    found: list[Violation] = []
+    with _told(name, found):
+        found += _files(name, dataset, header)
+        records = list(dataset.records())
+        found += _identity(name, dataset, records, header)
+        found += (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
+        yield from found
+        found.clear()
+        for record in records:
+            yield from _record(name, record)
             if decode:
                 yield from _episode(name, dataset, record)
                 advance(record.length)
-        yield from _indexes(name, dataset, datasets[DISTRACTORS].revision)
-    yield from _rows(root, reader, datasets)
+    yield from found
 
 
-def _identity(name: str, dataset: Dataset, reader: ManifestReader) -> Iterator[Violation]:
-    own = [
-        column
-        for column in dataset.episodes.column_names
-        if column not in _LEROBOT_COLUMNS and not column.startswith(_LEROBOT_PREFIXES)
-    ]
-    if revision_of(dataset.episodes.select(own).to_pylist()) != dataset.revision:
-        yield Violation(name, "the episode table is not the one that the revision was made from")
-    found = {
-        "counts": {
-            "episodes": len(dataset),
-            "frames": pc.sum(dataset.episodes["length"]).as_py(),
-            "families": dict(Counter(dataset.episodes["family"].to_pylist())),
-        },
-        "exact": pc.all(dataset.episodes["exact"]).as_py(),
-        "cameras": [camera.removeprefix(CAMERA_PREFIX) for camera in dataset.cameras],
-        "simulators": sorted({*dataset.episodes["simulator"].to_pylist()} - {None}),
+def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
+    """Check every byte of a dataset: identity, list of sums, and all files in it."""
+    files = dataset.files
+    if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
+        what = f"does not have the SHA-256 of {MANIFESTS}/{MANIFEST_HEADER}"
+        yield Violation(f"{name}/{IDENTITY_PATH}", what)
+    sums, there = dataset.sums(), set(listed_files(files))
+    for path in sorted(sums.keys() | there):
+        if path not in there:
+            yield Violation(f"{name}/{path}", "is missing")
+        elif path not in sums:
+            yield Violation(f"{name}/{path}", "is too many: it is in no list")
+        elif sha256_file(files.path(path)) != sums[path]:
+            yield Violation(f"{name}/{path}", "does not have the recorded SHA-256")
+
+
+def _identity(
+    name: str, dataset: Dataset, records: list[EpisodeRecord], header: ManifestHeader
+) -> Iterator[Violation]:
+    identity, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
+    unit = {"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if name == DISTRACTORS else None
+    expected: dict[str, Any] = {
+        "kind": name,
+        "revision": revision_of(records),
+        "exact": all(record.exact for record in records),
+        "cameras": dataset.cameras,
+        "unit": unit,
+        "simulators": tuple(sorted({r.simulator for r in records if r.simulator})),
+        "counts": counts_of(records),
     }
-    for field, value in found.items():
-        if dataset.identity.get(field) != value:
-            what = f"{field} is {dataset.identity.get(field)}; its episodes say {value}"
-            yield Violation(f"{name}/{IDENTITY_PATH}", what)
-    recorded = reader.header["datasets"][name]
-    if recorded["revision"] != dataset.revision:
-        yield Violation(name, "is not the revision that the manifests were made for")
-    for field, value in recorded.items():
-        own_value = dataset.identity.get(field)
-        if field != "revision" and value != own_value:
-            what = f"{field} of the {name} is {value}; the dataset says {own_value}"
-            yield Violation(f"{MANIFESTS}/{MANIFEST_JSON}", what)
+    for field, value in expected.items():
+        given = getattr(identity, field)
+        if given != value:
+            yield Violation(where, f"{field} is {given}; its episodes say {value}")
+    if identity.codec not in CODECS:
+        yield Violation(where, f"codec {identity.codec!r} is unknown")
+    recorded = header.datasets[name]
+    for field in ("kind", "version", "revision"):
+        if getattr(recorded, field) != getattr(identity, field):
+            what = f"{field} of the {name} is {getattr(recorded, field)}; the dataset says "
+            yield Violation(f"{MANIFESTS}/{MANIFEST_HEADER}", f"{what}{getattr(identity, field)}")
 
 
-def _record(name: str, record: EpisodeRecord, tasks: list[str]) -> Iterator[Violation]:
+def _record(name: str, record: EpisodeRecord) -> Iterator[Violation]:
     start = record.exec_start_idx
-    if (start is None) != (name == DISTRACTORS):
-        yield Violation(f"{name} {record.id}", f"exec_start_idx is {start}")
+    where = f"{name} {record.episode_id}"
+    if (start is None) != (name == DISTRACTORS) or (start is None) != (
+        record.lesson_sha256 is None
+    ):
+        yield Violation(where, f"exec_start_idx is {start}")
     elif record.length != (expected := UNIT_FRAMES if start is None else start + 1):
-        yield Violation(f"{name} {record.id}", f"holds {record.length} frames, not {expected}")
-    if tasks != [record.goals[0]]:
-        yield Violation(f"{name} {record.id}", f"its task is {tasks}; its goal {record.goals[0]!r}")
+        yield Violation(where, f"holds {record.length} frames, not {expected}")
 
 
 def _episode(name: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
-    spans: list[tuple[str, int, dict[str, str], str | None]] = [
-        ("frames", record.length, record.feature_sha256, record.sha256)
-    ]
-    if record.exec_start_idx is not None:
-        recorded = record.lesson_feature_sha256, record.lesson_sha256
-        spans.append(("lesson", record.exec_start_idx, *recorded))
-    where = f"{name} {record.id}"
-    try:
-        found = dataset.prefix_digests(record.episode_index, [stop for _, stop, *_ in spans])
-    except InterferenceError as error:
-        yield Violation(where, error.message)
-        return
-    for (what, _, features, whole), digests in zip(spans, found, strict=True):
-        for feature, digest in digests.items():
-            if digest != features.get(feature):
-                yield Violation(where, f"{feature} ({what}) does not have the recorded SHA-256")
-        if combine(features) != whole:
-            yield Violation(where, f"the SHA-256 of its {what} is not that of their features")
+    where = f"{name} {record.episode_id}"
+    spans = {"frames": (record.length, record.feature_sha256)}
+    if record.exec_start_idx is not None and record.lesson_sha256 is not None:
+        spans["lesson"] = (record.exec_start_idx, record.lesson_sha256)
+    found: list[Violation] = []
+    with _told(where, found):
+        stops = [stop for stop, _ in spans.values()]
+        decoded = dataset.digests(record.episode_index, 0, stops)
+        for (what, (_, recorded)), digests in zip(spans.items(), decoded, strict=True):
+            for feature in sorted(digests.keys() | recorded.keys()):
+                if digests.get(feature) != recorded.get(feature):
+                    told = f"{feature} ({what}) does not have the recorded SHA-256"
+                    found.append(Violation(where, told))
+    yield from found
 
 
 def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
     """Check the embeddings beside a dataset, whatever encoders and cameras they are of."""
+    lengths = {record.episode_index: record.length for record in dataset.records()}
     for path in dataset.files.list(INDEX_DIR, f"/{INDEX_HEADER}"):
         folder = str(PurePath(path).parent)
-        where = f"{name}/{folder}"
-        try:
-            header = read_json(dataset.files.path(path))
-            made = header["encoder"]["name"], header["camera"]
+        found: list[Violation] = []
+        with _told(f"{name}/{folder}", found):
+            header = read_header(dataset.files.path(path), IndexHeader)
+            made = header.encoder.name, header.camera
             if index_folder(*made) != folder:
-                yield Violation(where, f"holds the embeddings of {made[0]}, camera {made[1]}")
+                what = f"holds the embeddings of {made[0]}, camera {made[1]}"
+                found.append(Violation(f"{name}/{folder}", what))
+            else:
+                dataset.index(*made).check(lengths)
+            if header.pool != pool:
+                what = "its centre and typical cosine are of other distractors"
+                found.append(Violation(f"{name}/{folder}", what))
+        yield from found
+
+
+def _buffers(root: Path, header: ManifestHeader) -> Iterator[Violation]:
+    """Plan all buffers anew, and compare them with the rows."""
+    where = f"{MANIFESTS}/{MANIFEST_HEADER}"
+    if header.rule_version != RULE_VERSION:
+        what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
+        yield Violation(where, what)
+        return
+    found: list[Violation] = []
+    with _told(MANIFESTS, found):
+        plan = plan_manifests(root, header.conditions, header.seed, header.position_limit)
+        given = {str(manifest): to_dict(manifest) for manifest in load_split(root).manifests()}
+        order = list(given)
+        counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
+        for number, manifest in enumerate(planned_buffers(plan)):
+            counts["buffers"] += 1
+            counts["sessions"] += len(manifest.sessions)
+            row = given.pop(str(manifest), None)
+            if row is None:
+                found.append(Violation(str(manifest), f"is missing in {MANIFEST_ROWS}"))
                 continue
-            index = dataset.index(*made)
-            index.check()
-        except InterferenceError as error:
-            yield Violation(where, error.message)
-        except (KeyError, TypeError, AttributeError):
-            yield Violation(where, f"its {INDEX_HEADER} does not say of which encoder and camera")
-        else:
-            if index.pool != pool:
-                yield Violation(where, "its centre and typical cosine are of other distractors")
-
-
-def _rows(root: Path, reader: ManifestReader, datasets: dict[str, Dataset]) -> Iterator[Violation]:
-    header = reader.header
-    if header["rule_version"] != RULE_VERSION:
-        yield Violation(
-            f"{MANIFESTS}/manifest.json",
-            f"rule version {header['rule_version']}; this package can check {RULE_VERSION}",
-        )
-        return
-    try:
-        plan = plan_manifests(
-            datasets[DEMONSTRATIONS],
-            datasets[DISTRACTORS],
-            header["k"],
-            header["seed"],
-            header["position_limit"],
-        )
-        counts = {"queries": 0, "buffers": 0, "sessions": 0}
-        for expected, found in _aligned(expected_rows(plan), reader.rows()):
-            yield from _row(expected, found)
-            if expected is not None:
-                counts["queries"] += expected["k"] == plan.k[0]
-                counts["buffers"] += 1
-                counts["sessions"] += len(expected["sessions"])
-        if header["counts"] != counts:
-            what = f"counts are {header['counts']}; there are {counts}"
-            yield Violation(f"{MANIFESTS}/{MANIFEST_JSON}", what)
-        yield from _lines(root / MANIFESTS / MANIFEST_JSONL, reader)
-    except InterferenceError as error:
-        yield Violation(MANIFESTS, error.message)
-    except (pa.ArrowException, OSError) as error:
-        yield Violation(f"{MANIFESTS}/{MANIFEST_PARQUET}", f"cannot be read: {error}")
-
-
-def _aligned(expected: Rows, found: Rows) -> Iterator[tuple[Row | None, Row | None]]:
-    """Pair the rows of two streams in canonical order; None where one has no such row."""
-    other = next(found, None)
-    for row in expected:
-        while other is not None and _key(other) < _key(row):
-            yield None, other
-            other = next(found, None)
-        if other is not None and _key(other) == _key(row):
-            yield row, other
-            other = next(found, None)
-        else:
-            yield row, None
-    while other is not None:
-        yield None, other
-        other = next(found, None)
-
-
-def _key(row: Row) -> tuple[tuple[int | str, ...], int]:
-    try:
-        return EpisodeId.parse(row["episode_id"]).sort_key, int(row["k"])
-    except (InvalidIdError, AttributeError, KeyError, TypeError, ValueError):
-        return (-1,), -1  # before all others
-
-
-def _row(expected: Row | None, found: Row | None) -> Iterator[Violation]:
-    if expected is None or found is None:
-        what = "should not be there" if expected is None else "is missing"
-        row = expected or found or {}
-        yield Violation(_name(row), f"the row {what} in {MANIFEST_PARQUET}, or not in its place")
-        return
-    for field, value in expected.items():
-        if found[field] != value:
-            given, wanted = _difference(found[field], value)
-            yield Violation(_name(expected), f"{field} is {given}; the rules give {wanted}")
-
-
-def _lines(path: Path, reader: ManifestReader) -> Iterator[Violation]:
-    """Check that the JSON lines are the rows of the parquet file."""
-    broken: list[int] = []
-    if not path.is_file():
-        return
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for row, line in _aligned(reader.rows(), _parsed(lines, broken)):
-            if row != line:
-                name = _name(row or line or {})
-                what = f"{name} is not the same row as in {MANIFEST_PARQUET}"
-                yield Violation(f"{MANIFESTS}/{MANIFEST_JSONL}", what)
-    for number in broken:
-        yield Violation(f"{MANIFESTS}/{MANIFEST_JSONL}", f"line {number} is not a JSON object")
-
-
-def _parsed(lines: Iterable[str], broken: list[int]) -> Rows:
-    for number, line in enumerate(lines, 1):
-        try:
-            row = json.loads(line)
-        except ValueError:
-            row = None
-        if isinstance(row, dict):
-            yield row
-        else:
-            broken.append(number)
+            if number >= len(order) or order[number] != str(manifest):
+                found.append(Violation(str(manifest), f"is not in its place in {MANIFEST_ROWS}"))
+            for field, value in to_dict(manifest).items():
+                if row[field] != value:
+                    told, rules = _difference(row[field], value)
+                    what = f"{field} is {told}; the rules give {rules}"
+                    found.append(Violation(str(manifest), what))
+        found += (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in given)
+        if header.counts != counts:
+            found.append(Violation(where, f"counts are {header.counts}; there are {counts}"))
+        if set(header.datasets) != {DEMONSTRATIONS, DISTRACTORS}:
+            found.append(Violation(where, f"datasets are {sorted(header.datasets)}"))
+    yield from found
 
 
 def _difference(found: Any, expected: Any) -> tuple[str, str]:
@@ -291,12 +264,6 @@ def _difference(found: Any, expected: Any) -> tuple[str, str]:
         return f"{given} at {place}", wanted
     if isinstance(found, dict) and isinstance(expected, dict):
         keys = [key for key in expected if found.get(key) != expected[key]]
-        return (
-            str({key: found.get(key) for key in keys}),
-            str({key: expected[key] for key in keys}),
-        )
+        both = ({key: one.get(key) for key in keys} for one in (found, expected))
+        return str(next(both)), str(next(both))
     return repr(found), repr(expected)
-
-
-def _name(row: dict[str, Any]) -> str:
-    return f"{row.get('episode_id')} at k={row.get('k')}"

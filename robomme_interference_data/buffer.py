@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +124,9 @@ class Buffer:
     @property
     def session_index(self) -> NDArray[np.int64]:
         """For each frame, the number of its session, `(T,) int64`; a new array."""
-        return np.repeat(np.arange(len(self.sessions), dtype=np.int64), list(map(len, self.sessions)))
+        return np.repeat(
+            np.arange(len(self.sessions), dtype=np.int64), list(map(len, self.sessions))
+        )
 
     @cached_property
     def states(self) -> NDArray[np.float32]:
@@ -241,7 +244,7 @@ class Buffer:
             FormatError: They are of an unknown version, or damaged.
         """
         of_query = self.query.dataset.index(encoder, camera)
-        parts = [np.empty((0, of_query.header.size), np.float16)]
+        parts: list[NDArray[np.float16]] = [np.empty((0, of_query.header.size), np.float16)]
         for entry in self.manifest.sessions:
             index = self._datasets[entry.dataset].index(encoder, camera)
             if index.made != of_query.made:
@@ -343,9 +346,8 @@ class Buffer:
             for frame in self._stored_frames(entry, camera, stored, end):
                 # A frame is shown until the next one's first place.
                 until = position + entry.repeat - (position - session.start) % entry.repeat
-                for position in range(position, min(last, until)):
-                    yield frame
-                position += 1
+                yield from repeat(frame, min(last, until) - position)
+                position = until
 
     def _stored_frames(
         self, entry: SessionEntry, camera: str, start: int, stop: int

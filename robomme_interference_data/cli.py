@@ -11,44 +11,30 @@ import typer
 from typer.core import TyperGroup
 
 from robomme_interference_data import commands
-from robomme_interference_data.build_dataset import check_commands
-from robomme_interference_data.build_dataset import commands as build_commands
+from robomme_interference_data.build_dataset import commands as building
+from robomme_interference_data.console import MESSAGES
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.evaluate import commands as evaluate_commands
-from robomme_interference_data.evaluate.score import commands as score_commands
-from robomme_interference_data.retrieval import commands as retrieval_commands
-from robomme_interference_data.simulators import commands as simulator_commands
+from robomme_interference_data.evaluate import commands as evaluating
+from robomme_interference_data.evaluate.score import commands as scoring
+from robomme_interference_data.retrieval import commands as retrieving
+from robomme_interference_data.settings import spread_values
+from robomme_interference_data.simulators import commands as simulating
 
 __all__ = ["app", "main"]
 
 
-SEVERAL = {
-    "build": ("--k",),
-    "evaluate": ("--conditions", "--families"),
-    "retrieval-score": ("--rules",),
-}
-"""Options that take several values, by command."""
-
-
 class _Root(TyperGroup):
-    """Lets options take several values, as in `--k 0 1 3 7`."""
+    """Lets options take several values, as in `--conditions k0 k7`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, spread(args))
-
-
-def spread(args: list[str]) -> list[str]:
-    """Repeat an option before each of its values: click's options take one value each."""
-    options = SEVERAL.get(args[0], ()) if args else ()
-    spreaded: list[str] = []
-    option: str | None = None
-    for arg in args:
-        if arg.startswith("-"):
-            option = arg if arg in options else None
-        elif option is not None and spreaded[-1] != option:
-            spreaded.append(option)
-        spreaded.append(arg)
-    return spreaded
+        command: Any = self
+        several: set[str] = set()
+        for arg in args:
+            command = getattr(command, "commands", {}).get(arg)
+            if command is None:
+                break
+            several |= {o for p in command.params if getattr(p, "multiple", False) for o in p.opts}
+        return super().parse_args(ctx, spread_values(args, tuple(several)))
 
 
 app = typer.Typer(
@@ -57,7 +43,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    help="History buffers for RoboMME-Interference: build, load, stream and check.",
+    help="History buffers for RoboMME-Interference: build, load, stream and score.",
     epilog="""A split is a folder with demonstrations, distractor units and manifests of buffers.
 
 ```
@@ -65,25 +51,40 @@ robomme-interference doctor
 robomme-interference build all --source robomme-h5:recordings/ --out my-split
 robomme-interference verify my-split
 robomme-interference list my-split
-robomme-interference show MoveCube/train/0 --split my-split --k 3 --out strip.png
+robomme-interference show MoveCube/train/0 k3 --split my-split --out strip.png
 ```
 """,
 )
-app.add_typer(build_commands.app, name="build")
-app.command()(check_commands.verify)
-app.command()(check_commands.audit)
-app.command(name="list")(commands.list_buffers)
-app.command()(commands.show)
-app.command()(retrieval_commands.index)
-app.command()(retrieval_commands.retrieve)
-app.command(name="retrieval-score")(retrieval_commands.retrieval_score)
-app.command()(retrieval_commands.calibrate)
-app.command()(commands.doctor)
-app.command()(simulator_commands.simulate)
-app.command()(score_commands.score)
-app.command()(score_commands.compare)
-app.command()(evaluate_commands.evaluate)
-app.command()(evaluate_commands.merge)
+
+_GROUPS = {
+    "Data": (
+        ("doctor", commands.doctor),
+        ("build", building.app),
+        ("verify", building.verify),
+        ("audit", building.audit),
+    ),
+    "Look": (
+        ("list", commands.list_buffers),
+        ("show", commands.show),
+        ("simulate", simulating.simulate),
+    ),
+    "Retrieval": (
+        ("index", retrieving.index),
+        ("retrieve", retrieving.retrieve),
+        ("retrieval-score", retrieving.retrieval_score),
+        ("calibrate", retrieving.calibrate),
+    ),
+    "Rollouts": (("evaluate", evaluating.evaluate), ("merge", evaluating.merge)),
+    "Scores": (("score", scoring.score), ("compare", scoring.compare)),
+}
+"""Commands in the order in which one uses them."""
+
+for _panel, _commands in _GROUPS.items():
+    for _name, _command in _commands:
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, name=_name, rich_help_panel=_panel)
+        else:
+            app.command(name=_name, rich_help_panel=_panel)(_command)
 
 
 def main() -> None:
@@ -91,10 +92,7 @@ def main() -> None:
     try:
         app()
     except InterferenceError as error:
-        typer.secho(f"Error: {error.message}", fg=typer.colors.RED, err=True)
-        if error.hint:
-            typer.echo(error.hint, err=True)
-        sys.exit(1)
+        _fail(error.message, error.hint)
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
@@ -102,9 +100,15 @@ def main() -> None:
         if error.errno is None:  # not the system's word on a file
             raise
         where = f"{error.filename}: " if error.filename is not None else ""
-        typer.secho(f"Error: {where}{error.strerror}", fg=typer.colors.RED, err=True)
-        typer.echo("Check the path, its permissions and the space left on the disk.", err=True)
-        sys.exit(1)
+        hint = "Check the path, its permissions and the space left on the disk."
+        _fail(f"{where}{error.strerror}", hint)
+
+
+def _fail(message: str, hint: str | None) -> None:
+    typer.secho(f"Error: {message}", fg=typer.colors.RED, err=True)
+    if hint:
+        MESSAGES.print(hint)
+    sys.exit(1)
 
 
 if __name__ == "__main__":

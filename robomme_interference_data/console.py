@@ -1,6 +1,9 @@
 """What commands print: messages and progress on stderr, JSON on stdout."""
 
 import json
+import shlex
+import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any, Self
@@ -19,7 +22,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-__all__ = ["MESSAGES", "AsJson", "WorkProgress", "print_json"]
+__all__ = ["MESSAGES", "AsJson", "WorkProgress", "command_line", "print_json", "stoppable"]
 
 MESSAGES = Console(stderr=True, soft_wrap=True, markup=False, emoji=False, highlight=False)
 """What commands say beside their output: lines are never wrapped, so that paths can be copied."""
@@ -31,6 +34,41 @@ AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard out
 def print_json(value: Any) -> None:
     """Print one JSON value to stdout."""
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def command_line() -> str:
+    """Return the command that runs, to be typed again."""
+    return shlex.join(["robomme-interference", *sys.argv[1:]])
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came."""
+
+
+@contextmanager
+def stoppable(kept: str) -> Iterator[None]:
+    """Let Ctrl-C, and SIGTERM as schedulers send it, end a command in peace; tell how to go on.
+
+    Args:
+        kept: What an interrupted command leaves behind, such as `Finished episodes are kept`.
+    """
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short
+        raise _Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        MESSAGES.print(f"\nStopped. {kept}; go on with:\n{command_line()}")
+        raise typer.Exit(143 if isinstance(interrupt, _Terminated) else 130) from None
+    except OSError as error:
+        if error.errno is not None:  # the system's word on a file, such as that the disk is full
+            MESSAGES.print(f"Stopped. {kept}; once mended, go on with:\n{command_line()}")
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class _Speed(ProgressColumn):

@@ -256,7 +256,9 @@ class EmbeddingIndex:
         if extra := sorted(listed ^ known | (self._sums.keys() - expected - {CENTRE_FILE})):
             raise self._damaged(f"{extra[0]} is missing, or too many")
         if self.header.frames != sum(lengths.values()):
-            raise self._damaged(f"{self.header.frames} frames; the dataset has {sum(lengths.values())}")
+            raise self._damaged(
+                f"{self.header.frames} frames; the dataset has {sum(lengths.values())}"
+            )
 
     @cached_property
     def _sums(self) -> dict[str, str]:

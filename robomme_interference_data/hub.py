@@ -29,9 +29,7 @@ def is_repo_id(text: str) -> bool:
     return _REPO_ID.fullmatch(text) is not None
 
 
-def locate(
-    location: str | os.PathLike[str], repo_type: str = "dataset"
-) -> "LocalFiles | HubFiles":
+def locate(location: str | os.PathLike[str], repo_type: str = "dataset") -> "LocalFiles | HubFiles":
     """Return the files at a location.
 
     Args:

@@ -33,7 +33,6 @@ VERSIONS = ("v3.0", "v2.1")
 
 _V21_EPISODES = "meta/episodes.jsonl"
 _V21_TASKS = "meta/tasks.jsonl"
-_V21_STATS = "meta/episodes_stats.jsonl"
 
 _MAX_VALUES = 1 << 28
 """Values in one frame of a feature, at most: nothing is allocated for a shape beyond."""
@@ -84,16 +83,14 @@ class LeRobotFiles:
 
     Args:
         files: How to reach the dataset.
-        keep_stats: Columns whose statistics are kept: `constant` tells of them.
 
     Raises:
         MissingFileError: `meta/info.json` is missing.
         FormatError: It is of an unknown version, or damaged.
     """
 
-    def __init__(self, files: Files, keep_stats: tuple[str, ...] = ()):
+    def __init__(self, files: Files):
         self.files = files
-        self._keep_stats = keep_stats
         self._rows: dict[int, dict[str, Any]] = {}
         try:
             path = files.path(INFO_PATH)
@@ -124,7 +121,7 @@ class LeRobotFiles:
         return dict(self.info["features"])
 
     def shape(self, column: str) -> tuple[int, ...]:
-        """Return the shape of one value of a column; of a camera `(H, W, 3)`, however it is told."""
+        """Return the shape of a column's values; of a camera `(H, W, 3)`, however it is told."""
         feature = self.info["features"][column]
         shape = tuple(feature["shape"])
         if feature["dtype"] in ("video", "image") and len(shape) == 3 and shape[2] != 3:
@@ -136,7 +133,7 @@ class LeRobotFiles:
 
     @cached_property
     def table(self) -> pa.Table:
-        """The per-episode columns by episode index; statistics only of what is kept.
+        """The per-episode columns by episode index, without statistics.
 
         Raises:
             MissingFileError: A file in `meta/` is missing.
@@ -179,12 +176,10 @@ class LeRobotFiles:
             row = self._rows[index] = self.table.slice(index, 1).to_pylist()[0]
         return row
 
-    def constant(self, column: str, index: int) -> int | None:
-        """Return the value that a kept column has in all frames of an episode; None if not told."""
-        low, high = (self.row(index).get(f"stats/{column}/{bound}") for bound in ("min", "max"))
-        low, high = (b[0] if isinstance(b, list) and b else b for b in (low, high))
-        told = isinstance(low, int | float) and low == high and low == int(low)
-        return int(low) if told else None
+    def all_rows(self) -> list[dict[str, Any]]:
+        """Return `row` of every episode, by episode index."""
+        rows: list[dict[str, Any]] = self.table.to_pylist()
+        return rows
 
     def place(self, index: int) -> EpisodePlace:
         """Return where an episode lies.
@@ -301,7 +296,6 @@ class LeRobotFiles:
             )
 
     def _v30_table(self) -> pa.Table:
-        kept = [f"stats/{name}/{bound}" for name in self._keep_stats for bound in ("min", "max")]
         paths = [self.files.path(name) for name in self.files.list(EPISODES_DIR, ".parquet")]
         if not paths:
             raise MissingFileError(
@@ -311,7 +305,7 @@ class LeRobotFiles:
         tables = []
         for path in paths:
             file = open_parquet(path)
-            names = [n for n in file.schema_arrow.names if not n.startswith("stats/") or n in kept]
+            names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
             with reading(path):
                 tables.append(file.read(columns=names))
         with reading(paths[0]):  # files with columns of different types
@@ -319,14 +313,6 @@ class LeRobotFiles:
 
     def _v21_table(self) -> pa.Table:
         rows = list(self._json_lines(_V21_EPISODES))
-        if self._keep_stats and _V21_STATS in self.files.list("meta", ".jsonl"):
-            by_index = {row.get("episode_index"): row.get("stats") for row in self._json_lines(_V21_STATS)}
-            for row in rows:
-                stats = by_index.get(row.get("episode_index"))
-                for name in self._keep_stats:
-                    bounds = stats.get(name) if isinstance(stats, dict) else None
-                    for bound in ("min", "max"):
-                        row[f"stats/{name}/{bound}"] = (bounds or {}).get(bound)
         names = dict.fromkeys(name for row in rows for name in row)
         with reading(self.files.path(_V21_EPISODES)):
             return pa.table({name: [row.get(name) for row in rows] for name in names})

@@ -59,7 +59,9 @@ class Query:
         """Frames of its demonstration, the first live observation not among them."""
         start = self.record.exec_start_idx
         if start is None:
-            raise FormatError.damaged(self.dataset.files.describe(), f"{self.episode_id}: no lesson")
+            raise FormatError.damaged(
+                self.dataset.files.describe(), f"{self.episode_id}: no lesson"
+            )
         return start
 
     @property

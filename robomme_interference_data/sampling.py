@@ -1,22 +1,11 @@
 """What a sample of a history holds, whatever sessions the history is made of: pure."""
 
 from collections.abc import Iterable, Sequence
-from typing import Protocol
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
+from robomme_interference_data.records import Session
 
-__all__ = ["Span", "even_sample", "lesson_frames", "lesson_share", "spread"]
-
-
-class Span(Protocol):
-    """Frames of a buffer that have one role: `start` is the first, `stop` follows the last."""
-
-    @property
-    def role(self) -> str: ...
-    @property
-    def start(self) -> int: ...
-    @property
-    def stop(self) -> int: ...
+__all__ = ["even_sample", "lesson_frames", "lesson_share", "spread"]
 
 
 def even_sample(history_frames: int, samples: int = SAMPLE_FRAMES) -> list[int]:
@@ -49,23 +38,20 @@ def spread(start: int, stop: int, count: int) -> list[int]:
     return [start + j * last // max(count - 1, 1) for j in range(count)]
 
 
-def lesson_frames(sessions: Iterable[Span], start: int = 0, stop: int | None = None) -> int:
-    """Count the frames of a span of a buffer, by default of all, that are of the lesson.
+def lesson_frames(sessions: Iterable[Session], start: int, stop: int) -> int:
+    """Count the frames of a span of a buffer that are of the lesson.
 
     Args:
         sessions: The buffer's sessions.
         start: First frame of the span.
-        stop: Frame after its last one; None for the buffer's end.
+        stop: Frame after its last one.
     """
-    return sum(
-        max(0, min(session.stop, session.stop if stop is None else stop) - max(session.start, start))
-        for session in sessions
-        if session.role == "lesson"
-    )
+    lessons = (session for session in sessions if session.role == "lesson")
+    return sum(max(0, min(one.stop, stop) - max(one.start, start)) for one in lessons)
 
 
 def lesson_share(
-    sessions: Sequence[Span], start: int, stop: int, samples: int = SAMPLE_FRAMES
+    sessions: Sequence[Session], start: int, stop: int, samples: int = SAMPLE_FRAMES
 ) -> float:
     """Return the share of lesson frames in an even sample of a span of a buffer.
 
@@ -79,10 +65,19 @@ def lesson_share(
     Returns:
         Share from 0 to 1.
     """
-    lessons = [session for session in sessions if session.role == "lesson"]
-    sample = even_sample(stop - start, samples)
-    inside = sum(
-        any(session.start <= start + index < session.stop for session in lessons)
-        for index in sample[:-1]
-    )
-    return inside / len(sample)
+    frames = stop - start
+    count = min(samples, frames + 1)
+    inside = 0
+    for session in sessions:
+        if session.role == "lesson":
+            first, last = (
+                min(max(edge - start, 0), frames) for edge in (session.start, session.stop)
+            )
+            inside += _before(last, frames, count) - _before(first, frames, count)
+    return inside / count
+
+
+def _before(index: int, frames: int, count: int) -> int:
+    """Return how many of an even sample's history frames come before one."""
+    # floor(j·t / (n − 1)) < index for the first ⌈index·(n − 1) / t⌉ numbers j.
+    return -(-index * (count - 1) // frames) if frames else 0

@@ -30,7 +30,7 @@ _SETTING = "setting"
 def setting(
     default: Any = dataclasses.MISSING,
     *,
-    help: str,  # noqa: A002 - as typer has it
+    help: str,
     name: str | None = None,
     metavar: str | None = None,
     env: str | None = None,
@@ -131,8 +131,8 @@ def _options(config: type) -> list[inspect.Parameter]:
     for name, hint, told, default in _declared(config):
         plain = _without_none(hint)
         if get_origin(plain) is tuple:
-            item = get_args(plain)[0]
-            kind: Any = list[item] if plain is hint else list[item] | None
+            listed: Any = list.__class_getitem__(get_args(plain)[0])
+            kind: Any = listed if plain is hint else listed | None
             metavar = told["metavar"] or "NAME…"
         else:
             kind, metavar = hint, told["metavar"]
@@ -141,10 +141,11 @@ def _options(config: type) -> list[inspect.Parameter]:
             about["show_default"] = told["shown"]
         elif default in (None, ()):
             about["show_default"] = False
-        if told["name"] == "-":
-            annotation = Annotated[kind, typer.Argument(**about)]
-        else:
-            annotation = Annotated[kind, typer.Option(_option_name(name, told), **about)]
+        argument = told["name"] == "-"
+        option: Any = (
+            typer.Argument(**about) if argument else typer.Option(_option_name(name, told), **about)
+        )
+        annotation: Any = Annotated[kind, option]
         missing = default is dataclasses.MISSING
         value = inspect.Parameter.empty if missing else _default(default)
         found.append(

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
-from robomme_interference_data.draw import even_sample
 from robomme_interference_data.page import Page, ink_on, open_page, tint
-from robomme_interference_data.sessions import Session
+from robomme_interference_data.records import Session
+from robomme_interference_data.sampling import even_sample, spread
 
-__all__ = ["Block", "arrange", "draw_strip", "session_colors", "shown_frames"]
+__all__ = ["Block", "arrange", "draw_strip", "session_colors"]
 
 LESSON_COLOR = "#D55E00"
 COLORS = (
@@ -59,16 +59,6 @@ class Block:
     slot: int
     slots: int
     frames: int
-
-
-def shown_frames(start: int, stop: int, count: int) -> list[int]:
-    """Return at most `count` evenly spread indices from `start` to `stop` (excluded).
-
-    The first and the last frame are among them, unless `count` is 1.
-    """
-    last = stop - start - 1
-    count = min(count, last + 1)
-    return [start + j * last // max(count - 1, 1) for j in range(count)]
 
 
 def arrange(frames: Sequence[int]) -> tuple[int, list[Block]]:
@@ -145,7 +135,7 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
         right = _WIDTH - _MARGIN
         page.text(right, top, "what the robot sees now", 6.5, align="right", bold=True)
         bottom = top + 0.15
-        bottom += page.picture(buffer.query_frame(camera), right - _LIVE, bottom, _LIVE, line=1.5)
+        bottom += page.picture(buffer.query.frame(camera), right - _LIVE, bottom, _LIVE, line=1.5)
         middle = right - _LIVE / 2
         page.text(middle, bottom + 0.03, str(len(buffer)), 5.5, color=_GREY)
         page.text(middle, bottom + 0.13, "first live observation", 6, width=_LIVE)
@@ -155,7 +145,7 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
 def _draw_head(page: Page, buffer: Buffer, camera: str) -> float:
     """Write the title and return the y under it."""
     manifest = buffer.manifest
-    title = f"{buffer.episode_id}   k = {buffer.k}"
+    title = f"{buffer.episode_id}   {buffer.condition}"
     page.text(_MARGIN, 0.06, title, 10, width=0.63 * _INNER, align="left", bold=True)
     view = camera.removeprefix(CAMERA_PREFIX)
     simulator = manifest.simulator and f"simulator {manifest.simulator}"
@@ -168,7 +158,7 @@ def _draw_head(page: Page, buffer: Buffer, camera: str) -> float:
         y += 0.15
     frames: Counter[str] = Counter()
     for session in buffer.sessions:
-        frames[session.role] += session.stop - session.start
+        frames[session.role] += len(session)
     parts = " + ".join(f"{count} {role}" for role, count in frames.items())
     counts = f"{len(buffer)} history frames" + (f" = {parts}" if parts else "")
     share = f"an even {SAMPLE_FRAMES}-frame sample holds {manifest.lesson_share:.0%} lesson"
@@ -180,7 +170,7 @@ def _draw_sessions(
     page: Page, buffer: Buffer, camera: str, colors: Sequence[str], top: float
 ) -> float:
     """Draw all sessions and return the y under them."""
-    slots, blocks = arrange([s.stop - s.start for s in buffer.sessions])
+    slots, blocks = arrange([len(s) for s in buffer.sessions])
     per_slot = _COLUMNS // slots
     pitch = (_INNER + _GAP) / slots
     size = (pitch - _GAP - (per_slot - 1) * _FRAME_GAP) / per_slot
@@ -188,7 +178,7 @@ def _draw_sessions(
         width = block.slots * pitch - _GAP
         # A session of several slots spreads its frames over the gaps between the slots.
         step = (width - size) / (block.slots * per_slot - 1)
-        indices = shown_frames(session.start, session.stop, block.frames)
+        indices = spread(session.start, session.stop, block.frames)
         images = [buffer.frame(index, camera) for index in indices]
         tall = size * images[0].shape[0] / images[0].shape[1]
         height = _BAND + tall + _FOOT
@@ -217,7 +207,7 @@ def _draw_card(
     page.box(x, y, width, height, fill=tint(color, 0.13), edge=edge, line=line)
     page.box(x, y, width, _BAND, fill=color, edge=edge, line=line)
     role = f"{number}  {session.role.upper() if lesson else session.role}"
-    frames = session.stop - session.start
+    frames = len(session)
     count = f"{frames} frame{'s' if frames > 1 else ''}"
     ink = ink_on(color)
     page.text(left, y + 0.03, role, 6.5, width=0.54 * inner, align="left", bold=lesson, color=ink)
@@ -237,7 +227,7 @@ def _draw_timeline(page: Page, buffer: Buffer, colors: Sequence[str], top: float
     sample = even_sample(len(buffer))
     for index in sample:
         page.tick(_MARGIN + (index + 0.5) * scale, bar - 0.1, bar - 0.02)
-    spans = [(s.stop - s.start) * scale for s in buffer.sessions]
+    spans = [(len(s)) * scale for s in buffer.sessions]
     numbers = [page.text_width(str(n), 6, bold=True) for n in range(len(spans))]
     turned = any(n > 0.9 * span for n, span in zip(numbers, spans, strict=True))
     for number, (session, color) in enumerate(zip(buffer.sessions, colors, strict=True)):

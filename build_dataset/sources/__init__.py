@@ -1,60 +1,88 @@
 """Sources of recorded episodes, opened by a specification such as `robomme-h5:recordings/`."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
-from robomme_interference_data.build_dataset.sources.base import Frame, Source, SourceEpisode
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    Source,
+    SourceEpisode,
+)
 from robomme_interference_data.errors import InvalidOptionError, nearest
 
-__all__ = ["KINDS", "Frame", "Source", "SourceEpisode", "open_source"]
+__all__ = ["KINDS", "Frame", "OpenOptions", "Recording", "Source", "SourceEpisode", "open_source"]
 
 
-def _robomme_h5(
-    location: str, columns: dict[str, str] | None, families_file: Path | None
-) -> Source:
-    from robomme_interference_data.build_dataset.sources.robomme_h5 import RoboMMEH5Source
+@dataclass(frozen=True)
+class OpenOptions:
+    """What some kinds of source are opened with.
 
-    return RoboMMEH5Source(_folder(location))
+    Attributes:
+        columns: `lerobot`: logical name to the dataset's column, where they differ.
+        families_file: `lerobot`: file that names the family of every episode.
+        robomme_python: `robomme`: the interpreter that has RoboMME.
+    """
+
+    columns: dict[str, str] | None = None
+    families_file: Path | None = None
+    robomme_python: str | None = None
 
 
-def _lerobot(location: str, columns: dict[str, str] | None, families_file: Path | None) -> Source:
+def _robomme_h5(location: str, options: OpenOptions) -> Source:
+    from robomme_interference_data.build_dataset.sources.h5 import H5Source
+
+    return H5Source(_folder(location))
+
+
+def _lerobot(location: str, options: OpenOptions) -> Source:
     from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
 
-    name, _, revision = location.partition("@")
-    if Path(location).expanduser().is_dir():  # a folder's name may hold an @
-        name, revision = location, ""
-    return LeRobotSource(
-        name, columns=columns, families_file=families_file, revision=revision or None
-    )
+    return LeRobotSource(location, columns=options.columns, families_file=options.families_file)
 
 
-def _frames(location: str, columns: dict[str, str] | None, families_file: Path | None) -> Source:
+def _frames(location: str, options: OpenOptions) -> Source:
     from robomme_interference_data.build_dataset.sources.frames import FramesSource
 
     return FramesSource(_folder(location))
 
 
-KINDS: dict[str, Callable[[str, dict[str, str] | None, Path | None], Source]] = {
-    "robomme-h5": _robomme_h5,
-    "lerobot": _lerobot,
-    "frames": _frames,
+def _tabletop(location: str, options: OpenOptions) -> Source:
+    from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
+
+    return SimulatorSource("tabletop")
+
+
+def _robomme(location: str, options: OpenOptions) -> Source:
+    from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
+
+    return SimulatorSource("robomme", options.robomme_python)
+
+
+def _sample(location: str, options: OpenOptions) -> Source:
+    from robomme_interference_data.build_dataset.sources.sample import SampleSource
+
+    return SampleSource(tuple(location.split(","))) if location else SampleSource()
+
+
+KINDS: dict[str, tuple[str, Callable[[str, OpenOptions], Source]]] = {
+    "robomme-h5": ("FOLDER", _robomme_h5),
+    "lerobot": ("FOLDER or NAMESPACE/NAME[@REVISION]", _lerobot),
+    "frames": ("FOLDER", _frames),
+    "tabletop": ("", _tabletop),
+    "robomme": ("", _robomme),
+    "sample": ("[FAMILY,…]", _sample),
 }
-"""Kind of source to the function that opens one: location, column map, families file."""
+"""Kind of source to what stands behind its colon, and the function that opens one."""
 
 
-def open_source(
-    specification: str,
-    *,
-    columns: dict[str, str] | None = None,
-    families_file: Path | None = None,
-) -> Source:
+def open_source(specification: str, options: OpenOptions | None = None) -> Source:
     """Open a source.
 
     Args:
-        specification: `KIND:LOCATION`: `robomme-h5:DIR`, `lerobot:DIR`, `lerobot:NAMESPACE/NAME`
-            (with `@REVISION` if wanted) or `frames:DIR`.
-        columns: For `lerobot`: logical name to the dataset's column, where they differ.
-        families_file: For `lerobot`: file that names the family of every episode.
+        specification: `KIND:LOCATION`, or `KIND` where nothing need stand behind it; see `KINDS`.
+        options: For kinds that take some.
 
     Raises:
         InvalidOptionError: The specification or kind is unknown, or there is no such folder.
@@ -62,16 +90,15 @@ def open_source(
         MissingExtraError: The kind needs an extra that is not installed.
     """
     kind, colon, location = specification.partition(":")
-    if not colon or not location or kind not in KINDS:
+    expected = KINDS[kind][0] if kind in KINDS else None
+    needs = expected is not None and expected != "" and not expected.startswith("[")
+    if expected is None or (needs and not location) or (expected == "" and colon):
         raise InvalidOptionError(
-            f"--source {specification!r} is not KIND:LOCATION with a kind of {', '.join(KINDS)}",
-            nearest(kind, KINDS) if colon else "For example: --source robomme-h5:recordings/",
+            f"--source {specification!r} is not one of "
+            + ", ".join(f"{name}:{what}" if what else name for name, (what, _) in KINDS.items()),
+            nearest(kind, KINDS, more=""),
         )
-    if kind != "lerobot" and (columns or families_file):
-        raise InvalidOptionError(
-            f"--columns and --families-file are for lerobot sources, not for {kind}"
-        )
-    return KINDS[kind](location, columns, families_file)
+    return KINDS[kind][1](location, options or OpenOptions())
 
 
 def _folder(location: str) -> Path:

@@ -7,9 +7,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["Frame", "Source", "SourceEpisode"]
+__all__ = ["Frame", "Recording", "Source", "SourceEpisode", "choose_cameras"]
 
 
 @dataclass(frozen=True)
@@ -34,49 +35,52 @@ class Frame:
 
 @dataclass(frozen=True)
 class SourceEpisode:
-    """A recorded episode, as its source lists it.
+    """A recorded episode, as its source lists it: nothing of it was read yet.
 
     Attributes:
         id: Episode id.
+        key: Where the source finds the episode again, and what changes if the recording does
+            (such as a file's time and size): must be picklable.
+    """
+
+    id: EpisodeId
+    key: Any = field(default=None, compare=False)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode that is being read.
+
+    Attributes:
         goals: Wordings of the goal; at least one.
-        raw_length: Recorded frames.
-        demonstration_length: Frames of the demonstration, which come first; None if the source
-            does not mark them. The frame at this index is the first live observation.
         seed: Seed of the simulator, or None if not recorded.
         difficulty: `easy`, `medium` or `hard`, or None if not recorded.
         simulator: `robomme`, `tabletop`, or what the source names; None for real robots.
         exact: False if the frames were lossily compressed before they came here.
-        cameras: Camera name to `(height, width)` in pixels.
-        key: Where the source finds the episode again, and what changes if the recording does
-            (such as a file's time and size): must be picklable.
-        state_size: Values in a state.
-        action_size: Values in an action; None if actions were not recorded.
+        frames: The frames in order, a bounded number in memory at a time. Closing it early
+            releases the files.
     """
 
-    id: EpisodeId
     goals: tuple[str, ...]
-    raw_length: int
-    demonstration_length: int | None
     seed: int | None
     difficulty: str | None
     simulator: str | None
     exact: bool
-    cameras: dict[str, tuple[int, int]]
-    key: Any = field(compare=False)
-    state_size: int = 8
-    action_size: int | None = 8
+    frames: Generator[Frame]
 
 
 class Source(Protocol):
     """A place with recorded episodes. Instances are picklable: workers get a copy each.
 
     Attributes:
-        kind: Name under which the source is registered, e.g. `robomme-h5`.
-        provenance: What a dataset built from it records about it; the same on every machine
-            (no local paths), e.g. a Hub repository with its commit.
+        provenance: What a dataset built from it records about it, `kind` among it; the same on
+            every machine (no local paths), e.g. a Hub repository with its commit.
+        time_limit: Seconds that reading and storing one episode may take, by default.
+        whole: Whether episodes go on after the first live observation, as units need.
     """
 
-    kind: str
+    time_limit: float
+    whole: bool
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -91,15 +95,33 @@ class Source(Protocol):
         """
         ...
 
-    def read(self, episode: SourceEpisode) -> Generator[Frame]:
-        """Stream the frames of an episode in order, a bounded number in memory at a time.
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Open an episode that `episodes` listed. What it holds is known by reading it.
 
-        The episode is one that `episodes` listed, with some of its cameras or all: only those in
-        `episode.cameras` are read.
-
-        Callers may stop early; closing the generator releases the files.
+        Args:
+            episode: The episode.
+            cameras: Names of the cameras that are wanted: no others are read; None for all.
 
         Raises:
-            SourceError: The recording breaks off or does not fit what `episodes` said of it.
+            InvalidOptionError: The episode has no such camera.
+            SourceError: The recording cannot be read, or, while it is read, breaks off.
         """
         ...
+
+    def close(self) -> None:
+        """Release what is held from one episode to the next."""
+        ...
+
+
+def choose_cameras(
+    wanted: tuple[str, ...] | None, there: tuple[str, ...], what: object
+) -> tuple[str, ...]:
+    """Return the cameras that are wanted of those that are there, sorted.
+
+    Raises:
+        InvalidOptionError: One is not there; `what` says where.
+    """
+    for camera in wanted or ():
+        if camera not in there:
+            raise InvalidOptionError.one_of(f"{what}: camera", camera, there)
+    return tuple(sorted(there if wanted is None else set(wanted)))

@@ -8,10 +8,9 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     SourceError,
     UnknownNameError,
-    nearest,
 )
 
-__all__ = ["ColumnMap", "image_size", "resolve_columns"]
+__all__ = ["ColumnMap", "resolve_columns"]
 
 _USUAL = {
     "front": ("observation.images.front", "image", "observation.images.image"),
@@ -24,7 +23,7 @@ _USUAL = {
 """Names by which each is looked for, in this order: LeRobot's and this project's usual ones, then
 those of `lerobot/robomme` and `Yinpei/robomme_data_lerobot`."""
 
-_REQUIRED = ("front", "state", "action")
+_REQUIRED = ("front", "state")
 _CAMERAS = ("front", "wrist")
 _EXPECTED = {
     "front": ("video", "image"),
@@ -43,7 +42,7 @@ class ColumnMap:
     front: str
     wrist: str | None
     state: str
-    action: str
+    action: str | None
     is_demo: str | None
     exec_start_idx: str | None
 
@@ -66,24 +65,18 @@ def resolve_columns(
     Raises:
         InvalidOptionError: A logical name is unknown.
         UnknownNameError: A given column is not in the dataset.
-        SourceError: The front camera, the state or the action is not found, or a column is not
-            of a fitting type.
+        SourceError: The front camera or the state is not found, or a column is not of a fitting
+            type.
     """
     given = given or {}
     for name in given:
         if name not in _USUAL:
-            raise InvalidOptionError(
-                f"--columns {name}={given[name]}: {name!r} is none of {', '.join(_USUAL)}",
-                nearest(name, _USUAL),
-            )
+            raise InvalidOptionError.one_of(f"--columns {name}={given[name]}: name", name, _USUAL)
     found: dict[str, str | None] = {}
     for name, usual in _USUAL.items():
         column = given.get(name)
         if column is not None and column not in features:
-            raise UnknownNameError(
-                f"--columns {name}={column}: {place} has no column {column!r}",
-                nearest(column, features),
-            )
+            raise UnknownNameError.among(f"--columns {name}: column", column, place, features)
         if column is None:
             column = next((known for known in usual if known in features), None)
         if column is None and name in _REQUIRED:
@@ -98,23 +91,6 @@ def resolve_columns(
     return ColumnMap(**found)  # type: ignore[arg-type]  # the required ones are not None
 
 
-def image_size(column: str, feature: Mapping[str, Any], place: str) -> tuple[int, int]:
-    """Return `(height, width)` of an image feature; its shape is (H, W, 3) or (3, H, W).
-
-    Raises:
-        SourceError: The shape is neither.
-    """
-    shape = tuple(feature.get("shape") or ())
-    if len(shape) == 3 and shape[2] == 3:
-        return int(shape[0]), int(shape[1])
-    if len(shape) == 3 and shape[0] == 3:
-        return int(shape[1]), int(shape[2])
-    raise SourceError(
-        f"{place}: column {column!r} has the shape {shape}; expected three colour channels",
-        "Choose another one: --columns front=COLUMN (or wrist=COLUMN).",
-    )
-
-
 def _check_type(name: str, column: str, feature: Mapping[str, Any], place: str) -> None:
     kind = feature.get("dtype")
     if kind not in _EXPECTED[name]:
@@ -123,11 +99,14 @@ def _check_type(name: str, column: str, feature: Mapping[str, Any], place: str) 
             f"{', '.join(_EXPECTED[name])}",
             f"Say which column it is: --columns {name}=COLUMN",
         )
-    if name in _CAMERAS:
-        image_size(column, feature, place)
-    elif name in ("state", "action") and len(feature.get("shape") or ()) != 1:
+    shape: tuple[Any, ...] = tuple(feature.get("shape") or ())
+    if name in _CAMERAS and not (len(shape) == 3 and 3 in (shape[0], shape[2])):
         raise SourceError(
-            f"{place}: column {column!r} has the shape {feature.get('shape')}; {name!r} needs one "
-            "vector a frame",
+            f"{place}: column {column!r} has the shape {shape}; expected three colour channels",
+            f"Choose another one: --columns {name}=COLUMN",
+        )
+    if name in ("state", "action") and len(shape) != 1:
+        raise SourceError(
+            f"{place}: column {column!r} has the shape {shape}; {name!r} needs one vector a frame",
             f"Say which column it is: --columns {name}=COLUMN",
         )

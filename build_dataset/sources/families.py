@@ -79,9 +79,9 @@ def ids_by_columns(
                 raise SourceError(f"{where}: {error.message}", error.hint) from None
             wanted.append(_Wanted(where, episode, found.family, found.split, found.index))
         else:
-            number = row.get("source_episode")
+            number = row.get("index")
             if number is not None and not isinstance(number, int):
-                raise SourceError(f"{where}: source_episode is {number!r}; expected a number")
+                raise SourceError(f"{where}: index is {number!r}; expected a number")
             wanted.append(
                 _Wanted(where, episode, str(row["family"]), row.get("split") or split, number)
             )

@@ -13,30 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.sources.base import Frame, SourceEpisode
-from robomme_interference_data.build_dataset.sources.exactness import (
-    probe_video,
-    stream_is_exact,
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    SourceEpisode,
+    choose_cameras,
 )
+from robomme_interference_data.build_dataset.sources.exactness import probe_video, stream_is_exact
 from robomme_interference_data.build_dataset.sources.frames_table import (
     TABLE,
     EpisodeRows,
     read_frames_table,
 )
-from robomme_interference_data.build_dataset.sources.images import (
-    check_size,
-    decode_image,
-    png_size,
-)
-from robomme_interference_data.build_dataset.sources.tables import RowSpan
-from robomme_interference_data.errors import (
-    FormatError,
-    InvalidIdError,
-    MissingFileError,
-    SourceError,
-    TruncatedVideoError,
-)
+from robomme_interference_data.build_dataset.sources.images import decode_image
+from robomme_interference_data.errors import InterferenceError, InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.video import iter_frames
 
 __all__ = ["FramesSource"]
@@ -46,31 +38,12 @@ _REQUIRED_CAMERA = "front"
 
 
 @dataclass(frozen=True)
-class _Images:
-    """Where the images of one camera of an episode are.
-
-    Attributes:
-        path: Video file or folder of PNG images, relative to the source's folder.
-        rate: Frames per second of the video; None for a folder.
-        size: `(height, width)` in pixels.
-        exact: Whether the files are certain to keep every pixel.
-        state: What changes when the files do: their latest time and total size.
-    """
-
-    path: str
-    rate: float | None
-    size: tuple[int, int]
-    exact: bool
-    state: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class _Key:
-    """Where an episode lies: its rows, its images by camera, and the state of the table."""
+    """Where an episode lies: its rows, its images by camera, and the state of all these files."""
 
-    start: int
-    images: dict[str, _Images]
-    state: tuple[int, int]
+    rows: EpisodeRows
+    images: dict[str, Path]
+    state: tuple[Any, ...]
 
 
 class FramesSource:
@@ -83,11 +56,12 @@ class FramesSource:
         SourceError: There is no such table in it.
     """
 
-    kind = "frames"
+    time_limit = 1800.0
+    whole = True
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self.provenance: dict[str, Any] = {"kind": self.kind}
+        self.provenance: dict[str, Any] = {"kind": "frames"}
         if not (folder / TABLE).is_file():
             raise SourceError(
                 f"{folder} is no frames folder: {TABLE} is missing",
@@ -95,84 +69,71 @@ class FramesSource:
             )
 
     def episodes(self) -> list[SourceEpisode]:
-        """List all episodes; see `Source.episodes`.
-
-        Raises:
-            SourceError: The folder is not as described; says which episode and file, and what to
-                do.
-        """
+        """List all episodes; see `Source.episodes`."""
         path = self._folder / TABLE
         table = read_frames_table(path)
-        state = _state(path)
-        places = self._find([episode.id for episode in table.episodes])
+        places = self._find(set(table))
         found = []
-        for episode in table.episodes:
-            images = {
-                camera: self._probe(episode, place)
-                for camera, place in sorted(places[episode.id].items())
-            }
-            declared = episode.values["exact"]
-            certain = all(image.exact for image in images.values())
-            found.append(
-                SourceEpisode(
-                    id=episode.id,
-                    goals=(episode.goal,),
-                    raw_length=episode.length,
-                    demonstration_length=episode.demonstration_length,
-                    seed=episode.values["seed"],
-                    difficulty=episode.values["difficulty"],
-                    simulator=episode.values["simulator"],
-                    exact=certain if declared is None else declared,
-                    cameras={camera: image.size for camera, image in images.items()},
-                    key=_Key(episode.start, images, state),
-                    state_size=table.state_size,
-                    action_size=table.action_size,
-                )
-            )
-        return sorted(found, key=lambda episode: episode.id)
+        for name, rows in sorted(table.items()):
+            images = dict(sorted(places[name].items()))
+            state = (_state(path), *map(_state, images.values()))
+            found.append(SourceEpisode(name, _Key(rows, images, state)))
+        return found
 
-    def read(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
-        """Stream the frames of an episode; see `Source.read`.
-
-        Raises:
-            SourceError: A video or image is damaged, has another size, or is not there, or a
-                video has more or fewer frames than the table has rows.
-        """
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Open an episode; see `Source.read`."""
         key: _Key = episode.key
+        chosen = choose_cameras(cameras, tuple(key.images), episode.id)
         try:
-            if _state(self._folder / TABLE) != key.state:
-                raise SourceError(f"{TABLE} has changed since it was listed", "Start again.")
-            rows = RowSpan(self._folder / TABLE, key.start, key.start + episode.raw_length)
+            if (_state(self._folder / TABLE), *map(_state, key.images.values())) != key.state:
+                raise SourceError("its files have changed since they were listed", "Start again.")
+            rates = {camera: _rate(key.images[camera], key.rows.length) for camera in chosen}
+        except (InterferenceError, OSError) as error:
+            raise _about(episode, error) from error
+        declared = key.rows.values["exact"]
+        certain = all(exact for _, exact in rates.values())
+        return Recording(
+            goals=(key.rows.goal,),
+            seed=key.rows.values["seed"],
+            difficulty=key.rows.values["difficulty"],
+            simulator=key.rows.values["simulator"],
+            exact=certain if declared is None else declared,
+            frames=self._frames(episode, {camera: rate for camera, (rate, _) in rates.items()}),
+        )
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _frames(self, episode: SourceEpisode, rates: dict[str, float | None]) -> Generator[Frame]:
+        key: _Key = episode.key
+        length, start = key.rows.length, key.rows.demonstration_length
+        try:
+            rows = RowSpan(self._folder / TABLE, key.rows.start, key.rows.start + length)
             states = rows.vectors("state")
-            actions = None if episode.action_size is None else rows.vectors("action")
+            actions = rows.vectors("action") if key.rows.actions else None
             with ExitStack() as stack:
                 streams = {
-                    camera: stack.enter_context(closing(self._stream(episode, key.images[camera])))
-                    for camera in episode.cameras
+                    camera: stack.enter_context(closing(_stream(key.images[camera], rate, length)))
+                    for camera, rate in rates.items()
                 }
-                for number in range(episode.raw_length):
-                    found = {}
-                    for camera, stream in streams.items():
-                        image = next(stream, None)
+                for number in range(length):
+                    images = {camera: next(stream, None) for camera, stream in streams.items()}
+                    for camera, image in images.items():
                         if image is None:
-                            raise self._miscounted(episode, camera, number)
-                        check_size(image, episode.cameras[camera], camera, number, "the first one")
-                        found[camera] = image
-                    start = episode.demonstration_length
+                            raise _miscounted(key.images[camera], number, length)
                     yield Frame(
-                        images=found,
+                        images={camera: i for camera, i in images.items() if i is not None},
                         state=states[number],
                         action=None if actions is None else actions[number],
                         is_demonstration=None if start is None else number < start,
                     )
                 for camera, stream in streams.items():
-                    more = sum(1 for _ in stream)
-                    if more:
-                        raise self._miscounted(episode, camera, episode.raw_length + more)
-        except (FormatError, MissingFileError, TruncatedVideoError, SourceError) as error:
-            raise SourceError(f"{episode.id}: {error.message}", error.hint) from error
+                    if more := sum(1 for _ in stream):
+                        raise _miscounted(key.images[camera], length + more, length)
+        except (InterferenceError, OSError) as error:
+            raise _about(episode, error) from error
 
-    def _find(self, episodes: list[EpisodeId]) -> dict[EpisodeId, dict[str, Path]]:
+    def _find(self, episodes: set[EpisodeId]) -> dict[EpisodeId, dict[str, Path]]:
         """Find the video or image folder of every camera of every episode."""
         found: dict[EpisodeId, dict[str, Path]] = {episode: {} for episode in episodes}
         for kind in ("videos", "images"):
@@ -190,10 +151,9 @@ class FramesSource:
                         f"{path} is a file; expected a folder with the images of an episode",
                         "Name them images/<camera>/<Family>/<split>/<index>/000000.png and so on.",
                     )
+                index = path.stem if kind == "videos" else path.name
                 try:
-                    episode = EpisodeId.parse(
-                        f"{family}/{split}/{path.stem if kind == 'videos' else path.name}"
-                    )
+                    episode = EpisodeId.parse(f"{family}/{split}/{index}")
                 except InvalidIdError as error:
                     raise SourceError(f"{path}: {error.message}", error.hint) from None
                 if episode not in found:
@@ -220,63 +180,53 @@ class FramesSource:
                     )
         return found
 
-    def _probe(self, episode: EpisodeRows, path: Path) -> _Images:
-        relative = path.relative_to(self._folder).as_posix()
-        try:
-            if path.is_dir():
-                _check_names(path, episode.length)
-                with (path / _image_name(0)).open("rb") as first:
-                    size = png_size(first.read(24))
-                return _Images(relative, None, size, True, _state(path))
-            stream = probe_video(path)
-            if stream.rate is None:
-                raise SourceError(
-                    f"{path} does not say its frame rate",
-                    "Write it again with a constant frame rate, for example as .mkv.",
-                )
-            exact = stream_is_exact(stream)
-            return _Images(relative, stream.rate, stream.size, exact, _state(path))
-        except (FormatError, SourceError, OSError) as error:
-            message = error.message if isinstance(error, FormatError | SourceError) else error
-            hint = error.hint if isinstance(error, FormatError | SourceError) else None
-            raise SourceError(f"{episode.id}: {message}", hint) from error
 
-    def _stream(
-        self, episode: SourceEpisode, images: _Images
-    ) -> Generator[NDArray[np.uint8], None, None]:
-        path = self._folder / images.path
-        if images.rate is not None:
-            yield from iter_frames(path, 0, None, images.rate)
-            return
-        for number in range(episode.raw_length):
-            file = path / _image_name(number)
-            try:
-                yield decode_image(file.read_bytes())
-            except FormatError as error:
-                raise SourceError(f"{file}: {error.message}", error.hint) from None
-            except OSError as error:
-                raise SourceError(f"{file} cannot be read: {error.strerror}") from None
-
-    def _miscounted(self, episode: SourceEpisode, camera: str, frames: int) -> SourceError:
-        return SourceError(
-            f"{self._folder / episode.key.images[camera].path} holds {frames} frames; {TABLE} has "
-            f"{episode.raw_length} rows",
-            "Write the video again with one frame for every row.",
-        )
-
-
-def _check_names(folder: Path, length: int) -> None:
-    """Check that a folder holds the images 0 to `length - 1`, and no others."""
-    expected = {_image_name(number) for number in range(length)}
-    names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-    missing, extra = sorted(expected - names), sorted(names - expected)
-    if missing or extra:
-        what = f"lacks {missing[0]}" if missing else f"holds {extra[0]}"
+def _rate(path: Path, length: int) -> tuple[float | None, bool]:
+    """Return the frame rate of a video, None of a folder, and whether it surely keeps pixels."""
+    if path.is_dir():
+        expected = {_image_name(number) for number in range(length)}
+        names = {path.name for path in path.iterdir() if not path.name.startswith(".")}
+        if wrong := sorted(expected ^ names):
+            what = f"lacks {wrong[0]}" if wrong[0] in expected else f"holds {wrong[0]}"
+            raise SourceError(
+                f"{path} {what}; {TABLE} has {length} rows, so it holds {_image_name(0)} to "
+                f"{_image_name(length - 1)} and nothing else",
+                "Number the images of an episode from 0, six digits, one for every row.",
+            )
+        return None, True
+    stream = probe_video(path)
+    if stream.rate is None:
         raise SourceError(
-            f"{folder} {what}; {TABLE} has {length} rows, so it holds {_image_name(0)} to "
-            f"{_image_name(length - 1)} and nothing else",
-            "Number the images of an episode from 0, six digits, one for every row.",
+            f"{path} does not say its frame rate",
+            "Write it again with a constant frame rate, for example as .mkv.",
         )
+    return stream.rate, stream_is_exact(stream)
+
+
+def _stream(path: Path, rate: float | None, length: int) -> Generator[NDArray[np.uint8]]:
+    """Yield the images of an episode, all of one size."""
+    if rate is not None:
+        yield from iter_frames(path, 0, None, rate)
+        return
+    for number in range(length):
+        file = path / _image_name(number)
+        try:
+            yield decode_image(file.read_bytes())
+        except InterferenceError as error:
+            raise error.about(file) from None
+
+
+def _miscounted(path: Path, frames: int, rows: int) -> SourceError:
+    return SourceError(
+        f"{path} holds {frames} frames; {TABLE} has {rows} rows",
+        "Write the video again with one frame for every row.",
+    )
+
+
+def _about(episode: SourceEpisode, error: InterferenceError | OSError) -> SourceError:
+    if isinstance(error, InterferenceError):
+        return SourceError(f"{episode.id}: {error.message}", error.hint)
+    return SourceError(f"{episode.id}: {error.filename} cannot be read: {error.strerror}")
 
 
 def _image_name(number: int) -> str:
@@ -284,5 +234,7 @@ def _image_name(number: int) -> str:
 
 
 def _state(path: Path) -> tuple[int, int]:
+    """Return what changes when a file or a folder's files do: latest time and total size."""
     found = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
-    return max(each.st_mtime_ns for each in found), sum(each.st_size for each in found)
+    latest = max((each.st_mtime_ns for each in found), default=0)
+    return latest, sum(each.st_size for each in found)

@@ -4,9 +4,9 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, SourceError
+from robomme_interference_data.errors import FormatError
 
-__all__ = ["check_size", "decode_image", "is_png", "png_size"]
+__all__ = ["decode_image", "is_png"]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
@@ -26,17 +26,6 @@ def is_png(data: bytes) -> bool:
         f"an image starts with the bytes {data[:8].hex(' ') or '(none)'}; expected PNG or JPEG",
         "Store images as PNG: it is exact.",
     )
-
-
-def png_size(data: bytes) -> tuple[int, int]:
-    """Return `(height, width)` from the first 24 bytes of a PNG.
-
-    Raises:
-        FormatError: They are not the beginning of a PNG.
-    """
-    if len(data) < 24 or not data.startswith(_PNG) or data[12:16] != b"IHDR":
-        raise FormatError("not a PNG image", "Store images as PNG: it is exact.")
-    return int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
@@ -62,19 +51,3 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
             "Convert the images to 8 bits a channel.",
         )
     return frames[0].to_ndarray(format="rgb24")
-
-
-def check_size(
-    image: NDArray[np.uint8], size: tuple[int, int], camera: str, number: int, said: str
-) -> None:
-    """Hold the size of a decoded image against `(height, width)`, which `said` tells.
-
-    Raises:
-        SourceError: It differs.
-    """
-    if image.shape[:2] != size:
-        raise SourceError(
-            f"frame {number} of camera {camera!r} is {image.shape[1]}×{image.shape[0]} pixels; "
-            f"{said} is {size[1]}×{size[0]}",
-            "All frames of a camera must have one size: record or resize them again.",
-        )

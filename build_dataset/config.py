@@ -1,0 +1,223 @@
+"""What is asked of a build: its settings, and the plan that follows from them."""
+
+import dataclasses
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    POSITION_LIMIT,
+    SPLITS,
+)
+from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.ids import parse_numbers
+from robomme_interference_data.settings import setting
+
+if TYPE_CHECKING:
+    from robomme_interference_data.build_dataset.build import BuildPlan
+    from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
+
+__all__ = [
+    "BuildConfig",
+    "PlanConfig",
+    "list_episodes",
+    "plan_all",
+    "plan_build",
+    "position_limit",
+]
+
+_CPUS = os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """What to build of which recordings, and how."""
+
+    source: tuple[str, ...] = setting(
+        metavar="SOURCE…",
+        help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
+        "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; several, with spaces.",
+    )
+    out: Path = setting(help="Folder to make, or dataset to let grow.")
+    families: tuple[str, ...] = setting((), help="Families to take; all by default.")
+    split: str | None = setting(None, help="Only train, val or test.", shown="units: train")
+    episodes: str | None = setting(None, help="Numbers to take, such as 0-49 or 0,3,10-12.")
+    cameras: tuple[str, ...] = setting((), help="Cameras to store, such as front; default: all.")
+    codec: str = setting(
+        "av1-lossless", help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy)."
+    )
+    version: str = setting("1.0.0", help="Version that the dataset carries.")
+    workers: int = setting(_CPUS, help="Worker processes.", shown="all processors")
+    time_limit: float | None = setting(
+        None,
+        help="Seconds that one episode may take before it is tried once more.",
+        shown="300 on tabletop, else 1800",
+    )
+    columns: tuple[str, ...] = setting(
+        (), metavar="NAME=COLUMN…", help="lerobot sources: where columns are named otherwise."
+    )
+    families_file: Path | None = setting(
+        None, help="lerobot sources: file that names each episode's family."
+    )
+    robomme_python: str | None = setting(
+        None, help="Source robomme: interpreter that has RoboMME.", env="ROBOMME_PYTHON"
+    )
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """Which buffers to plan."""
+
+    conditions: tuple[str, ...] = setting(
+        DEFAULT_CONDITIONS, help="Conditions to plan buffers for: no-history, k0 to k63."
+    )
+    seed: int = setting(0, help="Seed of the draw.")
+    position_limit: str = setting(
+        str(POSITION_LIMIT), help="Positions that systems hold for history and rollout, or none."
+    )
+
+
+def plan_build(kind: str, config: BuildConfig) -> "BuildPlan":
+    """Open the sources and plan one dataset.
+
+    Raises:
+        InvalidOptionError: A setting is not what it may be, or does not fit the sources.
+        SourceError, MissingExtraError, HubError: A source cannot be used.
+    """
+    return _plan(kind, config, config.split or ("train" if kind == DISTRACTORS else None))
+
+
+def plan_all(config: BuildConfig, plan: PlanConfig) -> "dict[str, BuildPlan]":
+    """Plan both datasets of a split, and check all that can be known before anything is read.
+
+    Raises:
+        PoolTooSmallError: Even if every train episode yielded a unit, there were too few.
+        InvalidIdError, InvalidOptionError, SourceError: As `plan_build` and `in_order`.
+    """
+    conditions = in_order(plan.conditions)
+    position_limit(plan)
+    plans = {DEMONSTRATIONS: plan_build(DEMONSTRATIONS, config)}
+    units = dataclasses.replace(config, families=(), episodes=None)
+    plans[DISTRACTORS] = _plan(DISTRACTORS, units, "train")
+    _check_pool(plans, conditions)
+    return plans
+
+
+def _check_pool(plans: "dict[str, BuildPlan]", conditions: Sequence[Condition]) -> None:
+    from robomme_interference_data.draw import UnitPool
+
+    pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
+    most = max(condition.k for condition in conditions)
+    for query in {e.id.family: e.id for _, e in plans[DEMONSTRATIONS].tasks}.values():
+        pool.draw(query, most)
+
+
+def _plan(kind: str, config: BuildConfig, split: str | None) -> "BuildPlan":
+    from robomme_interference_data.build_dataset.build import BuildPlan
+    from robomme_interference_data.build_dataset.sources import OpenOptions, open_source
+    from robomme_interference_data.encode import get_codec
+    from robomme_interference_data.execution import Processes
+
+    get_codec(config.codec)
+    Processes(config.workers)
+    numbers = None if config.episodes is None else parse_numbers(config.episodes)
+    pairs = [text.partition("=") for text in config.columns]
+    if not all(name and equals and column for name, equals, column in pairs):
+        raise InvalidOptionError.expected(
+            "--columns", config.columns, "NAME=COLUMN, such as front=image"
+        )
+    options = OpenOptions(
+        columns={name: column for name, _, column in pairs} or None,
+        families_file=config.families_file,
+        robomme_python=config.robomme_python,
+    )
+    sources = tuple(open_source(text, options) for text in config.source)
+    for text, source in zip(config.source, sources, strict=True):
+        if kind == DISTRACTORS and not source.whole:
+            raise InvalidOptionError(
+                f"{text} plays demonstrations only, and distractor units need whole episodes",
+                "Build the two datasets apart, the distractors from RoboMME's own training "
+                "recordings: robomme-interference build distractors --source robomme-h5:FOLDER",
+            )
+    tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
+    return BuildPlan(
+        kind=kind,
+        sources=sources,
+        tasks=tasks,
+        cameras=tuple(sorted(config.cameras)) or None,
+        codec=config.codec,
+        version=config.version,
+        time_limit=config.time_limit,
+    )
+
+
+def list_episodes(
+    sources: "Sequence[Source]",
+    *,
+    families: Iterable[str] = (),
+    split: str | None = None,
+    numbers: Iterable[int] | None = None,
+) -> "tuple[tuple[int, SourceEpisode], ...]":
+    """List the episodes of sources that pass all filters, in canonical order.
+
+    Args:
+        sources: The sources.
+        families: Their families; none for all.
+        split: `train`, `val` or `test`; None for all.
+        numbers: Their indices; None for all.
+
+    Raises:
+        InvalidOptionError: A family or split is unknown.
+        SourceError: Two sources hold the same episode, no episode is left, or a source cannot be
+            used.
+    """
+    listed = [(number, one) for number, source in enumerate(sources) for one in source.episodes()]
+    known = {one.id.family for _, one in listed}
+    wanted = set(families) or known
+    for family in sorted(wanted - known):
+        raise InvalidOptionError.one_of("--families", family, sorted(known))
+    if split is not None and split not in SPLITS:
+        raise InvalidOptionError.one_of("--split", split, SPLITS)
+    indices = None if numbers is None else set(numbers)
+    chosen = sorted(
+        (
+            (number, one)
+            for number, one in listed
+            if one.id.family in wanted
+            and split in (None, one.id.split)
+            and (indices is None or one.id.index in indices)
+        ),
+        key=lambda item: item[1].id.sort_key,
+    )
+    for (first, one), (second, other) in pairwise(chosen):
+        if one.id == other.id:
+            raise SourceError(
+                f"{one.id} is recorded twice (in source {first + 1} and source {second + 1})",
+                "Leave one out: --families, --split, --episodes, or fewer --source.",
+            )
+    if not chosen:
+        raise SourceError(
+            f"no episode is left of the {len(listed)} that are listed",
+            "Check --families, --split and --episodes against the sources.",
+        )
+    return tuple(chosen)
+
+
+def position_limit(config: PlanConfig) -> int | None:
+    """Return the position limit of a plan; None for none.
+
+    Raises:
+        InvalidOptionError: It is neither `none` nor a positive number.
+    """
+    text = config.position_limit
+    if text == "none":
+        return None
+    if not text.isdecimal() or int(text) == 0:
+        raise InvalidOptionError.expected("--position-limit", text, "a positive number or none")
+    return int(text)

@@ -1,0 +1,70 @@
+"""Cut what a dataset stores out of a recorded episode, while it is read: pure.
+
+A demonstration is every raw frame of the demonstration section and then the first live
+observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
+32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote). Nothing is
+read beyond the last frame that is needed.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+
+from robomme_interference_data.build_dataset.sources.base import Frame
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    UNIT_MIN_RAW_FRAMES,
+    UNIT_STRIDE,
+)
+from robomme_interference_data.errors import SourceError
+
+__all__ = ["CUTS", "NothingToStore", "cut_demonstration", "cut_unit"]
+
+
+class NothingToStore(Exception):
+    """An episode yields nothing; the text says why."""
+
+
+def cut_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield the frames of the demonstration, and then the first live observation.
+
+    Raises:
+        NothingToStore: There is no demonstration, or no live observation after it.
+        SourceError: The source does not mark which frames are the demonstration.
+    """
+    for lesson, frame in enumerate(frames):
+        if frame.is_demonstration is None:
+            raise SourceError(
+                "the source does not mark which frames are the demonstration",
+                "Demonstrations need an is_demo flag or an exec_start_idx column (give its name "
+                "with --columns is_demo=NAME); distractor units can be built without: "
+                "robomme-interference build distractors",
+            )
+        if not frame.is_demonstration and lesson == 0:
+            raise NothingToStore("no demonstration frame")
+        yield frame
+        if not frame.is_demonstration:
+            return
+    raise NothingToStore("no live observation after the demonstration")
+
+
+def cut_unit(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield the 32 frames of a distractor unit.
+
+    Raises:
+        NothingToStore: The episode has fewer than 249 raw frames: it is not padded.
+    """
+    count = 0
+    for frame in frames:
+        if count % UNIT_STRIDE == 0:
+            yield frame
+        count += 1
+        if count == UNIT_MIN_RAW_FRAMES:
+            return
+    raise NothingToStore(f"{count} raw frames; a unit needs {UNIT_MIN_RAW_FRAMES}")
+
+
+CUTS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
+    DEMONSTRATIONS: cut_demonstration,
+    DISTRACTORS: cut_unit,
+}
+"""Kind of dataset to what it stores of an episode."""

@@ -1,0 +1,154 @@
+"""What makes a LeRobot dataset one of ours: per-episode columns, identity, report, SHA-256 sums.
+
+LeRobot 0.6 offers no way to hand per-episode columns to its writer, but reads any that stand in
+`meta/episodes`: `LeRobotDatasetMetadata.filter_episodes` can select by them. So they are added
+there, not in a file of their own. LeRobot's tools that merge datasets or change their features and
+tasks carry them along; those that delete episodes or split a dataset drop them, and refuse the
+lossless codec.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
+    DISTRACTORS,
+    EPISODES_DIR,
+    FORMAT_VERSION,
+    IDENTITY_PATH,
+    REPORT_PATH,
+    STATS_PATH,
+    SUMS_PATH,
+    UNIT_FRAMES,
+    UNIT_STRIDE,
+)
+from robomme_interference_data.files import (
+    Files,
+    LocalFiles,
+    canonical_json,
+    format_sums,
+    sha256_file,
+    write_json,
+    write_text,
+)
+from robomme_interference_data.records import Counts, DatasetIdentity, EpisodeRecord
+from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+
+__all__ = ["complete_dataset", "counts_of", "listed_files", "revision_of"]
+
+_LEROBOTS = ("episode_index", "length")
+"""Fields of a record that LeRobot writes."""
+
+
+def revision_of(records: Iterable[EpisodeRecord]) -> str:
+    """Return the identity of a dataset's content: SHA-256 over all records, a line of JSON each."""
+    digest = hashlib.sha256()
+    for record in records:
+        digest.update(canonical_json(to_dict(record)).encode() + b"\n")
+    return digest.hexdigest()
+
+
+def counts_of(records: Sequence[EpisodeRecord]) -> Counts:
+    """Return how much records amount to."""
+    families = Counter(record.episode_id.family for record in records)
+    return Counts(len(records), sum(record.length for record in records), dict(families))
+
+
+def listed_files(files: Files) -> list[str]:
+    """Return the files of a dataset whose SHA-256 is recorded: all but the list and what it names.
+
+    An index has a list of its own, and what people put beside a dataset has none: a README, and
+    hidden files.
+    """
+    folders = ("meta", "data", "videos")
+    known = (IDENTITY_PATH, SUMS_PATH)
+    return [path for folder in folders for path in files.list(folder) if path not in known]
+
+
+def complete_dataset(
+    root: Path,
+    kind: str,
+    version: str,
+    records: Sequence[EpisodeRecord],
+    codec: str,
+    sources: Sequence[dict[str, Any]],
+    skipped: dict[str, str],
+) -> None:
+    """Complete a dataset that LeRobot's writer has finished.
+
+    Args:
+        root: The dataset.
+        kind: `demonstrations` or `distractors`.
+        version: Its version.
+        records: Its episodes.
+        codec: Name of the video settings.
+        sources: What the sources say of themselves.
+        skipped: Ids of episodes that yielded nothing, and why.
+    """
+    _add_columns(root, records)
+    _sort_statistics(root / STATS_PATH)
+    counts = counts_of(records)
+    report = {
+        "format_version": FORMAT_VERSION,
+        "kind": kind,
+        "counts": {**to_dict(counts), "skipped": len(skipped)},
+        "skipped": [{"episode_id": name, "why": why} for name, why in sorted(skipped.items())],
+    }
+    write_json(root / REPORT_PATH, report)
+    write_text(root / SUMS_PATH, format_sums(root, listed_files(LocalFiles(root))))
+    names = sorted(n for n in records[0].feature_sha256 if n.startswith(CAMERA_PREFIX))
+    identity = DatasetIdentity(
+        format_version=FORMAT_VERSION,
+        kind=kind,
+        version=version,
+        revision=revision_of(records),
+        exact=all(record.exact for record in records),
+        codec=codec,
+        cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in names),
+        unit={"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if kind == DISTRACTORS else None,
+        simulators=tuple(sorted({one.simulator for one in records if one.simulator})),
+        sources=tuple(sorted(sources, key=canonical_json)),
+        counts=counts,
+        sums=sha256_file(root / SUMS_PATH),
+    )
+    write_json(root / IDENTITY_PATH, to_dict(identity))
+
+
+def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
+    """Rewrite meta/episodes as one file with our columns after LeRobot's."""
+    paths = sorted((root / EPISODES_DIR).rglob("*.parquet"))
+    table = pa.concat_tables([pq.read_table(path) for path in paths]).combine_chunks()
+    table = table.sort_by("episode_index")
+    for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
+        place = table.schema.get_field_index(name)
+        table = table.set_column(place, name, pa.array([0] * len(table), pa.int64()))
+    schema = arrow_schema(EpisodeRecord, sorted(records[0].feature_sha256))
+    own = to_table(records, schema)
+    for field in schema:
+        if field.name not in _LEROBOTS:
+            table = table.append_column(field, own[field.name])
+    for path in paths:
+        path.unlink()
+    # The file is read whole: of over a hundred columns, what helps to skip rows is a burden.
+    pq.write_table(
+        table.replace_schema_metadata(None),
+        paths[0],
+        row_group_size=len(table),
+        compression="zstd",
+        write_statistics=False,
+        store_schema=False,
+    )
+
+
+def _sort_statistics(path: Path) -> None:
+    """Sort the features: LeRobot writes them in the order of a set, which differs between runs."""
+    statistics = json.loads(path.read_text(encoding="utf-8"))
+    text = json.dumps(statistics, indent=4, sort_keys=True, allow_nan=False)
+    write_text(path, text + "\n")

@@ -1,0 +1,214 @@
+"""Source `robomme-h5`: official RoboMME recordings, `record_dataset_<Family>.h5`.
+
+Layout (RoboMME, `doc/h5_data_format.md`, and the files themselves): `episode_<N>/setup/` with
+seed, difficulty and goals; `episode_<N>/timestep_<T>/{obs,action,info}`. Numbers may start at 0 or
+1, and keys come in text order, so both are sorted as numbers here. The observation at t is the one
+after action t.
+"""
+
+import re
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    SourceEpisode,
+    choose_cameras,
+)
+from robomme_interference_data.errors import MissingExtraError, SourceError
+from robomme_interference_data.ids import EpisodeId
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["H5Source", "identify"]
+
+_FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
+_CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
+_AGAIN = "Record or download the file again, or move it out of the folder."
+
+_TEST_SEEDS = 500_000
+_VAL_SEEDS = 1_000_000
+_FAMILY_CODES = {
+    "PickXtimes": 1,
+    "StopCube": 2,
+    "SwingXtimes": 3,
+    "BinFill": 4,
+    "VideoUnmaskSwap": 5,
+    "VideoUnmask": 6,
+    "ButtonUnmaskSwap": 7,
+    "ButtonUnmask": 8,
+    "VideoRepick": 9,
+    "VideoPlaceButton": 10,
+    "VideoPlaceOrder": 11,
+    "PickHighlight": 12,
+    "InsertPeg": 13,
+    "MoveCube": 14,
+    "PatternLock": 15,
+    "RouteStick": 16,
+}
+
+
+def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
+    """Tell split and index of the official recordings in a file, from their numbers and seeds.
+
+    RoboMME's seeds are fixed: `1000·code + 100·index + attempt` in train, `10000·code + …` from
+    500,000 on in test and from 1,000,000 on in val (its `env_metadata` folder; a few val seeds are
+    100 higher). So a recording says what split it is of, and whether its file counts from 0 or 1.
+
+    Args:
+        family: Task family.
+        seeds: Number of each episode in the file to its seed, or None if not recorded.
+
+    Returns:
+        Number to id; split `train` where there is no seed.
+    """
+    code = _FAMILY_CODES.get(family)
+    splits, votes = {}, []
+    for number, seed in seeds.items():
+        value, scale, splits[number] = seed or 0, 1000, "train"
+        if value >= _VAL_SEEDS:
+            value, scale, splits[number] = value - _VAL_SEEDS, 10_000, "val"
+        elif value >= _TEST_SEEDS:
+            value, scale, splits[number] = value - _TEST_SEEDS, 10_000, "test"
+        if seed is not None and code is not None:
+            votes.append(number - (value - scale * code) // 100)
+    by_seed = {first: votes.count(first) for first in (0, 1)}
+    if 0 in seeds:
+        first = 0
+    elif by_seed[0] != by_seed[1]:
+        first = max(by_seed, key=lambda candidate: by_seed[candidate])
+    else:
+        first = 1 if 1 in seeds else 0
+    return {number: EpisodeId(family, splits[number], number - first) for number in seeds}
+
+
+class H5Source:
+    """A folder of `record_dataset_<Family>.h5` files.
+
+    Args:
+        folder: The folder, or one such file.
+
+    Raises:
+        SourceError: It holds no such file.
+        MissingExtraError: h5py is not installed.
+    """
+
+    time_limit = 1800.0
+    whole = True
+
+    def __init__(self, folder: Path):
+        try:
+            import h5py  # noqa: F401
+        except ImportError:
+            raise MissingExtraError.needs("reading RoboMME recordings", "h5py", "build") from None
+        self.provenance: dict[str, Any] = {"kind": "robomme-h5"}
+        candidates = [folder] if folder.is_file() else sorted(folder.glob("*.h5"))
+        self._files = {
+            match["family"]: path for path in candidates if (match := _FILE.fullmatch(path.name))
+        }
+        if not self._files:
+            raise SourceError(
+                f"{folder} holds no record_dataset_<Family>.h5 file",
+                "Point to the folder of RoboMME's recordings: --source robomme-h5:FOLDER",
+            )
+
+    def episodes(self) -> list[SourceEpisode]:
+        """List all episodes; see `Source.episodes`."""
+        found = []
+        for family, path in self._files.items():
+            with _reading(path) as file:
+                numbers = _numbers(file, "episode_")
+                if not numbers:
+                    raise SourceError(f"{path} holds no episode_<N> group", _AGAIN)
+                ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
+            stat = path.stat()
+            state = (stat.st_size, stat.st_mtime_ns)
+            found += [SourceEpisode(ids[n], (str(path.resolve()), n, state)) for n in numbers]
+        return sorted(found, key=lambda episode: episode.id)
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Open an episode; see `Source.read`."""
+        path, number, _ = episode.key
+        where = f"{path}: episode_{number}"
+        with _reading(path) as file:
+            group = file[f"episode_{number}"]
+            steps = _numbers(group, "timestep_")
+            if not steps or steps != list(range(steps[0], steps[0] + len(steps))):
+                raise SourceError(f"{where} does not hold consecutive timestep_<T> groups", _AGAIN)
+            setup, first = group["setup"], group[f"timestep_{steps[0]}/obs"]
+            goals = tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()]))
+            there = tuple(camera for camera, name in _CAMERAS.items() if name in first)
+            if not goals or not there:
+                missing = " or ".join(_CAMERAS.values()) if goals else "task_goal"
+                raise SourceError(f"{where} has no {missing}", _AGAIN)
+            chosen = choose_cameras(cameras, there, episode.id)
+            difficulty = _text(setup["difficulty"][()]) if "difficulty" in setup else None
+            seed = _seed(group)
+        frames = _frames(path, number, steps, chosen)
+        return Recording(goals, seed, difficulty, "robomme", True, frames)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+@contextmanager
+def _reading(path: str | Path) -> Iterator["h5py.File"]:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError, ValueError, UnicodeDecodeError) as error:
+        if isinstance(error, SourceError):
+            raise
+        raise SourceError(f"{path} is not a complete RoboMME recording: {error}", _AGAIN) from None
+
+
+def _frames(path: str, number: int, steps: list[int], cameras: tuple[str, ...]) -> Generator[Frame]:
+    live = False
+    with _reading(path) as file:
+        for step in steps:
+            place = f"episode_{number}/timestep_{step}"
+            if place not in file:
+                raise SourceError(f"{path} has no {place}", _AGAIN)
+            frame = _frame(file[place], cameras)
+            if live and frame.is_demonstration:
+                raise SourceError(
+                    f"{path}: {place} is a demonstration frame after live ones",
+                    "Only recordings that begin with their demonstration can be used.",
+                )
+            live = not frame.is_demonstration
+            yield frame
+
+
+def _frame(step: "h5py.Group", cameras: tuple[str, ...]) -> Frame:
+    observation = step["obs"]
+    # The gripper has two fingers that move alike; RoboMME's own loaders keep the first.
+    # `gripper_state` is float64 for some families, `joint_action` for all.
+    gripper = np.atleast_1d(observation["gripper_state"][()])[:1]
+    state = np.concatenate([observation["joint_state"][()][:7], gripper])
+    return Frame(
+        images={camera: observation[_CAMERAS[camera]][()] for camera in cameras},
+        state=state.astype(np.float32),
+        action=step["action/joint_action"][()].astype(np.float32),
+        is_demonstration=bool(step["info/is_video_demo"][()]),
+    )
+
+
+def _numbers(group: "h5py.Group", prefix: str) -> list[int]:
+    suffixes = [key.removeprefix(prefix) for key in group if key.startswith(prefix)]
+    return sorted(int(suffix) for suffix in suffixes if suffix.isdigit())
+
+
+def _seed(group: "h5py.Group") -> int | None:
+    return int(group["setup/seed"][()]) if "setup/seed" in group else None
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,150 @@
+"""Source `sample`: made-up episodes, to try everything without recordings or a simulator.
+
+A gripper moves over a table with cubes; every family has its own table colour and path.
+The sample says nothing about any benchmark. Only integers and exact fractions are used, so that
+every machine makes the same pixels.
+"""
+
+import hashlib
+from collections.abc import Generator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    SourceEpisode,
+    choose_cameras,
+)
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.ids import EpisodeId
+
+__all__ = ["SampleSource"]
+
+_CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
+_EPISODES = {"train": 3, "test": 1}
+_FRAMES = 260
+_SHORT = 200
+"""Frames of the first family's train episode 1: too few for a unit, as some real ones have."""
+
+
+class SampleSource:
+    """Three train episodes and a test episode of each family.
+
+    Args:
+        families: Names of the families, which need not be the benchmark's.
+        size: Height and width of the images in pixels, a multiple of 16.
+    """
+
+    time_limit = 300.0
+    whole = True
+
+    def __init__(self, families: tuple[str, ...] = FAMILIES, size: int = 256):
+        self._families = families
+        self._size = size
+        self.provenance: dict[str, Any] = {"kind": "sample", "size": size}
+
+    def episodes(self) -> list[SourceEpisode]:
+        """List all episodes; see `Source.episodes`."""
+        ids = [
+            EpisodeId(family, split, index)
+            for family in self._families
+            for split, count in _EPISODES.items()
+            for index in range(count)
+        ]
+        return [SourceEpisode(one) for one in sorted(ids)]
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Make an episode up; see `Source.read`."""
+        name = episode.id
+        number = self._families.index(name.family)
+        scene = _Scene(name, number, self._size)
+        short = (number, name.split, name.index) == (0, "train", 1)
+        chosen = choose_cameras(cameras, ("front", "wrist"), name)
+        frames = scene.frames(_SHORT if short else _FRAMES, 48 + 16 * (name.index % 2), chosen)
+        goal = f"watch the video carefully, then do the {name.family} task again"
+        difficulty = DIFFICULTIES[name.index % 3]
+        return Recording((goal,), scene.seed, difficulty, "sample", True, frames)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class _Scene:
+    """One episode's table, cubes and path, on a grid of 256 × 256."""
+
+    def __init__(self, episode: EpisodeId, family: int, size: int):
+        digest = hashlib.sha256(str(episode).encode()).digest()
+        self.seed = int.from_bytes(digest[:4])
+        self.size = size
+        self._periods = (40 + 6 * family, 56 + 4 * family + digest[4] % 8)
+        self._cubes = [(40 + digest[5 + i] % 176, 110 + digest[8 + i] % 110) for i in range(3)]
+        hue = 37 * family % 120
+        rows = np.arange(size, dtype=np.int64)[:, None] * 256 // size
+        shade = np.broadcast_to(rows // 4, (size, size))
+        table = np.stack([90 + hue + shade // 2, 200 - hue + shade // 8, 150 + shade], axis=2)
+        self._table = table.clip(0, 255)
+
+    def frames(self, length: int, lesson: int, cameras: tuple[str, ...]) -> Generator[Frame]:
+        """Yield the frames of an episode, `lesson` of them the demonstration."""
+        for step in range(length):
+            images = {camera: getattr(self, camera)(step) for camera in cameras}
+            yield Frame(images, self.state(step), self.state(step + 1), step < lesson)
+
+    def _gripper(self, step: int) -> tuple[int, int]:
+        """Column and row of the gripper at a step."""
+        return (
+            32 + _triangle(step, self._periods[0], 192),
+            70 + _triangle(step, self._periods[1], 130),
+        )
+
+    def front(self, step: int) -> NDArray[np.uint8]:
+        """Draw the front view, `(size, size, 3) uint8`."""
+        image: NDArray[np.uint8] = self._table.astype(np.uint8)
+        for (column, row), colour in zip(self._cubes, _CUBES, strict=True):
+            self._box(image, column, row, 12, 12, colour)
+        column, row = self._gripper(step)
+        self._box(image, column, row // 2, 5, row // 2, (235, 235, 235))
+        self._box(image, column, row, 14, 6, (60, 60, 70))
+        return image
+
+    def wrist(self, step: int) -> NDArray[np.uint8]:
+        """Draw the wrist view, `(size, size, 3) uint8`: the front view around the gripper."""
+        column, row = (value * self.size // 256 for value in self._gripper(step))
+        return np.roll(self.front(step), (self.size // 2 - row, self.size // 2 - column), (0, 1))
+
+    def state(self, step: int) -> NDArray[np.float32]:
+        """Return 7 joint positions and the gripper opening: exact multiples of 1/1024."""
+        column, row = self._gripper(step)
+        joints = [(column * (i + 1) - row * (7 - i)) / 1024 for i in range(7)]
+        opening = 40 / 1024 if step % self._periods[0] < self._periods[0] // 2 else 0.0
+        return np.array([*joints, opening], np.float32)
+
+    def _box(
+        self,
+        image: NDArray[np.uint8],
+        column: int,
+        row: int,
+        half_width: int,
+        half_height: int,
+        colour: tuple[int, int, int],
+    ) -> None:
+        top, bottom, left, right = (
+            max(0, value * self.size // 256)
+            for value in (
+                row - half_height,
+                row + half_height,
+                column - half_width,
+                column + half_width,
+            )
+        )
+        image[top:bottom, left:right] = colour
+
+
+def _triangle(step: int, period: int, height: int) -> int:
+    """Return a triangle wave from 0 to `height`."""
+    phase = step % period
+    half = period // 2
+    return height * (phase if phase <= half else period - phase) // max(1, period - half)

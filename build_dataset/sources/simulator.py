@@ -1,0 +1,106 @@
+"""Source `tabletop` and `robomme`: a simulator plays the episodes while they are read."""
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.build_dataset.sources.base import (
+    Frame,
+    Recording,
+    SourceEpisode,
+    choose_cameras,
+)
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
+from robomme_interference_data.simulators.base import (
+    CAMERAS,
+    Demonstration,
+    Observation,
+    Simulator,
+)
+from robomme_interference_data.simulators.registry import make_simulator
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+
+__all__ = ["SimulatorSource"]
+
+
+class SimulatorSource:
+    """The episodes of the nine families that have demonstrations.
+
+    An episode is the demonstration, the first live observation and, on the tabletop, what the
+    oracle does until the episode ends. RoboMME tells no actions of its demonstrations, and has no
+    oracle: its episodes end with the first live observation.
+
+    Args:
+        name: `tabletop` or `robomme`.
+        python: RoboMME's interpreter, for `robomme`.
+
+    Attributes:
+        whole: Whether episodes go on after the first live observation.
+    """
+
+    def __init__(self, name: str, python: str | None = None):
+        self.name = name
+        self.whole = name == "tabletop"
+        # An episode takes the tabletop seconds, and RoboMME minutes.
+        self.time_limit = 300.0 if name == "tabletop" else 1800.0
+        # The same episode of another version of the suite is another one.
+        version = {"suite_version": SUITE_VERSION} if name == "tabletop" else {}
+        self.provenance: dict[str, Any] = {"kind": name, **version}
+        self._options = {"python": python} if name == "robomme" else {}
+        self._simulator: Simulator | None = None
+        self._cameras: tuple[str, ...] = ()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_simulator": None}
+
+    def episodes(self) -> list[SourceEpisode]:
+        """List all episodes: RoboMME's numbers are those of the tabletop suite."""
+        ids: list[EpisodeId] = [one for family in FAMILIES for one in episode_ids(family, None)]
+        return [SourceEpisode(one, self.provenance) for one in sorted(ids)]
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Begin to play an episode; see `Source.read`."""
+        simulator = self._open(choose_cameras(cameras, CAMERAS, self.name))
+        lesson, first, info = simulator.reset(str(episode.id))
+        act = (lambda: simulator.act("oracle")) if self.whole else None
+        frames = _play(simulator, lesson, first, act)
+        return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)
+
+    def close(self) -> None:
+        """End the simulator."""
+        if self._simulator is not None:
+            self._simulator.close()
+            self._simulator = None
+
+    def _open(self, cameras: tuple[str, ...]) -> Simulator:
+        """Return the simulator that draws these cameras: it is made once and kept."""
+        if self._simulator is None or self._cameras != cameras:
+            self.close()
+            self._simulator = make_simulator(self.name, cameras=cameras, **self._options)
+            self._cameras = cameras
+        return self._simulator
+
+
+def _play(
+    simulator: Simulator,
+    lesson: Demonstration,
+    first: Observation,
+    act: Callable[[], Any] | None,
+) -> Generator[Frame]:
+    told = len(lesson.actions) == len(lesson)
+    for index in range(len(lesson)):
+        images = {camera: shown[index] for camera, shown in lesson.images.items()}
+        action = lesson.actions[index] if told else None
+        yield Frame(images, lesson.states[index], action, True)
+    if act is None:
+        yield Frame(first.images, first.state, None, False)
+        return
+    seen, status = first, Status.ONGOING
+    while status is Status.ONGOING:
+        chosen = np.asarray(act(), np.float32)
+        yield Frame(seen.images, seen.state, chosen, False)
+        seen, status = simulator.step(chosen)
