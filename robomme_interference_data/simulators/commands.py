@@ -45,8 +45,10 @@ def simulate(
     orange one while the policy acts.
 
     Examples:
-    robomme-interference simulate --family MoveCube --episode 3 --video out.mp4;
+    ```
+    robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
     robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
+    ```
     """
     from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId

@@ -31,9 +31,9 @@ ACTION = np.zeros(8, np.float32)
 
 
 def test_a_simulator_is_made_by_its_name() -> None:
-    made = make_simulator(DOUBLE, cameras=("front", "wrist"))
+    made = make_simulator(DOUBLE, cameras=("wrist",))
     lesson, _, _ = made.reset("MoveCube/test/9")
-    assert set(lesson.images) == {"front", "wrist"}
+    assert list(lesson.images) == ["wrist"]
 
 
 @pytest.mark.parametrize(
@@ -147,26 +147,19 @@ def test_a_closed_simulator_refuses_all_but_close() -> None:
 # --- simulate ----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def play(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The command with a simulator that draws both cameras; returns its JSON."""
-    both = lambda **options: Double(cameras=("front", "wrist"))  # noqa: E731
-    monkeypatch.setattr("support.simulator_doubles.make", both)
+def play(*words: object) -> dict[str, Any]:
+    """Run the command; return its JSON."""
     app = typer.Typer()
     app.command()(simulate)
-
-    def call(*words: object) -> dict[str, Any]:
-        given = ["--family", "MoveCube", "--simulator", DOUBLE, "--json", *map(str, words)]
-        done = CliRunner().invoke(app, given)
-        if isinstance(done.exception, InterferenceError | OSError):
-            raise done.exception
-        assert done.exit_code == 0, done.output
-        return dict(json.loads(done.stdout))
-
-    return call
+    given = ["--family", "MoveCube", "--simulator", DOUBLE, "--json", *map(str, words)]
+    done = CliRunner().invoke(app, given)
+    if isinstance(done.exception, InterferenceError | OSError):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return dict(json.loads(done.stdout))
 
 
-def test_simulate_plays_an_episode_and_writes_what_is_seen(play: Any, tmp_path: Path) -> None:
+def test_simulate_plays_an_episode_and_writes_what_is_seen(tmp_path: Path) -> None:
     video = tmp_path / "new" / "out.mp4"
     assert play("--episode", 200, "--video", video) == {
         "episode": "MoveCube/test/200",
@@ -191,12 +184,12 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(play: Any, tmp_path: 
     assert abs(frames[8][18, 1] - 200).max() < 40  # the front camera; the wrist's is 99
 
 
-def test_simulate_can_play_the_demonstration_only(play: Any) -> None:
+def test_simulate_can_play_the_demonstration_only() -> None:
     told = play("--policy", "none")
     assert (told["status"], told["steps"]) == ("ongoing", 0)
 
 
-def test_what_simulate_cannot_do_is_refused_first(play: Any, tmp_path: Path) -> None:
+def test_what_simulate_cannot_do_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "folder.mp4").mkdir()
     (tmp_path / "file").touch()
     episode = ("--episode", UNKNOWN)  # playing would refuse it
@@ -211,7 +204,7 @@ def test_what_simulate_cannot_do_is_refused_first(play: Any, tmp_path: Path) -> 
         play(*episode, "--simulator", "robomme", "--policy", "oracle")
 
 
-def test_an_episode_that_breaks_leaves_no_video(play: Any, tmp_path: Path) -> None:
+def test_an_episode_that_breaks_leaves_no_video(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError):
         play("--episode", UNKNOWN, "--video", tmp_path / "out.mp4")
     assert list(tmp_path.iterdir()) == []
