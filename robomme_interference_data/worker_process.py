@@ -60,11 +60,11 @@ class Worker:
         It is ended from outside, so also while foreign code, such as a renderer, holds the
         interpreter. In the process of the caller (`Serial`) there is no limit.
         """
-        self._tell(("limit", seconds, what))
+        self._tell(("limit", what, seconds))
         try:
             yield
         finally:
-            self._tell(("limit", None, what))
+            self._tell(("limit", what, None))
 
 
 class Task(Protocol):
@@ -166,7 +166,7 @@ class WorkerProcess:
         self._task, self._attempts, self.busy = task, attempts, True
         self._limits = {}
         if time_limit is not None:
-            self._limits["the task"] = time_limit, time.monotonic() + time_limit
+            self._limit("the task", time_limit)
         with suppress(OSError):  # it died while idle: `settle` finds out
             self._pipe.send(task)
 
@@ -187,13 +187,9 @@ class WorkerProcess:
             if kind == "ready":
                 self._ready = True
                 for what, (seconds, _) in self._limits.items():
-                    self._limits[what] = seconds, time.monotonic() + seconds
+                    self._limit(what, seconds)
             elif kind == "limit":
-                seconds, what = rest
-                if seconds is None:
-                    self._limits.pop(what, None)
-                else:
-                    self._limits[what] = seconds, time.monotonic() + seconds
+                self._limit(*rest)
             else:
                 self.busy = False
                 return self._outcome(*rest)
@@ -210,6 +206,12 @@ class WorkerProcess:
 
     def _outcome(self, value: Any, error: BaseException | None, trace: str | None) -> Outcome:
         return Outcome(self._task, value, error, trace, self._attempts)
+
+    def _limit(self, what: str, seconds: float | None) -> None:
+        if seconds is None:
+            self._limits.pop(what, None)
+        else:
+            self._limits[what] = seconds, time.monotonic() + seconds
 
     def _left(self) -> float:
         """Return the seconds until the first limit is exceeded."""

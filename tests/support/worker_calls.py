@@ -70,9 +70,9 @@ def behave(task: tuple[str, Any], worker: Worker) -> Any:
                 with worker.limit(2.0, "a part"):
                     time.sleep(0.8)
         case "start":
-            method, folder, end = more
-            context: Any = multiprocessing.get_context(method)
-            process = context.Process(target=time.sleep, args=(FOREVER,))
+            folder, end = more
+            fork: Any = multiprocessing.get_context("fork")
+            process = fork.Process(target=time.sleep, args=(FOREVER,))
             process.start()
             for pid in (process.pid, os.getpid()):
                 Path(folder, str(pid)).touch()

@@ -73,13 +73,6 @@ def test_this_environment_has_all_that_is_needed_and_nothing_heavy_is_imported()
     assert rows_of_extras == set(extras) - {"all"}
 
 
-def test_an_old_python_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "MIN_PYTHON", (9, 9))
-    row = doctor.check_python()
-    assert row.ok is False
-    assert row.fix == "install Python 9.9 or later, then: pip install robomme-interference-data"
-
-
 OURS = [
     "numpy>=2.0",
     'colorama; sys_platform == "win33"',
@@ -101,11 +94,6 @@ LEROBOT = ['datasets<5,>=4.8; extra == "dataset"', 'pygame; extra == "teleop"']
             {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"},
             (False, "numpy 1.26.4 is not >=2.0"),
             (None, "datasets 5.0.0 is not <5,>=4.8, h5py is not installed"),
-        ),
-        (
-            {"lerobot": "0.5.0", "h5py": "3.16.0"},
-            (False, "numpy is not installed"),
-            (None, "lerobot 0.5.0 is not <0.7,>=0.6.1, datasets is not installed"),
         ),
     ],
 )
