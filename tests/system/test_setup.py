@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 # Stands in for Python, for its pip, and for the uv that it installs; notes how it is called.
@@ -163,10 +163,6 @@ def test_uv_uses_the_index_of_pip(
     assert f"index {index}" in checkout.log.read_text(encoding="utf-8").splitlines()
 
 
-def targets() -> set[str]:
-    return set(re.findall(r"^([a-z]+):", MAKEFILE, re.MULTILINE))
-
-
 def test_help_lists_every_target_that_a_person_runs() -> None:
     done = subprocess.run(
         ["make", "--no-print-directory"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -181,7 +177,7 @@ def test_help_lists_every_target_that_a_person_runs() -> None:
 def test_every_target_is_declared_phony() -> None:
     phony = re.search(r"^\.PHONY: (.+)$", MAKEFILE, re.MULTILINE)
     assert phony is not None
-    assert set(phony[1].split()) == targets()
+    assert set(phony[1].split()) == set(re.findall(r"^([a-z]+):", MAKEFILE, re.MULTILINE))
 
 
 def test_every_file_that_make_runs_exists() -> None:
@@ -190,7 +186,7 @@ def test_every_file_that_make_runs_exists() -> None:
     assert [name for name in files if not (ROOT / name).is_file()] == []
 
 
-@pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh"])
+@pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh", "scripts/system_packages.sh"])
 def test_shell_scripts_are_executable_and_parse(name: str) -> None:
     assert (ROOT / name).stat().st_mode & stat.S_IXUSR
     subprocess.run(["bash", "-n", str(ROOT / name)], check=True)

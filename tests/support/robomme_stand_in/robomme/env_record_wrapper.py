@@ -1,8 +1,8 @@
 """RoboMME's interface without its physics: for the interpreter that the tests make.
 
-Like the real one it returns lists, prints to stdout, gives another episode at a second reset of
-the same environment, makes environments of episodes that do not exist, and lets an episode go on
-for one step more than it is told.
+Like the real one it returns lists, prints to stdout, in colour, gives another episode at a second
+reset of the same environment, makes environments of episodes that do not exist, and lets an episode
+go on for one step more than it is told.
 """
 
 import os
@@ -25,7 +25,7 @@ class Environment:
 
     def reset(self):
         for number in range(100):
-            print("planner failure", number)
+            print(f"\x1b[33mWARN:\x1b[0m planner failure {number}")
         if self.index == 40:
             os._exit(7)
         if self.index == 42:
