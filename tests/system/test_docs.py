@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -47,7 +48,7 @@ def test_the_readmes_commands_run(tmp_path: Path) -> None:
         done = subprocess.run(
             [str(COMMAND), *shlex.split(given)],
             cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "INTERFERENCE_WORLD": "S"},
+            env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "WORLDS_SPLIT": "S"},
             capture_output=True,
             text=True,
             timeout=300,
@@ -75,8 +76,6 @@ def test_the_readmes_python_example(
 
 
 def test_the_readme_names_every_light_dependency() -> None:
-    import tomllib
-
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     section = text.split("## Load a buffer")[1].split("```")[0]
