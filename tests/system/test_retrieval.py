@@ -1,5 +1,6 @@
-"""`thumbnail` on RoboMME's own lessons: the first test episode of each of the nine families."""
+"""Retrieval for real: worker processes that embed, and `thumbnail` on RoboMME's own lessons."""
 
+import shutil
 from pathlib import Path
 
 import av
@@ -7,12 +8,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from support.retrieval import QUIET, embedded, files_of
+
 from robomme_interference_data.embeddings import normalised
+from robomme_interference_data.execution import Processes, Serial
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
-from robomme_interference_data.retrieval.segment import adaptive_threshold, typical_cosine
-from robomme_interference_data.retrieval.select import choose
+from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.retrieval.segment import typical_cosine
+from robomme_interference_data.retrieval.select import Rule, choose
 
 Features = dict[str, NDArray[np.float32]]
+
+
+def test_worker_processes_give_the_same_bytes(tiny_split: Path, tmp_path: Path) -> None:
+    for name, executor in (("a", Serial()), ("b", Processes(2))):
+        units = shutil.copytree(tiny_split / "distractors", tmp_path / name / "distractors")
+        build_index([units], Thumbnail(), QUIET, executor=executor)
+    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+
+
+# --- the first test episode of each of the nine families ------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -51,18 +66,18 @@ def test_the_right_lessons_nearest_frame_is_nearest(episodes: Features) -> None:
 
 
 def test_the_lesson_is_chosen_among_eight_sessions(episodes: Features) -> None:
-    # Without true boundaries: the cut is halfway between unrelated frames and equal ones. Centre
-    # and cut come from the other families' units.
+    # Without true boundaries; centre and adaptive cut come from the other families' units.
     purities, coverages = [], []
     for family, own in episodes.items():
         pool = [unit(other) for name, other in episodes.items() if name != family]
         centre = centre_of(pool)
         units = [normalised(one, centre) for one in pool]
-        typical = typical_cosine(units)
+        typical = typical_cosine(len(units), units.__getitem__)
         rows = normalised(own, centre)
         lesson, units = rows[:-1], units[:7]
         history = np.concatenate([lesson, *units])
-        start, stop = choose(history, rows[-1], threshold=adaptive_threshold(typical)).span
+        rule = Rule("max", Rule("max").threshold(typical))
+        start, stop = choose(embedded(history, rows[-1]), rule).span
         shared = max(0, min(stop, len(lesson)) - start)
         purities.append(shared / (stop - start))
         coverages.append(shared / len(lesson))
