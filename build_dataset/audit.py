@@ -124,15 +124,15 @@ def _pool_leaks(units: Sequence[EpisodeRecord], queries: Sequence[EpisodeRecord]
         if unit.episode_id.split != "train":
             yield Leak("not a train episode", f"unit {unit.episode_id}")
     # The same scene under another split or number: official seeds name the scene.
-    scenes = {
+    scenes: dict[tuple[str | None, str, int | None], EpisodeId] = {
         (query.simulator, query.episode_id.family, query.seed): query.episode_id
         for query in queries
         if query.seed is not None and query.episode_id.split == "test"
     }
     for unit in units:
-        query = scenes.get((unit.simulator, unit.episode_id.family, unit.seed))
-        if query is not None:
-            where = f"unit {unit.episode_id} and query {query} (seed {unit.seed})"
+        scene = scenes.get((unit.simulator, unit.episode_id.family, unit.seed))
+        if scene is not None:
+            where = f"unit {unit.episode_id} and query {scene} (seed {unit.seed})"
             yield Leak("same scene", where)
     for records in (units, queries):
         seen: dict[tuple[str, str], EpisodeId] = {}

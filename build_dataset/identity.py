@@ -43,9 +43,6 @@ from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 __all__ = ["complete_dataset", "counts_of", "listed_files", "revision_of"]
 
-_ROW_GROUP = 256
-"""Rows in a row group of meta/episodes: small, so that few bytes find one episode."""
-
 _LEROBOTS = ("episode_index", "length")
 """Fields of a record that LeRobot writes."""
 
@@ -139,7 +136,15 @@ def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
             table = table.append_column(field, own[field.name])
     for path in paths:
         path.unlink()
-    pq.write_table(table, paths[0], row_group_size=_ROW_GROUP, compression="zstd")
+    # The file is read whole: of over a hundred columns, what helps to skip rows is a burden.
+    pq.write_table(
+        table.replace_schema_metadata(None),
+        paths[0],
+        row_group_size=len(table),
+        compression="zstd",
+        write_statistics=False,
+        store_schema=False,
+    )
 
 
 def _sort_statistics(path: Path) -> None:

@@ -62,6 +62,8 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
             if other != record.episode_index:
                 yield path, f"is shared by episodes {other} and {record.episode_index}"
         try:
+            for path, _ in place.videos.values():
+                dataset.files.path(path)
             yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal))
         except InterferenceError as error:
             yield place.data, error.message
@@ -83,7 +85,8 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
     for name in dataset.features:
         values = stats.get(name)
         try:
-            finite = all(np.isfinite(np.asarray(v, float)).all() for v in dict(values).values())
+            found = dict(values or {}).values()
+            finite = all(np.isfinite(np.asarray(one, float)).all() for one in found)
         except (TypeError, ValueError):
             finite = False
         if not values or not finite:

@@ -7,6 +7,7 @@ Rules 1 to 5 and 8 of the protocol; the draw itself is `draw.py`, what a conditi
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import batched
 from pathlib import Path
 
@@ -131,12 +132,16 @@ class _Material:
         self._record = record
         self._units: list[SessionEntry] = []
 
-    def lesson(self) -> SessionEntry:
+    @cached_property
+    def _lesson(self) -> SessionEntry:
         record, dataset = self._record, self._split.plan.demonstrations
         if record.exec_start_idx is None or record.lesson_sha256 is None:
             raise FormatError.damaged(dataset.files.describe(), f"{record.episode_id}: no lesson")
         sha = combine(record.lesson_sha256)
         return _entry("lesson", dataset, record, record.exec_start_idx, sha)
+
+    def lesson(self) -> SessionEntry:
+        return self._lesson
 
     def units(self, k: int) -> Sequence[SessionEntry]:
         if k > len(self._units):  # drawn once for the largest k: smaller ones begin it

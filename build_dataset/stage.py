@@ -264,7 +264,9 @@ class _Writer:
                     "(H, W, 3) uint8"
                 )
             path = self._folder / f"{camera}.mp4"
-            self._encoders[camera] = VideoEncoder(path, self._codec, FPS, *image.shape[:2])
+            self._encoders[camera] = VideoEncoder(
+                path, self._codec, FPS, image.shape[0], image.shape[1]
+            )
             self.stats[camera] = ImageStats()
             self.features[CAMERA_PREFIX + camera] = image.shape
         for name, value in ((STATE, frame.state), (ACTION, frame.action)):

@@ -244,7 +244,7 @@ class Buffer:
             FormatError: They are of an unknown version, or damaged.
         """
         of_query = self.query.dataset.index(encoder, camera)
-        parts = [np.empty((0, of_query.header.size), np.float16)]
+        parts: list[NDArray[np.float16]] = [np.empty((0, of_query.header.size), np.float16)]
         for entry in self.manifest.sessions:
             index = self._datasets[entry.dataset].index(encoder, camera)
             if index.made != of_query.made:

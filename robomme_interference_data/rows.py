@@ -44,13 +44,37 @@ def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
 
 def to_dict(record: Any) -> dict[str, Any]:
     """Return a record as plain values, for JSON and Arrow: columns in order."""
-    return _plain(record, {})
+    plain: dict[str, Any] = _record_writer(type(record))(record, {})
+    return plain
 
 
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
     """Return records as a table; parts that records share are converted once."""
+    kept = list(records)  # alive, so that an id is one object's
+    write = _record_writer(type(kept[0])) if kept else None
     shared: dict[int, Any] = {}
-    return pa.Table.from_pylist([_plain(record, shared) for record in records], schema=schema)
+    rows = [write(record, shared) for record in kept] if write else []
+    columns = {field.name: [row.get(field.name) for row in rows] for field in schema}
+    return pa.table([_column(columns[field.name], field.type) for field in schema], schema=schema)
+
+
+def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
+    """Return a column; of lists of records, each record that several lists share goes in once."""
+    if not (pa.types.is_list(kind) and pa.types.is_struct(kind.value_type)):
+        return pa.array(values, kind)
+    place: dict[int, int] = {}
+    distinct: list[Any] = []
+    picks: list[int] = []
+    offsets = [0]
+    for listed in values:
+        for one in listed:
+            if id(one) not in place:
+                place[id(one)] = len(distinct)
+                distinct.append(one)
+            picks.append(place[id(one)])
+        offsets.append(len(picks))
+    items = pa.array(distinct, kind.value_type).take(pa.array(picks, pa.int64()))
+    return pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), items, type=kind)
 
 
 def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:
@@ -60,11 +84,11 @@ def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]
         FormatError: A column is missing or of another type, or a value is not what it should be;
             `path` is named.
     """
-    names = [field.name for field in fields(record)]  # type: ignore[arg-type]
+    names = _names(record)
     missing = [name for name in names if name not in table.column_names]
     if missing:
         raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
-    return (from_dict(record, row, path) for row in table.select(names).to_pylist())
+    return (from_dict(record, row, path) for row in table.select(list(names)).to_pylist())
 
 
 def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = False) -> T:
@@ -81,11 +105,13 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
     """
     try:
         if strict and isinstance(value, Mapping):
-            known = {field.name for field in fields(record)}  # type: ignore[arg-type]
+            known = set(_names(record))
             known |= set(_PARTS) if "episode_id" in known else set()
             if unknown := sorted(map(str, value.keys() - known)):
                 raise ValueError(f"unknown {', '.join(unknown)}")
-        return _reader(record)(value)
+        kind: Any = record
+        found: T = _reader(kind)(value)
+        return found
     except InterferenceError as error:
         raise FormatError.damaged(path, error.message) from None
     except ValueError as error:
@@ -99,7 +125,7 @@ def read_header[T](path: Path, record: type[T], *, strict: bool = True) -> T:
         FormatError: It is damaged, or of a format version that this package does not know.
     """
     value = read_json(path)
-    if "format_version" in {field.name for field in fields(record)}:  # type: ignore[arg-type]
+    if "format_version" in _names(record):
         version = value.get("format_version")
         if version != FORMAT_VERSION:
             raise FormatError.version(path, version, FORMAT_VERSION)
@@ -108,29 +134,68 @@ def read_header[T](path: Path, record: type[T], *, strict: bool = True) -> T:
 
 # --- to plain values and Arrow -----------------------------------------------------------------
 
-
-def _plain(value: Any, shared: dict[int, Any]) -> Any:
-    if isinstance(value, EpisodeId):
-        return str(value)
-    if is_dataclass(value):
-        found = shared.get(id(value))
-        if found is None:
-            found = {name: _plain(getattr(value, name), shared) for name in _names(type(value))}
-            if "episode_id" in found:
-                for part in _PARTS:
-                    found[part] = getattr(value.episode_id, part)  # type: ignore[attr-defined]
-            shared[id(value)] = found
-        return found
-    if isinstance(value, tuple):
-        return [_plain(item, shared) for item in value]
-    if isinstance(value, Mapping):
-        return {name: _plain(item, shared) for name, item in value.items()}
-    return value
+_Writer = Callable[[Any, dict[int, Any]], Any]
+"""From a value to a plain one; what is shared by many rows is remembered by its id."""
 
 
 @cache
-def _names(record: type) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(record))
+def _writer(hint: Any) -> _Writer | None:
+    """Return what makes plain values of a type; None where they are plain already."""
+    plain, optional = _split(hint)
+    if plain is EpisodeId:
+        write: _Writer = _remembered(lambda value, shared: str(value))
+    elif is_dataclass(plain):
+        write = _remembered(_record_writer(plain))
+    elif get_origin(plain) is tuple:
+        write = _listed(_writer(get_args(plain)[0]))
+    elif get_origin(plain) is dict and _writer(get_args(plain)[1]) is not None:
+        write = _mapped(_writer(get_args(plain)[1]))
+    else:
+        return None
+    if not optional:
+        return write
+    return lambda value, shared: None if value is None else write(value, shared)
+
+
+def _remembered(write: _Writer) -> _Writer:
+    def found(value: Any, shared: dict[int, Any]) -> Any:
+        plain = shared.get(id(value))
+        if plain is None:
+            plain = shared[id(value)] = write(value, shared)
+        return plain
+
+    return found
+
+
+def _record_writer(record: Any) -> _Writer:
+    writers = [(name, _writer(hint)) for name, hint in _hints(record).items()]
+    identified = "episode_id" in _hints(record)
+
+    def write(value: Any, shared: dict[int, Any]) -> Any:
+        found = {}
+        for name, item in writers:
+            one = getattr(value, name)
+            found[name] = one if item is None else item(one, shared)
+        if identified:
+            episode = value.episode_id
+            found |= {"family": episode.family, "split": episode.split, "index": episode.index}
+        return found
+
+    return write
+
+
+def _listed(item: _Writer | None) -> _Writer:
+    if item is None:
+        return lambda value, shared: list(value)
+    return lambda value, shared: [item(one, shared) for one in value]
+
+
+def _mapped(item: _Writer | None) -> _Writer:
+    return lambda value, shared: {key: item and item(one, shared) for key, one in value.items()}
+
+
+def _names(record: Any) -> tuple[str, ...]:
+    return tuple(_hints(record))
 
 
 def _arrow_fields(record: type, keys: tuple[str, ...]) -> list[pa.Field]:
@@ -161,8 +226,12 @@ def _arrow_type(hint: Any, keys: tuple[str, ...]) -> pa.DataType:
 # --- from plain values -------------------------------------------------------------------------
 
 
+def _hints(record: Any) -> dict[str, Any]:
+    return _cached_hints(record)
+
+
 @cache
-def _hints(record: type) -> dict[str, Any]:
+def _cached_hints(record: Any) -> dict[str, Any]:
     hints = get_type_hints(record)
     return {field.name: hints[field.name] for field in fields(record)}
 

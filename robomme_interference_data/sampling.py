@@ -65,10 +65,19 @@ def lesson_share(
     Returns:
         Share from 0 to 1.
     """
-    lessons = [session for session in sessions if session.role == "lesson"]
-    sample = even_sample(stop - start, samples)
-    inside = sum(
-        any(session.start <= start + index < session.stop for session in lessons)
-        for index in sample[:-1]
-    )
-    return inside / len(sample)
+    frames = stop - start
+    count = min(samples, frames + 1)
+    inside = 0
+    for session in sessions:
+        if session.role == "lesson":
+            first, last = (
+                min(max(edge - start, 0), frames) for edge in (session.start, session.stop)
+            )
+            inside += _before(last, frames, count) - _before(first, frames, count)
+    return inside / count
+
+
+def _before(index: int, frames: int, count: int) -> int:
+    """Return how many of an even sample's history frames come before one."""
+    # floor(j·t / (n − 1)) < index for the first ⌈index·(n − 1) / t⌉ numbers j.
+    return -(-index * (count - 1) // frames) if frames else 0

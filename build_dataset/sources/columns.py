@@ -99,7 +99,7 @@ def _check_type(name: str, column: str, feature: Mapping[str, Any], place: str) 
             f"{', '.join(_EXPECTED[name])}",
             f"Say which column it is: --columns {name}=COLUMN",
         )
-    shape = feature.get("shape") or ()
+    shape: tuple[Any, ...] = tuple(feature.get("shape") or ())
     if name in _CAMERAS and not (len(shape) == 3 and 3 in (shape[0], shape[2])):
         raise SourceError(
             f"{place}: column {column!r} has the shape {shape}; expected three colour channels",

@@ -1,0 +1,193 @@
+"""The cache of decoded frames: bounded, shared, and never trusted when damaged."""
+
+import os
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from robomme_interference_data import DecodedCache
+from robomme_interference_data.cache import default_cache_folder
+from robomme_interference_data.errors import InvalidOptionError
+
+SHAPE = (4, 8, 8, 3)
+FILE_BYTES = 4 * 8 * 8 * 3 + 128
+
+
+def frames(seed: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, SHAPE).astype(np.uint8)
+
+
+def name(seed: int) -> str:
+    return f"{seed:064x}"
+
+
+def used_at(cache: DecodedCache, seed: int, second: int) -> None:
+    """Set when a file was last used: clocks may be too coarse to tell two writes apart."""
+    os.utime(cache.folder / f"{name(seed)}.npy", (second, second))
+
+
+def test_put_and_get(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path / "cache")
+    assert cache.get(name(1), SHAPE) is None
+    assert not cache.folder.exists()  # asking makes nothing
+    cache.put(name(1), frames(1))
+    found = cache.get(name(1), SHAPE)
+    assert found is not None
+    np.testing.assert_array_equal(found, frames(1))
+    assert isinstance(found, np.memmap)
+    with pytest.raises(ValueError, match="read-only"):
+        found[0] = 0
+    assert [path.name for path in cache.folder.iterdir()] == [f"{name(1)}.npy"]
+
+
+def test_put_replaces(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path)
+    cache.put(name(1), frames(1))
+    held = cache.get(name(1), SHAPE)
+    cache.put(name(1), frames(2))
+    np.testing.assert_array_equal(held, frames(1))  # a map that is in use keeps its file
+    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(2))
+
+
+def test_another_shape_or_type_counts_as_absent(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path)
+    cache.put(name(1), frames(1))
+    assert cache.get(name(1), (5, 8, 8, 3)) is None
+    np.save(tmp_path / f"{name(2)}.npy", frames(2).astype(np.int8))
+    assert cache.get(name(2), SHAPE) is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[:4],
+        lambda data: data[:60],
+        lambda data: data[:128],
+        lambda data: data[:-1],
+        lambda data: b"garbage" * 100,
+        lambda data: b"PK\x03\x04" + data,  # looks like an .npz
+        lambda data: b"\x80\x04K\x01." + data,  # looks like a pickle
+        lambda data: data[:6] + b"\x09" + data[7:],  # an unknown version
+        lambda data: data.replace(b"shape", b"shapf"),
+        lambda data: data.replace(b"(4, 8", b"(((("),
+        lambda data: data[:60] + b"\xff" * 20 + data[80:],
+        lambda data: data.replace(b"|u1", b"|O "),
+    ],
+)
+def test_damaged_files_count_as_absent(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    cache = DecodedCache(tmp_path)
+    cache.put(name(1), frames(1))
+    path = tmp_path / f"{name(1)}.npy"
+    damaged = damage(path.read_bytes())
+    assert damaged != path.read_bytes()
+    path.write_bytes(damaged)
+    assert cache.get(name(1), SHAPE) is None
+    cache.put(name(1), frames(1))  # and are written anew
+    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(1))
+
+
+def test_a_folder_in_the_place_of_a_file_counts_as_absent(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path)
+    (tmp_path / f"{name(1)}.npy").mkdir()
+    assert cache.get(name(1), SHAPE) is None
+
+
+def test_least_used_go_first(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path, max_bytes=3 * FILE_BYTES)
+    for seed in (1, 2, 3):
+        cache.put(name(seed), frames(seed))
+        used_at(cache, seed, second=seed)
+    assert cache.get(name(1), SHAPE) is not None  # used now, so 2 is the least used
+    cache.put(name(4), frames(4))
+    assert cache.get(name(2), SHAPE) is None
+    for seed in (1, 3, 4):
+        np.testing.assert_array_equal(cache.get(name(seed), SHAPE), frames(seed))
+
+
+@pytest.mark.parametrize("bound", [FILE_BYTES, 2 * FILE_BYTES - 1, 5 * FILE_BYTES, 10**9])
+def test_the_bound_holds_after_every_put(tmp_path: Path, bound: int) -> None:
+    cache = DecodedCache(tmp_path, max_bytes=bound)
+    for seed in range(8):
+        cache.put(name(seed), frames(seed))
+        used_at(cache, seed, second=seed)
+        sizes = [path.stat().st_size for path in tmp_path.iterdir()]
+        assert sum(sizes) <= bound
+        assert sizes == [FILE_BYTES] * min(seed + 1, bound // FILE_BYTES)
+
+
+def test_frames_larger_than_the_bound_are_not_stored(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path, max_bytes=FILE_BYTES - 1)
+    cache.put(name(1), frames(1))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("bound", [0, -1])
+def test_bound_must_be_positive(tmp_path: Path, bound: int) -> None:
+    with pytest.raises(InvalidOptionError, match=f"bound of {bound} bytes is not positive"):
+        DecodedCache(tmp_path, max_bytes=bound)
+
+
+def test_many_at_once(tmp_path: Path) -> None:
+    """Several users share a folder that holds fewer files than they use."""
+    cache = DecodedCache(tmp_path, max_bytes=3 * FILE_BYTES)
+    errors: list[BaseException] = []
+
+    def use(worker: int) -> None:
+        try:
+            for turn in range(60):
+                seed = (turn * (worker + 1)) % 7
+                found = cache.get(name(seed), SHAPE)
+                if found is None:
+                    cache.put(name(seed), frames(seed))
+                else:
+                    np.testing.assert_array_equal(found, frames(seed))
+        except BaseException as error:
+            errors.append(error)
+
+    workers = [threading.Thread(target=use, args=(number,)) for number in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert errors == []
+    cache.put(name(99), frames(99))
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 3 * FILE_BYTES
+
+
+def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache_folder() == tmp_path / "robomme-interference" / "decoded"
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert default_cache_folder() == tmp_path / ".cache" / "robomme-interference" / "decoded"
+
+
+@pytest.mark.parametrize("place", ["file", "missing parent is a file"])
+def test_where_nothing_can_be_written_it_is_said_once(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("")
+    cache = DecodedCache(tmp_path / "file" if place == "file" else tmp_path / "file" / "cache")
+    with pytest.warns(RuntimeWarning, match="decoded frames are not kept"):
+        cache.put(name(1), frames(1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.put(name(2), frames(2))
+    assert cache.get(name(1), SHAPE) is None
+
+
+def test_a_cache_that_only_others_may_write_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = DecodedCache(tmp_path)
+    cache.put(name(1), frames(1))
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "utime", refuse)
+    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(1))

@@ -1,0 +1,312 @@
+"""The draw of distractor units: fixed for its rule version, and with the properties it claims.
+
+`golden/draws_rule_1.json` holds draws of rule version 1. They must never change: splits that were
+published with them could no longer be verified. Another rule needs another version, and another
+file, which `UPDATE_GOLDEN=1 pytest tests/core/test_draw.py` writes.
+"""
+
+import json
+import os
+import random
+import subprocess
+import sys
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data.constants import FAMILIES, RULE_VERSION
+from robomme_interference_data.draw import UnitPool
+from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
+from robomme_interference_data.ids import EpisodeId
+
+GOLDEN = Path(__file__).parents[1] / "golden" / f"draws_rule_{RULE_VERSION}.json"
+
+NOMINAL = dict.fromkeys(FAMILIES, 100)
+UNEVEN = dict(zip(FAMILIES, (100, 50, 10, 100, 30, 100, 5, 70, 100), strict=True))
+SMALL = {"VideoUnmask": 3, "MoveCube": 1, "my-robot": 2}
+
+
+def units_of(sizes: dict[str, int]) -> list[EpisodeId]:
+    return [
+        EpisodeId(family, "train", index) for family, size in sizes.items() for index in range(size)
+    ]
+
+
+def queries(count: int, split: str = "test") -> list[EpisodeId]:
+    return [EpisodeId(family, split, index) for family in FAMILIES for index in range(count)]
+
+
+# --- golden draws ---------------------------------------------------------------------------
+
+CASES: list[tuple[dict[str, int], int, str, int]] = [
+    (NOMINAL, 0, "VideoRepick/test/7", 7),
+    (NOMINAL, 0, "VideoRepick/test/8", 7),
+    (NOMINAL, 1, "VideoRepick/test/7", 7),
+    (NOMINAL, 0, "VideoRepick/val/7", 7),
+    (NOMINAL, 0, "RouteStick/test/49", 16),
+    (NOMINAL, 0, "PatternLock/test/1234567", 3),
+    (NOMINAL, 123456789, "InsertPeg/train/0", 63),
+    (NOMINAL, 0, "my-robot/test/3", 9),
+    (UNEVEN, 0, "VideoPlaceOrder/test/12", 20),
+    (UNEVEN, 0, "MoveCube/test/0", 3),
+    (SMALL, 0, "VideoUnmask/test/1", 3),
+    (SMALL, 5, "PatternLock/test/2", 6),
+]
+
+
+def golden_draws() -> list[dict[str, Any]]:
+    return [
+        {
+            "pool": sizes,
+            "seed": seed,
+            "query": query,
+            "units": [
+                str(unit)
+                for unit in UnitPool(units_of(sizes), seed).draw(EpisodeId.parse(query), k)
+            ],
+        }
+        for sizes, seed, query, k in CASES
+    ]
+
+
+def test_golden_draws_never_change() -> None:
+    if os.environ.get("UPDATE_GOLDEN") and not GOLDEN.exists():
+        GOLDEN.write_text(json.dumps(golden_draws(), indent=1) + "\n")
+    assert golden_draws() == json.loads(GOLDEN.read_text())
+
+
+def test_one_golden_draw_in_words() -> None:
+    drawn = UnitPool(units_of(NOMINAL)).draw(EpisodeId.parse("VideoRepick/test/7"), 7)
+    assert list(map(str, drawn)) == [
+        "VideoPlaceOrder/train/4",
+        "PatternLock/train/85",
+        "VideoUnmaskSwap/train/22",
+        "VideoPlaceButton/train/9",
+        "VideoUnmask/train/19",
+        "InsertPeg/train/66",
+        "RouteStick/train/66",
+    ]
+
+
+@pytest.mark.parametrize("hash_seed", ["0", "1", "4242"])
+def test_golden_draws_in_other_processes(hash_seed: str) -> None:
+    """Neither Python's hash seed nor the order of a set that depends on it matters."""
+    code = (
+        "import json, sys\n"
+        "from robomme_interference_data.draw import UnitPool\n"
+        "from robomme_interference_data.ids import EpisodeId\n"
+        "for case in json.load(sys.stdin):\n"
+        "    names = {f'{f}/train/{i}' for f, n in case['pool'].items() for i in range(n)}\n"
+        "    pool = UnitPool(map(EpisodeId.parse, names), case['seed'])\n"
+        "    units = pool.draw(EpisodeId.parse(case['query']), len(case['units']))\n"
+        "    assert [str(unit) for unit in units] == case['units'], case\n"
+        "print('all as before')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        input=GOLDEN.read_text(),
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONHASHSEED": hash_seed},
+        check=False,
+        timeout=120,
+    )
+    assert done.stdout == "all as before\n", done.stderr
+
+
+# --- properties of single draws ---------------------------------------------------------------
+
+NAMES = (*FAMILIES, "my-robot", "other-robot")
+pools = st.dictionaries(st.sampled_from(NAMES), st.integers(1, 9), max_size=len(NAMES))
+some_query = st.builds(
+    EpisodeId,
+    st.sampled_from(NAMES),
+    st.sampled_from(["train", "val", "test"]),
+    st.integers(0, 300) | st.integers(0, 10**17),
+)
+seeds = st.integers(0, 10**9)
+
+
+def eligible(sizes: dict[str, int], query: EpisodeId) -> int:
+    return sum(size for family, size in sizes.items() if family != query.family)
+
+
+@given(pools, some_query, seeds)
+def test_a_draw_of_all_holds_every_eligible_unit_once(
+    sizes: dict[str, int], query: EpisodeId, seed: int
+) -> None:
+    drawn = UnitPool(units_of(sizes), seed).draw(query, eligible(sizes, query))
+    assert sorted(drawn) == sorted(
+        unit for unit in units_of(sizes) if unit.family != query.family
+    )  # so none twice, and none of the query's own family
+
+
+@given(pools, some_query, seeds, st.data())
+def test_draws_are_nested_in_k(
+    sizes: dict[str, int], query: EpisodeId, seed: int, data: st.DataObject
+) -> None:
+    count = eligible(sizes, query)
+    more = data.draw(st.integers(0, count))
+    fewer = data.draw(st.integers(0, more))
+    pool = UnitPool(units_of(sizes), seed)
+    assert pool.draw(query, fewer) == pool.draw(query, more)[:fewer]
+
+
+@given(pools, some_query, seeds)
+def test_distinct_families_come_first(sizes: dict[str, int], query: EpisodeId, seed: int) -> None:
+    drawn = UnitPool(units_of(sizes), seed).draw(query, eligible(sizes, query))
+    families = [unit.family for unit in drawn]
+    different = len(sizes.keys() - {query.family})
+    assert len(set(families[:different])) == different
+
+
+@given(pools, some_query, seeds, st.randoms(use_true_random=False))
+def test_order_of_input_does_not_matter(
+    sizes: dict[str, int], query: EpisodeId, seed: int, shuffler: random.Random
+) -> None:
+    units = units_of(sizes)
+    shuffled = units[:]
+    shuffler.shuffle(shuffled)
+    k = eligible(sizes, query)
+    assert UnitPool(shuffled, seed).draw(query, k) == UnitPool(units, seed).draw(query, k)
+
+
+@given(pools, some_query, seeds, st.lists(some_query, max_size=6))
+def test_other_queries_do_not_matter(
+    sizes: dict[str, int], query: EpisodeId, seed: int, others: list[EpisodeId]
+) -> None:
+    k = eligible(sizes, query)
+    expected = UnitPool(units_of(sizes), seed).draw(query, k)
+    pool = UnitPool(units_of(sizes), seed)
+    for other in others:
+        pool.draw(other, eligible(sizes, other))
+    assert pool.draw(query, k) == expected
+
+
+@given(pools, some_query, seeds, st.integers(0, 9))
+def test_units_of_the_own_family_do_not_matter(
+    sizes: dict[str, int], query: EpisodeId, seed: int, own: int
+) -> None:
+    k = eligible(sizes, query)
+    expected = UnitPool(units_of({**sizes, query.family: own}), seed).draw(query, k)
+    assert UnitPool(units_of(sizes), seed).draw(query, k) == expected
+
+
+@given(pools, some_query, seeds)
+def test_pool_too_small_exactly_when_it_is(
+    sizes: dict[str, int], query: EpisodeId, seed: int
+) -> None:
+    pool = UnitPool(units_of(sizes), seed)
+    count = eligible(sizes, query)
+    assert len(pool.draw(query, count)) == count
+    for k in (count + 1, count + 60):
+        with pytest.raises(PoolTooSmallError) as caught:
+            pool.draw(query, k)
+        assert f"{query} needs {k} distractor units" in caught.value.message
+        assert f"the pool has {count} " in caught.value.message
+
+
+def test_pool_too_small_names_the_families() -> None:
+    pool = UnitPool(units_of({"MoveCube": 2, "InsertPeg": 1, "PatternLock": 9}))
+    with pytest.raises(PoolTooSmallError, match=r"the pool has 3 \(InsertPeg, MoveCube\)"):
+        pool.draw(EpisodeId("PatternLock", "test", 0), 4)
+    with pytest.raises(PoolTooSmallError, match=r"the pool has 0 \(no family\)"):
+        UnitPool([]).draw(EpisodeId("PatternLock", "test", 0), 1)
+
+
+def test_a_unit_twice_in_the_pool_is_refused() -> None:
+    units = units_of({"MoveCube": 2})
+    with pytest.raises(InvalidOptionError, match="MoveCube/train/1 is in the pool 3 times"):
+        UnitPool([*units, units[1], units[1]])
+
+
+def test_pool_properties() -> None:
+    pool = UnitPool(units_of(SMALL))
+    assert len(pool) == 6
+    assert pool.families == ("MoveCube", "VideoUnmask", "my-robot")
+
+
+def test_seed_and_query_do_matter() -> None:
+    units = units_of(NOMINAL)
+    draws = {
+        tuple(map(str, UnitPool(units, seed).draw(EpisodeId(family, split, index), 7)))
+        for seed in (0, 1)
+        for family in ("MoveCube", "InsertPeg")
+        for split in ("val", "test")
+        for index in (0, 1, 2)
+    }
+    assert len(draws) == 24
+
+
+# --- balance over all queries -------------------------------------------------------------------
+
+
+def uses(sizes: dict[str, int], k: int, seed: int = 0, count: int = 50) -> dict[EpisodeId, int]:
+    """How often each unit is drawn over `count` queries of each of the nine families."""
+    pool = UnitPool(units_of(sizes), seed)
+    counts = Counter(unit for query in queries(count) for unit in pool.draw(query, k))
+    return {unit: counts[unit] for unit in units_of(sizes)}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_usage_of_the_nominal_pool(seed: int) -> None:
+    """900 units, 450 queries: the mean is k/2 uses."""
+    # With all 8 other families, 400 queries draw one unit each of a family of 100: 4 uses, and
+    # with two rounds 8; exactly, as consecutive queries take consecutive units.
+    assert set(uses(NOMINAL, 8, seed).values()) == {4}
+    assert set(uses(NOMINAL, 16, seed).values()) == {8}
+    # At k=7 each query leaves one of these families out, so at most 4. Observed: 1 to 4, for
+    # seed 0 8, 64, 298 and 530 units.
+    seven = uses(NOMINAL, 7, seed)
+    assert sum(seven.values()) == 450 * 7
+    assert min(seven.values()) >= 1
+    assert max(seven.values()) <= 4
+    # k=1 and k=3 draw a part of that.
+    for k in (1, 3):
+        assert max(uses(NOMINAL, k, seed).values()) <= 4
+    if seed == 0:
+        assert Counter(seven.values()) == {1: 8, 2: 64, 3: 298, 4: 530}
+
+
+def test_every_family_comes_at_every_place() -> None:
+    pool = UnitPool(units_of(NOMINAL))
+    for family in FAMILIES:
+        own = [EpisodeId(family, "test", index) for index in range(48)]
+        places = Counter(
+            (place, unit.family) for query in own for place, unit in enumerate(pool.draw(query, 8))
+        )
+        # 48 queries are 6 blocks of 8: in each block every family stands once at each place.
+        assert len(places) == 8 * 8
+        assert set(places.values()) == {6}
+
+
+def test_consecutive_queries_draw_different_units() -> None:
+    pool = UnitPool(units_of(NOMINAL))
+    for family in FAMILIES:
+        draws = [set(pool.draw(EpisodeId(family, "test", index), 7)) for index in range(50)]
+        assert all(not one & other for one, other in pairwise(draws))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("k", [1, 3])
+def test_small_families_are_used_in_proportion(k: int, seed: int) -> None:
+    """Where k leaves a choice of families, a unit is used as often in a small family."""
+    counted = uses(UNEVEN, k, seed, count=1000)
+    mean = sum(counted.values()) / len(counted)
+    for family in FAMILIES:
+        own = [count for unit, count in counted.items() if unit.family == family]
+        # Drawn evenly by family instead, the smallest would be at 13 times the mean.
+        assert 0.7 * mean < sum(own) / len(own) < 1.15 * mean
+
+
+def test_small_families_are_used_more_where_k_needs_all_families() -> None:
+    counted = uses(UNEVEN, 8)
+    for family, size in UNEVEN.items():
+        own = [count for unit, count in counted.items() if unit.family == family]
+        assert sum(own) == 400  # one unit for each query of the other families
+        assert max(own) <= 2 * 400 / size

@@ -1,0 +1,137 @@
+"""What every error promises: a fitting builtin, a message, a hint; and the nearest names."""
+
+import pickle
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data import errors
+from robomme_interference_data.errors import InterferenceError, nearest
+
+CLASSES = [
+    value
+    for value in vars(errors).values()
+    if isinstance(value, type)
+    and issubclass(value, InterferenceError)
+    and value is not InterferenceError
+]
+BUILTINS = {
+    "InvalidIdError": ValueError,
+    "UnknownNameError": LookupError,
+    "InvalidOptionError": ValueError,
+    "MissingExtraError": ImportError,
+    "MissingFileError": FileNotFoundError,
+    "FormatError": ValueError,
+    "HashMismatchError": ValueError,
+    "TruncatedVideoError": ValueError,
+    "SourceError": ValueError,
+    "BadRowsError": ValueError,
+    "MissingIndexError": FileNotFoundError,
+    "StaleIndexError": ValueError,
+    "MissingWeightsError": FileNotFoundError,
+    "BuildError": RuntimeError,
+    "PoolTooSmallError": ValueError,
+    "HistoryTooLongError": ValueError,
+    "PolicyError": RuntimeError,
+    "PolicyServerError": ConnectionError,
+    "WireError": ValueError,
+}
+
+
+def test_all_are_exported() -> None:
+    assert {error.__name__ for error in CLASSES} <= set(errors.__all__)
+    assert BUILTINS.keys() <= {error.__name__ for error in CLASSES}
+
+
+@pytest.mark.parametrize("error", CLASSES, ids=lambda error: error.__name__)
+def test_each_is_a_builtin_too(error: type[InterferenceError]) -> None:
+    builtins = [base for base in error.__mro__ if base.__module__ == "builtins"]
+    # Beyond Exception, BaseException and object there is a telling one.
+    assert len(builtins) > 3
+    if error.__name__ in BUILTINS:
+        assert issubclass(error, BUILTINS[error.__name__])
+
+
+@pytest.mark.parametrize("error", CLASSES, ids=lambda error: error.__name__)
+def test_message_and_hint(error: type[InterferenceError]) -> None:
+    raised = error("what was found", "what to do")
+    assert (raised.message, raised.hint) == ("what was found", "what to do")
+    assert str(raised) == "what was found\nwhat to do"
+    assert str(error("only this")) == "only this"
+
+
+@pytest.mark.parametrize("error", CLASSES, ids=lambda error: error.__name__)
+def test_errors_travel_between_processes(error: type[InterferenceError]) -> None:
+    copy = pickle.loads(pickle.dumps(error("what was found", "what to do")))
+    assert type(copy) is error
+    assert (copy.message, copy.hint, str(copy)) == (
+        "what was found",
+        "what to do",
+        "what was found\nwhat to do",
+    )
+
+
+@pytest.mark.parametrize(
+    ("given_name", "known", "sentence"),
+    [
+        ("VideoRepik", ["VideoRepick", "MoveCube"], "Did you mean 'VideoRepick'?"),
+        ("movecube", ["VideoRepick", "MoveCube"], "Did you mean 'MoveCube'?"),
+        ("wirst", ["wrist", "waist"], "Did you mean 'wrist' or 'waist'?"),
+        ("xyz", ["front", "wrist"], "Known: front, wrist"),
+        ("anything", [], ""),
+        (
+            "###",
+            [f"name{number:02}" for number in range(12)],
+            "Known: name00, name01, name02, name03, name04, name05, name06, name07, name08, "
+            "name09, … (12 in all)",
+        ),
+    ],
+)
+def test_nearest(given_name: str, known: list[str], sentence: str) -> None:
+    assert nearest(given_name, known) == sentence
+
+
+@given(st.text(max_size=8), st.lists(st.text(max_size=8), max_size=12))
+def test_nearest_offers_only_known_names(given_name: str, known: list[str]) -> None:
+    sentence = nearest(given_name, known)
+    if sentence.startswith("Did you mean "):
+        assert any(repr(name) in sentence for name in known)
+    else:
+        assert sentence.startswith("Known: ") or not known
+
+
+def test_nearest_of_very_many_names_is_quick() -> None:
+    known = [f"VideoRepick/test/{index}" for index in range(200_000)]
+    started = time.perf_counter()
+    sentence = nearest("VideoRepick/test/123456x", known)
+    assert time.perf_counter() - started < 10  # comparing all of them takes longer
+    assert "'VideoRepick/test/123456'" in sentence
+
+
+def test_constructors() -> None:
+    damaged = errors.FormatError.damaged("info.json", "no features")
+    assert damaged.message == "info.json: no features"
+    assert damaged.hint is not None
+    version = errors.FormatError.version("x", 2, 1)
+    assert version.message == "x has format version 2; this package reads 1"
+    unknown = errors.UnknownNameError.among("camera", "frnt", "S", ["front", "wrist"])
+    assert (unknown.message, unknown.hint) == (
+        "camera 'frnt' is not in S",
+        "Did you mean 'front'?",
+    )
+    one = errors.InvalidOptionError.one_of("--codec", "x", ["a", "b"])
+    assert (one.message, one.hint) == ("--codec 'x' is none of a, b", None)
+    extra = errors.MissingExtraError.needs("drawing", "matplotlib", "score")
+    assert extra.hint == 'Install it: pip install "robomme-interference-data[score]"'
+    about = unknown.about("MoveCube/test/1")
+    assert type(about) is errors.UnknownNameError
+    assert about.message == "MoveCube/test/1: camera 'frnt' is not in S"
+    assert about.hint == unknown.hint
+
+
+def test_first_line() -> None:
+    assert errors.first_line(InterferenceError("what", "hint")) == "what"
+    assert errors.first_line(ValueError("a\nb")) == "a"
+    assert errors.first_line(ValueError()) == "ValueError"

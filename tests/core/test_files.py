@@ -1,0 +1,207 @@
+"""Files reached through one place, written whole or not at all."""
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.files import (
+    LocalFiles,
+    atomic_path,
+    canonical_json,
+    format_sums,
+    hold,
+    parse_sums,
+    read_json,
+    sha256_file,
+    write_json,
+)
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**60), 2**60)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+def test_path_and_list(tmp_path: Path) -> None:
+    for name in ("b.parquet", "a/2.parquet", "a/10.parquet", "a/notes.txt"):
+        path = tmp_path / "meta" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+    files = LocalFiles(tmp_path)
+    assert files.path("meta/a/notes.txt").read_text() == "a/notes.txt"
+    assert files.list("meta", ".parquet") == [
+        "meta/a/10.parquet",
+        "meta/a/2.parquet",
+        "meta/b.parquet",
+    ]
+    assert len(files.list("meta")) == 4
+    assert files.list("data") == []
+    assert files.describe() == str(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["info.json", "meta"])
+def test_missing_file_or_folder_in_its_place(tmp_path: Path, name: str) -> None:
+    (tmp_path / "meta").mkdir()
+    with pytest.raises(MissingFileError, match=rf"{name} is missing in {tmp_path}") as caught:
+        LocalFiles(tmp_path).path(name)
+    assert isinstance(caught.value, FileNotFoundError)
+    assert "build it again" in str(caught.value.hint)
+
+
+def test_canonical_json() -> None:
+    assert canonical_json({"b": [1, 2.5, None, True], "a": "ä\n"}) == (
+        '{"a":"ä\\n","b":[1,2.5,null,true]}'
+    )
+    for number in (math.nan, math.inf, -math.inf):
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            canonical_json({"x": number})
+
+
+@given(st.dictionaries(st.text(), values, max_size=5))
+def test_canonical_json_does_not_depend_on_order(value: dict[str, Any]) -> None:
+    text = canonical_json(value)
+    assert canonical_json(dict(reversed(value.items()))) == text
+    assert json.loads(text) == value
+
+
+def test_written_json_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "info.json"
+    write_json(path, {"b": [1], "a": "ä"})
+    assert path.read_bytes() == '{\n  "a": "ä",\n  "b": [\n    1\n  ]\n}\n'.encode()
+    assert read_json(path) == {"a": "ä", "b": [1]}
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"not json", b'{"a": 1', b"\xff\xfe\x00", b"{} {}"])
+def test_not_json(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "info.json"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=r"info\.json: not JSON") as caught:
+        read_json(path)
+    assert caught.value.hint
+
+
+@pytest.mark.parametrize("data", ["[]", "3", "null", '"text"'])
+def test_json_but_no_object(tmp_path: Path, data: str) -> None:
+    path = tmp_path / "info.json"
+    path.write_text(data)
+    with pytest.raises(FormatError, match=r"info\.json: no JSON object"):
+        read_json(path)
+
+
+@pytest.mark.parametrize(
+    "relative", ["../x", "a/../../x", "/etc/passwd", "..", "a/..", "meta/\0x", "videos/../../x"]
+)
+def test_a_path_never_leads_out(tmp_path: Path, relative: str) -> None:
+    (tmp_path / "x").write_text("secret")
+    (tmp_path / "data").mkdir()
+    with pytest.raises(FormatError, match="leads out of it"):
+        LocalFiles(tmp_path / "data").path(relative)
+
+
+def test_links_are_followed_inside_only(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("secret")
+    root = tmp_path / "data"
+    (root / "meta").mkdir(parents=True)
+    (root / "real").write_text("here")
+    (root / "meta" / "inside").symlink_to(root / "real")
+    (root / "meta" / "out").symlink_to(tmp_path / "secret")
+    (root / "folder").symlink_to(tmp_path)
+    assert LocalFiles(root).path("meta/inside").read_text() == "here"
+    for relative in ("meta/out", "folder/secret"):
+        with pytest.raises(FormatError, match="link that leads out"):
+            LocalFiles(root).path(relative)
+    (tmp_path / "link").symlink_to(root)  # the folder itself may be one
+    assert LocalFiles(tmp_path / "link").path("real").read_text() == "here"
+
+
+def test_snapshots_of_the_hubs_cache_link_to_its_blobs(tmp_path: Path) -> None:
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "blobs" / "abc").write_text("data")
+    (tmp_path / "refs").mkdir()
+    (tmp_path / "refs" / "main").write_text("no data")
+    root = tmp_path / "snapshots" / "0123"
+    root.mkdir(parents=True)
+    (root / "info.json").symlink_to("../../blobs/abc")
+    (root / "other").symlink_to("../../refs/main")
+    assert LocalFiles(root).path("info.json").read_text() == "data"
+    with pytest.raises(FormatError, match="link that leads out"):
+        LocalFiles(root).path("other")
+
+
+def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
+    (tmp_path / "b").write_bytes(b"")
+    (tmp_path / "a").write_bytes(b"abc")
+    text = format_sums(tmp_path, ["b", "a"])
+    assert text == (
+        "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad  a\n"
+        "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855  b\n"
+    )
+    assert list(parse_sums(text, "here")) == ["a", "b"]
+    for damaged in ("abc  a\n", "no sums\n", text.replace("  a", " a")):
+        with pytest.raises(FormatError, match="no line of SHA-256"):
+            parse_sums(damaged, "here")
+
+
+def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
+    busy = FormatError("busy")
+    with (
+        hold(tmp_path / "lock", busy),
+        pytest.raises(FormatError, match="busy"),
+        hold(tmp_path / "lock", busy),
+    ):
+        pass
+    with hold(tmp_path / "lock", busy):  # free again
+        pass
+
+
+def test_atomic_path_replaces(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "file.txt"
+    for text in ("one", "two"):
+        with atomic_path(path) as partial:
+            assert partial.parent == path.parent  # a rename in one folder is atomic
+            assert partial.suffix == ".partial"
+            partial.write_text(text)
+        assert path.read_text() == text
+    assert [p.name for p in path.parent.iterdir()] == ["file.txt"]
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_atomic_path_leaves_nothing_when_the_block_fails(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(path) as partial:
+        partial.write_text("half")
+        raise KeyboardInterrupt
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
+
+
+def test_unserialisable_value_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "info.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(path, {"a": math.nan})
+    assert read_json(path) == {"a": 1}
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_sha256_file(tmp_path: Path) -> None:
+    path = tmp_path / "data"
+    path.write_bytes(b"abc")
+    # FIPS 180-4's example
+    assert sha256_file(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    data = bytes(range(256)) * 5000
+    path.write_bytes(data)
+    assert sha256_file(path) == hashlib.sha256(data).hexdigest()
