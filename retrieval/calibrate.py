@@ -50,7 +50,9 @@ class Calibration:
     """What the released rule finds in a split.
 
     Attributes:
-        threshold: What it fits.
+        rule: The rule that the encoder goes by itself.
+        in_use: The threshold that this comes to.
+        threshold: What the released rule fits.
         cuts: Cosines across true cuts, each once, ascending.
         lowest: Lowest cosine inside each session, each once, ascending.
         cut_percentile: The 99th percentile of `cuts`.
@@ -61,6 +63,8 @@ class Calibration:
         sweep: Other thresholds, ascending, each by condition.
     """
 
+    rule: str
+    in_use: float
     threshold: float
     cuts: tuple[float, ...]
     lowest: tuple[float, ...]
@@ -74,21 +78,16 @@ class Calibration:
         """Names of the conditions, in order."""
         return tuple(dict.fromkeys(trial.condition for trial in self.sweep))
 
-    def text(self, rule: str, own: float, title: str) -> str:
-        """Say it for a terminal.
-
-        Args:
-            rule: The rule that the encoder uses by itself.
-            own: The threshold that this comes to.
-            title: Title.
-        """
+    def text(self, title: str) -> str:
+        """Say it for a terminal."""
         apart = self.lowest_percentile - self.cut_percentile
         gap = f"they overlap by {-apart:.3f}: no threshold parts them"
         if apart >= 0:
             gap = f"{apart:.3f} lie between them"
         lines = (
             f"{title}\n",
-            f"Fitted by the released rule: {self.threshold:.3f}; in use ({rule}): {own:.3f}",
+            f"Fitted by the released rule: {self.threshold:.3f}; in use ({self.rule}): "
+            f"{self.in_use:.3f}",
             f"99th percentile of {len(self.cuts)} true cuts: {self.cut_percentile:.3f}; 1st "
             f"percentile of the lowest cosine inside {len(self.lowest)} sessions: "
             f"{self.lowest_percentile:.3f}; {gap}",
@@ -126,11 +125,14 @@ def _shares(*endings: str) -> list[Column]:
     ]
 
 
-def calibrate(measured: Sequence[Measured], thresholds: Sequence[float]) -> Calibration:
+def calibrate(
+    measured: Sequence[Measured], rule: Rule, thresholds: Sequence[float]
+) -> Calibration:
     """Fit a threshold, refit it without each family, and try others.
 
     Args:
-        measured: All buffers of a split that hold frames of the lesson.
+        measured: All buffers of a split that hold frames of the lesson; one or more.
+        rule: The rule that the encoder goes by itself.
         thresholds: What to try, ascending.
 
     Raises:
@@ -152,6 +154,8 @@ def calibrate(measured: Sequence[Measured], thresholds: Sequence[float]) -> Cali
         for name, within in by_condition.items()
     ]
     return Calibration(
+        str(rule),
+        rule.threshold(measured[0].typical),
         threshold,
         tuple(_true_cuts(measured)),
         tuple(_lowest_inside(measured)),

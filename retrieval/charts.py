@@ -98,14 +98,8 @@ def _percent(axes: Any) -> None:
     tidy(axes)
 
 
-def draw_calibration(found: Calibration, own: float, title: str, out: Path) -> None:
+def draw_calibration(found: Calibration, title: str, out: Path) -> None:
     """Draw what the released rule parts, and what other thresholds would give.
-
-    Args:
-        found: The calibration.
-        own: The threshold that the encoder uses by itself.
-        title: Title.
-        out: File to write, `.png` or `.svg`.
 
     Raises:
         InvalidOptionError, MissingExtraError: As for `draw_cells`.
@@ -119,7 +113,7 @@ def draw_calibration(found: Calibration, own: float, title: str, out: Path) -> N
             limits = axes.get_xlim()
             for value, colour, name in (
                 (found.threshold, _COLOURS[0], "fitted"),
-                (own, GREY, "in use"),
+                (found.in_use, GREY, "in use"),
             ):
                 if axes is left or limits[0] <= value <= limits[1]:
                     label = f"{name}: {value:.3f}"

@@ -222,17 +222,16 @@ def calibrate(
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
     about, measured = _measured(split, name, camera, quiet=as_json)
-    found = fitting.calibrate(measured, thresholds)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
-    own = rule.threshold(measured[0].typical)
+    found = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['split']}"
     if out is not None:
-        charts.draw_calibration(found, own, title, out)
+        charts.draw_calibration(found, title, out)
         MESSAGES.print(f"{out} written")
     if as_json:
-        print_json(about | {"in_use": {"rule": str(rule), "threshold": own}} | to_dict(found))
+        print_json(about | to_dict(found))
     else:
-        typer.echo(found.text(str(rule), own, title))
+        typer.echo(found.text(title))
 
 
 def _measured(

@@ -105,11 +105,6 @@ class Rule:
             cut = text
         return cls(method, cut)
 
-    @property
-    def single_frames(self) -> bool:
-        """Whether it chooses frames that need not be consecutive, not a span."""
-        return self.method == "top32"
-
     def threshold(self, typical: float) -> float:
         """Return the cosine below which it cuts, where unrelated frames have cosine `typical`."""
         return (1 + typical) / 2 if self.cut == ADAPTIVE else float(self.cut)
@@ -123,11 +118,14 @@ class Rule:
 def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
     """Read rules as `Rule.parse` does; `all` stands for every method, and for both cuts.
 
+    A text may hold several, with commas between them.
+
     Returns:
         The rules in the order given, each once.
     """
     every = [*METHODS, f"max/{ADAPTIVE}"]
-    named = (name for text in texts for name in (every if text == "all" else [text]))
+    given = (name for text in texts for name in text.split(","))
+    named = (name for text in given for name in (every if text == "all" else [text]))
     return list(dict.fromkeys(Rule.parse(name, published) for name in named))
 
 
@@ -193,7 +191,6 @@ class Choice:
     """What was chosen of a history, and what it was chosen by.
 
     Attributes:
-        method: One of `METHODS`.
         threshold: Cosine of adjacent frames below which the history was cut.
         frames: The chosen frames, ascending, `(n,) int64`, n at least 1.
         segments: All segments in order.
@@ -201,7 +198,6 @@ class Choice:
             all if the method scores none.
     """
 
-    method: str
     threshold: float
     frames: NDArray[np.int64]
     segments: tuple[Span, ...]
@@ -216,8 +212,8 @@ class Choice:
         """
         start, stop = int(self.frames[0]), int(self.frames[-1]) + 1
         if stop - start != len(self.frames):
-            what = f"method {self.method!r} chose {len(self.frames)} single frames, not a span"
-            raise InvalidOptionError(what, "Choose a method that takes whole segments: max.")
+            what = f"the rule chose {len(self.frames)} single frames, not a span"
+            raise InvalidOptionError(what, "Choose one that takes whole segments, such as max.")
         return start, stop
 
 
@@ -244,7 +240,7 @@ def choose(measured: Measured, rule: Rule) -> Choice:
     scores: dict[Span, float] = {}
     if rule.method == "top32":
         order = np.argsort(-measured.alike, kind="stable")[:SAMPLE_FRAMES]
-        return Choice(rule.method, threshold, np.sort(order), spans, (None,) * len(spans))
+        return Choice(threshold, np.sort(order), spans, (None,) * len(spans))
     if rule.method in _SCORES:
         score = _SCORES[rule.method]
         scores = {span: score(measured.alike[slice(*span)]) for span in candidates}
@@ -260,4 +256,4 @@ def choose(measured: Measured, rule: Rule) -> Choice:
     else:
         raise InvalidOptionError(f"{about}: there is no lesson that oracle could choose")
     frames = np.arange(*chosen, dtype=np.int64)
-    return Choice(rule.method, threshold, frames, spans, tuple(map(scores.get, spans)))
+    return Choice(threshold, frames, spans, tuple(map(scores.get, spans)))

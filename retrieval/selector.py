@@ -74,7 +74,7 @@ class Selector:
         device: str | None = None,
     ):
         self.rule = Rule.parse(rule, published_threshold(encoder))
-        if self.rule.single_frames:
+        if self.rule.method == "top32":
             expected = "one that chooses a span: a policy is not handed single frames"
             raise InvalidOptionError.expected("rule", rule, expected)
         self.camera = camera.removeprefix(CAMERA_PREFIX)
@@ -94,9 +94,8 @@ class Selector:
             buffer: Any buffer of the split whose index it looks up.
 
         Returns:
-            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the embeddings
-            (weights, settings, preprocessing, centre); `camera`; `method`; `cut`, a cosine or
-            `adaptive`; and `threshold`, the cosine that it comes to.
+            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the embeddings;
+            `camera`; `method`; `cut`; and `threshold`, the cosine that the cut comes to.
 
         Raises:
             MissingIndexError, StaleIndexError, FormatError: As for `select`.

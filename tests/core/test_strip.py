@@ -16,9 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.retrieval import EPISODE, remade, sessions_of
+from support.retrieval import remade, sessions_of
+from support.splits import QUERIES
 
-from robomme_interference_data import Buffer, SessionEntry, load_buffer
+from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError, UnknownNameError
 from robomme_interference_data.page import ink_on, open_page, tint
 from robomme_interference_data.sampling import spread
@@ -52,24 +53,21 @@ def coarse(image: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.array([[f.mean((0, 1)) for f in np.array_split(r, 4, axis=1)] for r in rows])
 
 
-def of_length(entry: SessionEntry, frames: int) -> SessionEntry:
-    """The session with so many frames; more than are stored are had by holding each of them."""
-    repeat = -(-frames // (entry.stop - entry.start))
-    return replace(entry, stop=entry.start + frames // repeat, repeat=repeat)
-
-
-def reshaped(buffer: Buffer, frames: Sequence[int], **changes: object) -> Buffer:
-    """The buffer with the lesson and then its units in turn, so many frames each."""
-    lesson, *units = buffer.manifest.sessions
-    entries = [lesson, *(units[n % len(units)] for n in range(len(frames) - 1))]
-    made = [of_length(entry, count) for entry, count in zip(entries, frames, strict=False)]
-    return remade(buffer, made, **changes)
+def of_lengths(split: Path, frames: Sequence[int], **changes: object) -> Buffer:
+    """A lesson and then units in turn, of so many frames each: more are had by holding them."""
+    lesson, *units = load_split(split).manifest(QUERIES[0], "k3").sessions
+    entries = []
+    for number, count in enumerate(frames):
+        entry = units[number % 3] if number else lesson
+        repeat = -(-count // entry.stop)
+        entries.append(replace(entry, stop=count // repeat, repeat=repeat))
+    return remade(split, entries, **changes)
 
 
 @pytest.fixture(scope="module")
 def buffer(tiny_split: Path) -> Buffer:
     """A lesson of 48 frames and three units of 32."""
-    return load_buffer(EPISODE, "k3", split=tiny_split)
+    return load_buffer(QUERIES[0], "k3", split=tiny_split)
 
 
 @pytest.fixture(scope="module")
@@ -80,20 +78,6 @@ def strip(buffer: Buffer, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # --- layout ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("start", "stop", "count", "expected"),
-    [
-        (0, 48, 4, [0, 15, 31, 47]),
-        (48, 80, 3, [48, 63, 79]),
-        (5, 8, 4, [5, 6, 7]),
-        (5, 6, 4, [5]),
-        (5, 9, 1, [5]),
-    ],
-)
-def test_frames_that_are_shown(start: int, stop: int, count: int, expected: list[int]) -> None:
-    assert spread(start, stop, count) == expected
 
 
 @pytest.mark.parametrize(
@@ -161,7 +145,7 @@ def test_tint() -> None:
 
 def test_says_what_the_buffer_is(strip: Path, buffer: Buffer) -> None:
     found = labels(strip)
-    assert f"{EPISODE}   k3" in found
+    assert f"{QUERIES[0]}   k3" in found
     assert f"Goal: {buffer.goal}" in found
     # 48 lesson frames of 144: samples are j · 144 // 31, so 0 to 10 of 32, 34%.
     share = "an even 32-frame sample holds 34% lesson"
@@ -207,9 +191,9 @@ def test_another_camera(buffer: Buffer, tmp_path: Path) -> None:
     [[36], [1, 1], [1100, *[32] * 7], [1100, *[32] * 63]],
     ids=["k0", "tiny", "long", "k63"],
 )
-def test_any_number_of_sessions(buffer: Buffer, tmp_path: Path, frames: list[int]) -> None:
+def test_any_number_of_sessions(tiny_split: Path, tmp_path: Path, frames: list[int]) -> None:
     out = tmp_path / "strip.svg"
-    made = reshaped(buffer, frames)
+    made = of_lengths(tiny_split, frames)
     draw_strip(made, out)
     lengths = [len(session) for session in made.sessions]
     found = labels(out)
@@ -238,13 +222,16 @@ def test_any_number_of_sessions(buffer: Buffer, tmp_path: Path, frames: list[int
     ids=["empty", "absent", "second", "in parts"],
 )
 def test_any_condition(
-    buffer: Buffer, tmp_path: Path, order: list[int], facts: str, heads: list[str]
+    buffer: Buffer,
+    tiny_split: Path,
+    tmp_path: Path,
+    order: list[int],
+    facts: str,
+    heads: list[str],
 ) -> None:
     lesson, unit, *_ = buffer.manifest.sessions
-    known = [lesson, unit, replace(lesson, stop=16)]
-    entries = [known[number] for number in order]
-    made = remade(buffer, entries, lesson_share=0.0)
-    draw_strip(made, tmp_path / "strip.svg")
+    entries = [[lesson, unit, replace(lesson, stop=16)][number] for number in order]
+    draw_strip(remade(tiny_split, entries, lesson_share=0.0), tmp_path / "strip.svg")
     found = labels(tmp_path / "strip.svg")
     assert f"{facts};  an even 32-frame sample holds 0% lesson" in found
     assert [text for text in found if re.match(r"\d  ", text)] == heads
@@ -261,17 +248,17 @@ def test_any_condition(
     ],
 )
 def test_odd_goals(
-    buffer: Buffer, tmp_path: Path, goal: str, line: str, recwarn: pytest.WarningsRecorder
+    tiny_split: Path, tmp_path: Path, goal: str, line: str, recwarn: pytest.WarningsRecorder
 ) -> None:
-    draw_strip(reshaped(buffer, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
+    draw_strip(of_lengths(tiny_split, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
     ET.parse(tmp_path / "strip.svg")
     assert line in labels(tmp_path / "strip.svg")
     assert not recwarn.list
 
 
-def test_a_long_goal_takes_four_lines_at_most(buffer: Buffer, tmp_path: Path) -> None:
+def test_a_long_goal_takes_four_lines_at_most(tiny_split: Path, tmp_path: Path) -> None:
     goal = " ".join(f"word{n}" for n in range(200))
-    draw_strip(reshaped(buffer, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
+    draw_strip(of_lengths(tiny_split, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
     lines = [text for text in labels(tmp_path / "strip.svg") if "word" in text]
     assert len(lines) == 4
     assert lines[0].startswith("Goal: word0 word1 ")
@@ -309,7 +296,7 @@ def test_another_process_with_other_settings_writes_the_same(
         "import sys; from pathlib import Path\n"
         "from robomme_interference_data import load_buffer\n"
         "from robomme_interference_data.strip import draw_strip\n"
-        f"buffer = load_buffer({EPISODE!r}, 'k3', split=sys.argv[1])\n"
+        f"buffer = load_buffer({QUERIES[0]!r}, 'k3', split=sys.argv[1])\n"
         "for path in sys.argv[2:]: draw_strip(buffer, Path(path))"
     )
     there = [tmp_path / "there.png", tmp_path / "there.svg"]
@@ -322,7 +309,7 @@ def test_another_process_with_other_settings_writes_the_same(
 
 def test_no_date_or_version_is_written(buffer: Buffer, strip: Path, tmp_path: Path) -> None:
     out = tmp_path / "strip.PNG"
-    draw_strip(reshaped(buffer, [36]), out)
+    draw_strip(buffer, out)
     data = out.read_bytes()
     position, kinds = 8, []
     while position < len(data):
@@ -337,7 +324,7 @@ def test_leaves_the_settings_of_matplotlib_alone(buffer: Buffer, tmp_path: Path)
     import matplotlib
 
     with matplotlib.rc_context({"font.size": 31}):
-        draw_strip(reshaped(buffer, [36]), tmp_path / "strip.svg")
+        draw_strip(buffer, tmp_path / "strip.svg")
         assert matplotlib.rcParams["font.size"] == 31
 
 

@@ -4,9 +4,13 @@ import pytest
 from support.retrieval import made
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.calibrate import calibrate, sweep_steps
+from robomme_interference_data.retrieval.calibrate import Calibration, calibrate, sweep_steps
 from robomme_interference_data.retrieval.grade import ALL
-from robomme_interference_data.retrieval.select import Measured
+from robomme_interference_data.retrieval.select import Measured, Rule
+
+
+def found_in(*measured: Measured, sweep: tuple[float, ...] = (0.5,)) -> Calibration:
+    return calibrate(measured, Rule(), sweep)
 
 
 def three() -> list[Measured]:
@@ -31,7 +35,7 @@ def three() -> list[Measured]:
 def test_the_released_rule_by_hand() -> None:
     # 99th percentile of 0, 0.2, 0.4: 0.2 + 0.98 · 0.2 = 0.396. 1st of 0.7, 0.8, 0.9: 0.7 + 0.02 ·
     # 0.1 = 0.702. Midway: 0.549.
-    found = calibrate(three(), [0.3, 0.549, 0.95])
+    found = found_in(*three(), sweep=(0.3, 0.549, 0.95))
     fitted = found.threshold, found.cut_percentile, found.lowest_percentile
     assert fitted == pytest.approx((0.549, 0.396, 0.702), abs=1e-6)
     assert found.cuts == pytest.approx((0, 0.2, 0.4))
@@ -58,7 +62,7 @@ def test_every_session_counts_and_each_once() -> None:
     other = made(
         "InsertPeg/test/0", cuts={3: 0.8, 6: 0.3, 8: 0.5, 11: 0.2, 13: 0.6}, high={}, units=units
     )
-    found = calibrate([one, other], [0.5])
+    found = found_in(one, other)
     assert found.lowest == pytest.approx([0.5, 0.6, 0.8, 0.9])
     assert found.cuts == pytest.approx([0.1, 0.2, 0.3])  # A to B once
     # Without MoveCube its query goes as a whole. 99th percentile of 0.2, 0.3: 0.299; 1st of 0.5,
@@ -75,7 +79,7 @@ def test_a_family_is_left_out_of_other_buffers_too() -> None:
     units = ("InsertPeg/train/0", "RouteStick/train/0", "RouteStick/train/1")
     one = made(cuts={3: 0.9, 6: 0.1, 8: 0.5, 11: 0.2, 15: 0.4}, high={}, spans=spans, units=units)
     own = made("InsertPeg/test/0", cuts={6: 0.3}, high={}, units=units[1:])
-    found = calibrate([one, own], [0.5])
+    found = found_in(one, own)
     without = next(trial for trial in found.held_out if trial.family == "InsertPeg")
     # 1st percentile of 0.9, 1, 1: 0.902.
     assert without.threshold == pytest.approx((0.4 + 0.902) / 2, abs=1e-6)
@@ -84,20 +88,20 @@ def test_a_family_is_left_out_of_other_buffers_too() -> None:
 def test_the_lesson_may_lie_anywhere() -> None:
     cuts = {4: 0.1, 6: 0.9, 11: 0.8}
     first, second = (made(cuts=cuts, high={5: 1}, lessons=lessons) for lessons in ((0,), (1,)))
-    assert calibrate([first], [0.5]).cuts == calibrate([second], [0.5]).cuts
+    assert found_in(first).cuts == found_in(second).cuts
     # Cut before 4 alone, 4 to 14 are chosen: 2 of 11 and 2 of 6, or 5 of 11 and 5 of 5.
-    shares = [calibrate([one], [0.5]).sweep[0] for one in (first, second)]
+    shares = [found_in(one).sweep[0] for one in (first, second)]
     assert [(one.purity, one.coverage) for one in shares] == [(2 / 11, 2 / 6), (5 / 11, 1)]
 
 
 def test_nothing_to_fit() -> None:
     alone = made(condition="k0", cuts={}, high={}, spans=((0, 6),))
     with pytest.raises(InvalidOptionError, match="without any cut between sessions"):
-        calibrate([alone], [0.5])
+        found_in(alone)
     short = made(cuts={}, high={}, spans=((0, 1), (1, 2)))
     with pytest.raises(InvalidOptionError, match="without any session of two frames"):
-        calibrate([short], [0.5])
-    assert calibrate(three()[:2], [0.5]).held_out == ()  # one family
+        found_in(short)
+    assert found_in(*three()[:2]).held_out == ()  # one family
 
 
 def test_sweep_steps() -> None:

@@ -9,14 +9,17 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from support.retrieval import EPISODE, remade
+from support.retrieval import FRAMES, remade
+from support.splits import QUERIES
 
-from robomme_interference_data import Split, load_buffer, load_split
+from robomme_interference_data import load_split
 from robomme_interference_data.retrieval import drawing, reasons, select
 
 Run = Callable[..., tuple[int, str, str]]
 
+EPISODE = QUERIES[0]
 CONDITIONS = ("k0", "k1", "k3", "k7")
+FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 
 
 def picture(path: Path) -> tuple[int, int]:
@@ -32,42 +35,27 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def opened(indexed: Path) -> tuple[Split, int]:
-    """The split, and its number of queries."""
-    split = load_split(indexed)
-    return split, len(split.episode_ids)
-
-
 # --- index -------------------------------------------------------------------------------------
 
 
-def test_index(split: Path, run: Run) -> None:
-    datasets = load_split(split).datasets
-    names = ("demonstrations", "distractors")
-    frames = [datasets[name].identity.counts.frames for name in names]
-    code, out, err = run("index", split, "--encoder", "thumbnail", "--threads", 1)
+def test_index(own_split: Path, run: Run) -> None:
+    places = [f"{own_split}/{name}/index/thumbnail" for name in ("demonstrations", "distractors")]
+    code, out, err = run("index", own_split, "--encoder", "thumbnail", "--threads", 1)
     assert code == 0 and "frames/s" in err
     assert out.splitlines() == [
-        f"{split}/{name}/index/thumbnail: {count} frames, {count} embedded now"
-        for name, count in zip(names, frames, strict=True)
+        f"{place}: {count} frames, {count} embedded now"
+        for place, count in zip(places, FRAMES, strict=True)
     ]
-    code, out, err = run("index", split, "--json")
+    header = own_split / "distractors/index/thumbnail/index.json"
+    computed = {"computed": {"in": "cuda, bfloat16", "batch": 32}}
+    header.write_text(json.dumps(json.loads(header.read_text()) | computed))
+    assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_split)[2]
+    code, out, err = run("index", own_split, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
-    assert [(one["header"]["frames"], one["embedded"]) for one in found] == [
-        (count, 0) for count in frames
+    assert [(one["folder"], one["header"]["frames"], one["embedded"]) for one in found] == [
+        (place, count, 0) for place, count in zip(places, FRAMES, strict=True)
     ]
-    assert all(-1 < one["header"]["typical_cosine"] < 1 for one in found)
-
-
-def test_index_tells_what_it_keeps(indexed: Path, run: Run) -> None:
-    path = indexed / "distractors/index/thumbnail/index.json"
-    text = path.read_text()
-    computed = {"computed": {"in": "cuda, bfloat16", "batch": 32}}
-    path.write_text(json.dumps(json.loads(text) | computed))
-    code, _, err = run("index", indexed)
-    assert code == 0 and "is kept, computed with cuda, bfloat16, 32 images" in err
-    path.write_text(text)
 
 
 @pytest.mark.parametrize(
@@ -97,13 +85,12 @@ def test_index_refusals(
 
 def test_the_table_by_family_and_condition(run: Run, indexed: Path) -> None:
     code, out, err = run("retrieval-score", indexed)
-    split, queries = opened(indexed)
     assert code == 0 and "buffers/s" in err
-    assert f"{queries} of {5 * queries} buffers hold no lesson and are left out" in err
+    assert "3 of 15 buffers hold no lesson and are left out" in err
     title, _, heads, rule, *rest = out.splitlines()
     assert title == "Retrieval on split, encoder thumbnail, camera front, rule max/adaptive"
     assert heads.split()[:3] == ["family", "condition", "queries"] and set(rule) == {"-", " "}
-    counts = {family: "1" for family in split.families} | {"all": str(queries)}
+    counts = dict.fromkeys(FAMILIES, "1") | {"all": "3"}
     rows = [line.split()[:3] for line in rest[: rest.index("")]]
     assert rows == [[family, name, counts[family]] for family in counts for name in CONDITIONS]
     assert out.splitlines()[-1].startswith("Cells of a family and a condition that pass: max/")
@@ -112,18 +99,16 @@ def test_the_table_by_family_and_condition(run: Run, indexed: Path) -> None:
 def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
     options = ("--rules", "oracle", "last,max/-1", "--out", tmp_path)
     code, out, err = run("retrieval-score", indexed, *options)
-    _, queries = opened(indexed)
-    assert code == 0
+    assert code == 0 and f"{tmp_path}/cells.csv, rows.csv and retrieval.png written" in err
     lines = out.splitlines()
     rows = lines[4 : lines.index("", 4)]
     assert [row.split()[:3] for row in rows] == [
-        [rule, name, str(queries)]
+        [rule, name, "3"]
         for rule in ("oracle/adaptive", "last/adaptive", "max/-1")
         for name in CONDITIONS
     ]
     assert all(row.endswith("yes") for row in rows[:4])
-    assert f"oracle/adaptive: {4 * queries} of {4 * queries}" in lines[-1]
-    assert f"{tmp_path}/cells.csv, rows.csv and retrieval.png written" in err
+    assert "oracle/adaptive: 12 of 12" in lines[-1]
     # One segment, whatever comes: all of the lesson, and every other session.
     whole = [row for row in rows_of(tmp_path / "cells.csv") if row["rule"] == "max/-1"]
     assert {row["coverage"] for row in whole} == {"1.000000"}
@@ -132,14 +117,13 @@ def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
         assert float(row["false_sessions"]) == k
         assert (row["found_cuts"], row["false_cuts"]) == ("0", "0")
         assert int(row["true_cuts"]) == k * int(row["queries"])
-    rows = rows_of(tmp_path / "rows.csv")
-    assert len(rows) == 3 * queries * 4
-    one = next(
-        r for r in rows if (r["rule"], r["episode_id"], r["condition"]) == ("max/-1", EPISODE, "k3")
-    )
-    frames = len(load_buffer(EPISODE, "k3", split=indexed))
-    assert (one["start"], one["stop"], one["segments"]) == ("0", str(frames), "1")
-    assert float(one["purity"]) == pytest.approx((frames - 96) / frames, abs=1e-6)
+    found = {
+        (r["rule"], r["episode_id"], r["condition"]): r for r in rows_of(tmp_path / "rows.csv")
+    }
+    assert len(found) == 3 * 12
+    one = found["max/-1", EPISODE, "k3"]
+    assert (one["start"], one["stop"], one["segments"]) == ("0", "144", "1")
+    assert one["purity"] == "0.333333"  # 48 of 144
     assert picture(tmp_path / "retrieval.png") > (1000, 500)
 
 
@@ -148,15 +132,20 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
     assert runs[0][1] == runs[1][1]
     for name in ("cells.csv", "rows.csv", "retrieval.png"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    split, queries = opened(indexed)
     found = json.loads(runs[0][1])
-    assert (found["split"], found["encoder"], found["camera"]) == ("split", "thumbnail", "front")
-    assert (found["buffers"], found["left_out"]) == (4 * queries, queries)
-    assert found["rules"] == ["max/adaptive"] and found["pass_mark"] == 0.9
-    assert found["revision"] == split.revision
-    cell = next(c for c in found["cells"] if (c["family"], c["condition"]) == ("all", "k0"))
-    assert cell["purity"] == 1 and cell["false_sessions"] == 0 and cell["queries"] == queries
-    first = found["cells"][0]
+    cells = {(cell["family"], cell["condition"]): cell for cell in found.pop("cells")}
+    assert found == {
+        "split": "split",
+        "revision": load_split(indexed).revision,
+        "encoder": "thumbnail",
+        "camera": "front",
+        "buffers": 12,
+        "left_out": 3,
+        "rules": ["max/adaptive"],
+        "pass_mark": 0.9,
+    }
+    first, every = cells["VideoRepick", "k0"], cells["all", "k0"]
+    assert (every["purity"], every["false_sessions"], every["queries"]) == (1, 0, 3)
     assert first["queries"] == 1 and first["purity_low"] is None
 
 
@@ -200,18 +189,15 @@ def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
     words = ("retrieve", EPISODE, "k3", "--split", indexed, "--out", out_file)
     code, out, err = run(*words, "--rule", "oracle")
     assert code == 0 and f"{out_file} written" in err
-    buffer = load_buffer(EPISODE, "k3", split=indexed)
     first, chosen, why, closest, lesson = out.splitlines()
-    assert first.startswith(
-        f"{EPISODE} under k3, front camera, rule oracle/adaptive: {len(buffer)} history frames, cut"
-    )
-    last = buffer.sessions[0].stop - 1
-    assert chosen == f"Chosen: frames 0 to {last}, of lesson {EPISODE}"
+    about = f"{EPISODE} under k3, front camera, rule oracle/adaptive: 144 history frames, cut into"
+    assert first.startswith(about)
+    assert chosen == f"Chosen: frames 0 to 47, of lesson {EPISODE}"
     assert why.startswith("Why: oracle takes the true lesson")
     assert closest.startswith("What the robot sees now is closest to frame ")
     assert "the closest one outside is frame " in closest
-    assert lesson == (
-        f"The lesson is frames 0 to {last}: purity 100.0%, coverage 100.0%, 0 false sessions"
+    assert lesson.startswith(
+        "The lesson is frames 0 to 47: purity 100.0%, coverage 100.0%, 0 false"
     )
     assert picture(out_file) == (1296, 1098)
 
@@ -260,8 +246,8 @@ def test_why_as_json_is_what_the_score_says(run: Run, tmp_path: Path, indexed: P
 def test_why_wherever_the_lesson_lies(
     order: list[int], said: str, indexed: Path, tmp_path: Path
 ) -> None:
-    planned = load_buffer(EPISODE, "k1", split=indexed)
-    buffer = remade(planned, [planned.manifest.sessions[number] for number in order])
+    planned = load_split(indexed).manifest(EPISODE, "k1").sessions
+    buffer = remade(indexed, [planned[number] for number in order])
     rule = select.Rule("max", -1.0)
     measured = select.measure(buffer, "thumbnail")
     choice = select.choose(measured, rule)
@@ -277,29 +263,23 @@ def test_why_wherever_the_lesson_lies(
 def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
     figure = tmp_path / "cuts.svg"
     code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2", "--out", figure)
-    split, queries = opened(indexed)
-    assert code == 0 and f"{figure} written" in err
+    assert code == 0 and f"{figure} written" in err and figure.read_text().startswith("<?xml")
     assert "Fitted by the released rule: " in out and "in use (max/adaptive): " in out
-    for family in split.families:
-        assert f"\n{family} " in out
+    assert all(f"\n{family} " in out for family in FAMILIES)
     lines = out.splitlines()
     assert [line.split()[0] for line in lines[-11:]] == [f"{0.1 + n / 100:.2f}" for n in range(11)]
     heads = lines[-13].split()
     assert heads[1:3] == ["purity", "k0"] and heads[-2:] == ["coverage", "k7"]
-    assert figure.read_text().startswith("<?xml")
     code, out, err = run("calibrate", indexed, "--json")
     found = json.loads(out)
-    assert (code, err) == (0, "") and found["left_out"] == queries
-    assert found["in_use"]["rule"] == "max/adaptive"
-    assert found["threshold"] == pytest.approx(
-        (found["cut_percentile"] + found["lowest_percentile"]) / 2, abs=1e-5
-    )
-    assert [trial["threshold"] for trial in found["sweep"][::4]] == [
-        round(0.8 + n / 100, 2) for n in range(20)
-    ]
+    assert (code, err) == (0, "") and (found["left_out"], found["rule"]) == (3, "max/adaptive")
+    middle = (found["cut_percentile"] + found["lowest_percentile"]) / 2
+    assert found["threshold"] == pytest.approx(middle, abs=1e-5)
+    swept = [round(0.8 + n / 100, 2) for n in range(20)]
+    assert [trial["threshold"] for trial in found["sweep"][::4]] == swept
     # Units return in many buffers, and cuts under several conditions: each counts once.
-    rows = list(split.manifests(condition="k7"))
+    rows = list(load_split(indexed).manifests(condition="k7"))
     pairs = {(a.source, b.source) for m in rows for a, b in pairwise(m.sessions)}
     assert len(found["cuts"]) == len(pairs)
     assert len(found["lowest"]) == len({s.source for m in rows for s in m.sessions})
-    assert {one["family"] for one in found["held_out"]} == set(split.families)
+    assert [one["family"] for one in found["held_out"]] == list(FAMILIES)

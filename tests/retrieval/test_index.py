@@ -8,16 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.retrieval import (
-    EPISODE,
-    QUIET,
-    Interrupted,
-    TwoSums,
-    files_of,
-    make_index,
-    remade,
-    roots_of,
-)
+from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, make_index, remade
+from support.splits import QUERIES, UNITS
 
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.embeddings import EmbeddingIndex, normalised
@@ -31,38 +23,28 @@ from robomme_interference_data.files import LocalFiles, hold
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.select import measure
-from robomme_interference_data.retrieval.selector import Selector
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "index"
-
-
-def frames_in(split: Path) -> list[int]:
-    """Stored frames of both datasets."""
-    datasets = load_split(split).datasets
-    return [sum(r.length for r in datasets[p.name].records()) for p in roots_of(split)]
-
-
-def drop(split: Path, kind: str = "*") -> None:
-    for path in split.glob(f"{kind}/index"):
-        shutil.rmtree(path)
-
+GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 
 # --- what it holds -----------------------------------------------------------------------------
 
 
 def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
-    buffer = load_buffer(EPISODE, "k3", split=indexed)
+    buffer = load_buffer(QUERIES[0], "k3", split=indexed)
     found = buffer.embeddings("thumbnail")
-    assert found.dtype == np.float16 and found.shape == (len(buffer), 528)
+    assert found.dtype == np.float16 and found.shape == (48 + 3 * 32, 528)
     encoder, centre = Thumbnail(), buffer.query.dataset.index("thumbnail").centre
     assert np.array_equal(found, normalised(encoder.prepare(buffer.frames()), centre))
     query = normalised(encoder.prepare(buffer.query.frame()[None]), centre)[0]
     assert np.array_equal(buffer.query.embedding("thumbnail"), query)
+    lesson, unit, *_ = buffer.manifest.sessions
+    turned = remade(indexed, [unit, lesson]).embeddings("thumbnail")
+    assert np.array_equal(turned, np.concatenate([found[48:80], found[:48]]))
 
 
 @pytest.mark.parametrize("condition", ["no-history", "k0", "k3"])
 def test_embeddings_are_the_callers(indexed: Path, condition: str) -> None:
-    buffer = load_buffer(EPISODE, condition, split=indexed)
+    buffer = load_buffer(QUERIES[0], condition, split=indexed)
     once = buffer.embeddings("thumbnail")
     kept = once.copy()
     once += 1
@@ -71,162 +53,133 @@ def test_embeddings_are_the_callers(indexed: Path, condition: str) -> None:
     assert buffer.query.embedding("thumbnail").any()
 
 
-def test_embeddings_of_sessions_in_any_order(indexed: Path) -> None:
-    buffer = load_buffer(EPISODE, "k1", split=indexed)
-    lesson, unit = buffer.manifest.sessions
-    whole = buffer.embeddings("thumbnail")
-    turned = remade(buffer, [unit, lesson]).embeddings("thumbnail")
-    assert np.array_equal(turned, np.concatenate([whole[len(turned) - 32 :], whole[:-32]]))
-
-
-def test_the_centre_is_the_mean_of_the_units(indexed: Path) -> None:
-    units = load_split(indexed).datasets["distractors"]
-    features = []
-    for record in units.records():
-        images = np.empty((record.length, 32, 32, 3), np.uint8)
-        units.read_frames(record.episode_index, "front", 0, images)
-        features.append(Thumbnail().prepare(images))
-    index = load_buffer(EPISODE, "k0", split=indexed).query.dataset.index("thumbnail")
-    expected = np.concatenate(features).mean(axis=0, dtype=np.float64)
-    assert index.centre == pytest.approx(expected, abs=1e-6)
-    assert index.header.pool == units.revision
-
-
-def test_retrieval_does_not_depend_on_other_queries(indexed: Path, split: Path) -> None:
-    # Units alone: what queries there are can have no part in centre and typical cosine.
-    build_index([split / "distractors"], Thumbnail(), QUIET)
+def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path, own_split: Path) -> None:
+    datasets = load_split(indexed).datasets
+    units, images = datasets["distractors"], np.empty((UNITS, 32, 32, 32, 3), np.uint8)
+    for episode in range(UNITS):
+        units.read_frames(episode, "front", 0, images[episode])
+    expected = Thumbnail().prepare(images.reshape(-1, 32, 32, 3)).mean(axis=0, dtype=np.float64)
+    headers = []
+    for dataset in datasets.values():
+        index = dataset.index("thumbnail")
+        assert index.centre == pytest.approx(expected, abs=1e-6)
+        headers.append((index.made, index.header.typical_cosine))
+        assert index.header.pool == units.revision
+    assert headers[0] == headers[1]
+    # Made without any demonstration, they are the same.
+    build_index([own_split / "distractors"], Thumbnail(), QUIET)
     place = "distractors/index/"
-    expected = {k: v for k, v in files_of(indexed).items() if k.startswith(place)}
-    assert files_of(split) == expected
-    headers = [d.index("thumbnail").header for d in load_split(indexed).datasets.values()]
-    assert headers[0].typical_cosine == headers[1].typical_cosine
-    assert headers[0].encoder.sha256 == headers[1].encoder.sha256
+    assert files_of(own_split) == {k: v for k, v in files_of(indexed).items() if place in k}
 
 
-def test_each_camera_has_an_index_of_its_own(split: Path) -> None:
-    make_index(split)
-    once = files_of(split)
-    assert make_index(split, camera="wrist") == frames_in(split)
-    both = files_of(split)
+def test_each_camera_has_an_index_of_its_own(indexed: Path, own_split: Path) -> None:
+    shutil.copytree(indexed, own_split, dirs_exist_ok=True)
+    once = files_of(own_split)
+    assert make_index(own_split, camera="wrist") == FRAMES
+    both = files_of(own_split)
     assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
-    buffer = load_buffer(EPISODE, "k1", split=split)
+    buffer = load_buffer(QUERIES[0], "k1", split=own_split)
     centre = buffer.query.dataset.index("thumbnail", "wrist").centre
     expected = normalised(Thumbnail().prepare(buffer.frames("wrist")), centre)
     found = buffer.embeddings("thumbnail", "observation.images.wrist")
     assert np.array_equal(found, expected)
-    selector = Selector("thumbnail", camera="wrist")
-    assert (selector.name, selector.camera) == ("thumbnail@wrist/max/adaptive", "wrist")
     live = normalised(Thumbnail().prepare(buffer.query.frame("wrist")[None]), centre)[0]
     measured = measure(buffer, "thumbnail", "wrist")
     assert np.array_equal(measured.alike, measure(buffer, "thumbnail", "wrist", live).alike)
-    for path in split.glob("*/index/thumbnail@wrist"):
-        shutil.rmtree(path)
-    with pytest.raises(MissingIndexError, match="camera 'wrist'") as caught:
-        load_buffer(EPISODE, "k1", split=split).embeddings("thumbnail", "wrist")
-    assert str(caught.value.hint).endswith("--encoder thumbnail --camera wrist")
 
 
 # --- how it is made ----------------------------------------------------------------------------
 
 
-def test_an_index_is_the_same_bytes_every_time(indexed: Path, split: Path) -> None:
-    assert make_index(split, threads=3) == frames_in(split)
-    assert files_of(split) == files_of(indexed)
-    assert make_index(split) == [0, 0]  # it is there and right
-    assert make_index(split, force=True) == frames_in(split)
-    assert files_of(split) == files_of(indexed)
+def test_an_index_is_the_same_bytes_every_time(indexed: Path, own_split: Path) -> None:
+    assert make_index(own_split, threads=3) == FRAMES
+    assert files_of(own_split) == files_of(indexed)
+    assert make_index(own_split) == [0, 0]  # it is there and right
+    assert make_index(own_split, force=True) == FRAMES
+    assert files_of(own_split) == files_of(indexed)
 
 
-def test_an_interrupted_run_goes_on(indexed: Path, split: Path) -> None:
+def test_an_interrupted_run_goes_on(indexed: Path, own_split: Path) -> None:
     # Units come first, two batches of 16 each: three are done, and the first of the fourth.
     with pytest.raises(KeyboardInterrupt):
-        make_index(split, Interrupted(after=7))
+        make_index(own_split, Interrupted(after=7))
     with pytest.raises(MissingIndexError):
-        load_buffer(EPISODE, "k0", split=split).embeddings("thumbnail")
-    demonstrations, units = frames_in(split)
-    assert make_index(split) == [demonstrations, units - 3 * 32]
-    assert files_of(split) == files_of(indexed)
+        load_buffer(QUERIES[0], "k0", split=own_split).embeddings("thumbnail")
+    assert make_index(own_split) == [FRAMES[0], FRAMES[1] - 3 * 32]
+    assert files_of(own_split) == files_of(indexed)
 
 
-def test_an_interrupted_run_of_another_batch_is_not_gone_on_with(
-    split: Path, indexed: Path
-) -> None:
+def test_what_another_batch_left_is_not_gone_on_with(indexed: Path, own_split: Path) -> None:
     other = Interrupted(after=9)
     other.batch = 8
     with pytest.raises(KeyboardInterrupt):
-        make_index(split, other)
-    assert make_index(split) == frames_in(split)
-    assert files_of(split) == files_of(indexed)
-
-
-def test_each_dataset_is_made_by_itself(indexed: Path, split: Path) -> None:
-    make_index(split)
-    demonstrations, units = frames_in(split)
-    for kind, embedded in (("distractors", [0, units]), ("demonstrations", [demonstrations, 0])):
-        drop(split, kind)
-        assert make_index(split) == embedded
-        assert files_of(split) == files_of(indexed)
-
-
-def test_an_index_of_another_device_is_kept(split: Path) -> None:
-    make_index(split)
-    computed = {"in": "cuda, bfloat16", "batch": 32}
-    for path in split.glob("*/index/thumbnail/index.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"computed": computed}))
-    reports = build_index(roots_of(split), Thumbnail(), QUIET)
-    assert [r.embedded for r in reports] == [0, 0]
-    assert [r.header.computed for r in reports] == [computed] * 2
-    assert make_index(split, force=True) == frames_in(split)
+        make_index(own_split, other)
+    assert make_index(own_split) == FRAMES
+    assert files_of(own_split) == files_of(indexed)
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["chunk-000/episode-000003.npy", "SHA256SUMS", "centre.npy", "index.json", "stray.txt"],
+    ("name", "again"),
+    [
+        ("distractors", [0, FRAMES[1]]),
+        ("demonstrations", [FRAMES[0], 0]),
+        ("distractors/index/thumbnail/chunk-000/episode-000003.npy", [0, FRAMES[1]]),
+        ("distractors/index/thumbnail/SHA256SUMS", [0, FRAMES[1]]),
+        ("distractors/index/thumbnail/index.json", [0, FRAMES[1]]),
+        ("demonstrations/index/thumbnail/centre.npy", [FRAMES[0], 0]),
+        ("demonstrations/index/thumbnail/stray.txt", [FRAMES[0], 0]),
+    ],
 )
-def test_a_damaged_index_is_made_again(indexed: Path, split: Path, name: str) -> None:
-    shutil.copytree(indexed, split, dirs_exist_ok=True)
-    path = split / "distractors" / "index" / "thumbnail" / name
-    path.write_bytes((path.read_bytes()[:-2] if path.exists() else b"") + b"xx")
-    assert make_index(split)[1] == frames_in(split)[1]
-    assert files_of(split) == files_of(indexed)
+def test_what_is_missing_or_damaged_is_made_again(
+    indexed: Path, own_split: Path, name: str, again: list[int]
+) -> None:
+    shutil.copytree(indexed, own_split, dirs_exist_ok=True)
+    path = own_split / name
+    if path.is_dir():
+        shutil.rmtree(path / "index")
+    else:
+        path.write_bytes((path.read_bytes()[:-2] if path.exists() else b"") + b"xx")
+    assert make_index(own_split) == again
+    assert files_of(own_split) == files_of(indexed)
 
 
-def test_other_units_make_it_anew(split: Path) -> None:
-    # As if the units had changed: the demonstrations' centre is of others.
-    make_index(split)
-    header = split / "demonstrations/index/thumbnail/index.json"
-    header.write_text(json.dumps(json.loads(header.read_text()) | {"pool": "0" * 64}))
-    assert make_index(split) == [frames_in(split)[0], 0]
+def test_an_index_of_another_device_is_kept_one_of_other_units_is_not(
+    indexed: Path, own_split: Path
+) -> None:
+    shutil.copytree(indexed, own_split, dirs_exist_ok=True)
+    header = own_split / "demonstrations/index/thumbnail/index.json"
+    whole = json.loads(header.read_text())
+    header.write_text(json.dumps(whole | {"computed": {"in": "cuda, bfloat16", "batch": 32}}))
+    assert make_index(own_split) == [0, 0]
+    header.write_text(json.dumps(whole | {"pool": "0" * 64}))
+    assert make_index(own_split) == [FRAMES[0], 0]
 
 
 # --- refusals ----------------------------------------------------------------------------------
 
 
-def test_what_is_not_finite_is_not_stored(split: Path) -> None:
+def test_what_cannot_be_embedded(own_split: Path) -> None:
     class Holed(Thumbnail):
         def features(self, prepared: Any) -> Any:
             prepared[-1, 5] = np.inf
             return prepared
 
-    with pytest.raises(BuildError, match=r"not finite for \w+/train/\d"):
-        make_index(split, Holed())
-    assert not list(split.glob("*/index/thumbnail"))
-
-
-def test_an_encoder_that_breaks_is_told(split: Path) -> None:
     class Broken(Thumbnail):
         def features(self, prepared: Any) -> Any:
             raise RuntimeError("out of memory")
 
+    with pytest.raises(BuildError, match=r"not finite for \w+/train/\d"):
+        make_index(own_split, Holed())
     with pytest.raises(BuildError, match=r"/train/\d cannot be embedded: .*out of memory"):
-        make_index(split, Broken())
+        make_index(own_split, Broken())
+    assert not list(own_split.glob("*/index/thumbnail"))
 
 
-def test_two_do_not_make_one_index(split: Path) -> None:
-    folder = split / "demonstrations" / "index" / ".thumbnail"
+def test_two_do_not_make_one_index(own_split: Path) -> None:
+    folder = own_split / "demonstrations" / "index" / ".thumbnail"
     folder.mkdir(parents=True)
     with hold(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
-        make_index(split)
+        make_index(own_split)
 
 
 def test_what_cannot_be_indexed(tiny_split: Path) -> None:
@@ -242,27 +195,27 @@ def test_what_cannot_be_indexed(tiny_split: Path) -> None:
 # --- the files ---------------------------------------------------------------------------------
 
 
-def test_the_files_are_the_golden_ones(split: Path) -> None:
+def test_the_files_are_the_golden_ones(own_split: Path) -> None:
     """A change here is a change of the format: `docs/format.md`, and the format version."""
-    make_index(split, TwoSums())
-    written = split / "distractors" / "index" / "thumbnail"
-    golden = GOLDEN / "index" / "thumbnail"
+    build_index([own_split / "distractors"], TwoSums(), QUIET)
+    written = own_split / "distractors" / "index"
     if os.environ.get("UPDATE_GOLDEN"):
-        shutil.rmtree(golden, ignore_errors=True)
-        shutil.copytree(written, golden)
-    for folder in (written, golden):
-        names = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
-        if folder == written:
-            found = names
-    assert found.keys() == names.keys()
-    for name, path in names.items():
-        assert found[name].read_bytes() == path.read_bytes(), name
+        shutil.rmtree(GOLDEN, ignore_errors=True)
+        shutil.copytree(written, GOLDEN / "golden" / "index")
+    assert (
+        files_of(own_split).items()
+        == {
+            name.replace("golden/", "distractors/"): content
+            for name, content in files_of(GOLDEN).items()
+        }.items()
+    )
 
 
 def test_a_golden_index_is_read() -> None:
-    header = json.loads((GOLDEN / "index" / "thumbnail" / "index.json").read_text())
-    index = EmbeddingIndex(LocalFiles(GOLDEN), header["revision"], "thumbnail")
-    index.check(dict.fromkeys(range(header["frames"] // 32), 32))
+    files = LocalFiles(GOLDEN / "golden")
+    header = json.loads(files.path("index/thumbnail/index.json").read_text())
+    index = EmbeddingIndex(files, header["revision"], "thumbnail")
+    index.check(dict.fromkeys(range(UNITS), 32))
     found = index.span(6, 30, 32)
     assert found.shape == (2, 3) and found.dtype == np.float16
     assert np.linalg.norm(found.astype(float), axis=1) == pytest.approx([1, 1], abs=2e-3)

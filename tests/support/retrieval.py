@@ -1,27 +1,26 @@
 """Indexes, buffers with other sessions than planned, and cosines made up by hand."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from support.splits import QUERIES, with_sessions
 
-from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry
+from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_split
 from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.records import place_sessions
-from robomme_interference_data.retrieval.encoders import make_encoder
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
 from robomme_interference_data.retrieval.select import Measured
 
 QUIET = WorkProgress(quiet=True)
-EPISODE = "VideoRepick/test/0"
-
-
-# --- indexes -----------------------------------------------------------------------------------
+FRAMES = [3 * 49, 17 * 32]
+"""Stored frames of the golden split: demonstrations and units."""
 
 
 class TwoSums:
@@ -54,14 +53,10 @@ class Interrupted(Thumbnail):
         return prepared
 
 
-def roots_of(split: Path) -> list[Path]:
-    return [split / DEMONSTRATIONS, split / DISTRACTORS]
-
-
 def make_index(split: Path, encoder: Any = None, **options: Any) -> list[int]:
     """Make the index; returns how many frames of each dataset were embedded now."""
-    made = make_encoder("thumbnail") if encoder is None else encoder
-    reports = build_index(roots_of(split), made, QUIET, **options)
+    roots = [split / DEMONSTRATIONS, split / DISTRACTORS]
+    reports = build_index(roots, encoder or Thumbnail(), QUIET, **options)
     return [report.embedded for report in reports]
 
 
@@ -71,29 +66,15 @@ def files_of(split: Path) -> dict[str, bytes]:
     return {path.relative_to(split).as_posix(): path.read_bytes() for path in found}
 
 
-# --- buffers -----------------------------------------------------------------------------------
-
-
-def remade(buffer: Buffer, entries: Sequence[SessionEntry], **changes: Any) -> Buffer:
-    """The buffer with other sessions."""
-    lessons = [entry.num_frames for entry in entries if entry.role == "lesson"]
-    manifest = replace(
-        buffer.manifest,
-        sessions=tuple(entries),
-        lesson_frames=sum(lessons),
-        history_frames=sum(entry.num_frames for entry in entries),
-        **changes,
-    )
-    return Buffer(manifest, buffer.query, buffer._datasets)
-
-
-# --- cosines -----------------------------------------------------------------------------------
-
-SESSIONS = ((0, 6), (6, 11), (11, 15))
+def remade(split: Path, entries: Iterable[SessionEntry], **changes: Any) -> Buffer:
+    """The k3 buffer of the first query with other sessions."""
+    opened = load_split(split)
+    manifest = with_sessions(opened.manifest(QUERIES[0], "k3"), *entries)
+    return Buffer(replace(manifest, **changes), opened.query(QUERIES[0]), opened.datasets)
 
 
 def sessions_of(names: Sequence[str], spans: Sequence[Span], lessons: Sequence[int]) -> Any:
-    """Sessions of these episodes and lengths; those of the given numbers are of the lesson."""
+    """Sessions of these episodes in these places; those of the given numbers are of the lesson."""
     entries = []
     for number, (name, (start, stop)) in enumerate(zip(names, spans, strict=True)):
         source = EpisodeId.parse(name)
@@ -104,20 +85,28 @@ def sessions_of(names: Sequence[str], spans: Sequence[Span], lessons: Sequence[i
     return place_sessions(tuple(entries))
 
 
+def number_of(text: str) -> int:
+    """A number for an episode, for each another: what is stored is told apart by it."""
+    return int.from_bytes(text.encode()) % 10**8
+
+
 def made(
     episode: str = "MoveCube/test/0",
     condition: str = "k2",
     *,
     cuts: dict[int, float],
     high: dict[int, float],
-    spans: tuple[Span, ...] = SESSIONS,
+    spans: tuple[Span, ...] = ((0, 6), (6, 11), (11, 15)),
     lessons: Sequence[int] = (0,),
-    typical: float = 0.0,
     units: tuple[str, ...] = (),
 ) -> Measured:
     """A buffer whose adjacent cosines are 1 but before `cuts`, and 0 with the query but at `high`.
 
     Args:
+        episode: The query.
+        condition: The condition.
+        cuts: Cosine of the frame before with this one.
+        high: Cosine of a frame with the query.
         spans: Where its sessions lie.
         lessons: Which of them are of the lesson.
         units: Sources of the others; its own if none are given.
@@ -132,24 +121,13 @@ def made(
     others = iter(units or own)
     names = [episode if n in lessons else next(others) for n in range(len(spans))]
     sessions: tuple[Session, ...] = sessions_of(names, spans, lessons)
-    return Measured(EpisodeId.parse(episode), condition, sessions, adjacent, alike, typical)
+    return Measured(EpisodeId.parse(episode), condition, sessions, adjacent, alike, 0.0)
 
 
-def number_of(text: str) -> int:
-    """A number for an episode, for each another: what is stored is told apart by it."""
-    return int.from_bytes(text.encode()) % 10**8
-
-
-def embedded(history: np.ndarray, query: np.ndarray, lesson: Span | None = None) -> Measured:
-    """A buffer of these embeddings, in one session, or a lesson and what is around it."""
-    spans = [(0, len(history))] if len(history) else []
-    lessons: list[int] = []
-    if lesson is not None:
-        edges = sorted({0, *lesson, len(history)})
-        spans = list(zip(edges, edges[1:], strict=False))
-        lessons = [spans.index(lesson)]
-    names = ["MoveCube/test/0"] * len(spans)
-    sessions = sessions_of(names, spans, lessons)
-    alike = cosines(history, query)
-    episode = EpisodeId.parse("MoveCube/test/0")
+def embedded(history: np.ndarray, query: np.ndarray, lesson: Span = (0, 0)) -> Measured:
+    """A buffer of these embeddings: a lesson and what is around it."""
+    spans = list(pairwise(sorted({0, *lesson, len(history)})))
+    lessons = [spans.index(lesson)] if lesson in spans else []
+    sessions = sessions_of(["MoveCube/test/0"] * len(spans), spans, lessons)
+    episode, alike = EpisodeId.parse("MoveCube/test/0"), cosines(history, query)
     return Measured(episode, "k2", sessions, adjacent_cosines(history), alike, 0.0)

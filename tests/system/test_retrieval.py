@@ -7,7 +7,6 @@ import av
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
 from support.retrieval import QUIET, embedded, files_of
 
 from robomme_interference_data.embeddings import normalised

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.retrieval import EPISODE, make_index
+from support.retrieval import make_index
+from support.splits import QUERIES
 
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.embeddings import normalised
@@ -68,16 +69,15 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
     assert encoder.fingerprint["transformers"] == transformers.__version__
 
 
-def test_siglip_makes_an_index(tiny_split: Path, tmp_path: Path, model: str) -> None:
-    split = shutil.copytree(tiny_split, tmp_path / "split")
+def test_siglip_makes_an_index(own_split: Path, model: str) -> None:
     encoder = make_encoder(model, device="cpu")
-    make_index(split, encoder)
-    demonstrations = load_split(split).datasets["demonstrations"]
+    make_index(own_split, encoder)
+    demonstrations = load_split(own_split).datasets["demonstrations"]
     index, length = demonstrations.index(model), demonstrations.record(0).length
     found = index.span(0, 0, length)
     assert found.shape == (length, 32) and index.centre is None
     assert np.linalg.norm(found.astype(np.float32), axis=1) == pytest.approx(1, abs=2e-3)
-    buffer = load_buffer(EPISODE, "k1", split=split)
+    buffer = load_buffer(QUERIES[0], "k1", split=own_split)
     selector = Selector(model, device="cpu")
     assert selector.name == "siglip-tiny/max/adaptive"
     live = encoder.features(encoder.prepare(buffer.query.frame()[None]))
