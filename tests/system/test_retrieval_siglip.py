@@ -95,39 +95,33 @@ def test_a_worker_process_loads_the_model_itself(model: str) -> None:
     assert (again.name, again.batch, again.fingerprint) == (encoder.name, 3, encoder.fingerprint)
 
 
-def test_other_weights_are_another_encoder(model: str, tmp_path: Path) -> None:
+def test_other_weights_or_settings_are_another_encoder(model: str, tmp_path: Path) -> None:
     import torch
     from transformers import SiglipVisionModel
 
     folder = Path(model.partition(":")[2])
-    changed = shutil.copytree(folder, tmp_path / "tiny")
-    vision = SiglipVisionModel.from_pretrained(changed)
+    image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
+
+    def changed(path: Path) -> set[str]:
+        """What differs in the fingerprint; they are told apart because they see differently."""
+        one, other = (make_encoder(f"siglip:{place}", device="cpu") for place in (folder, path))
+        rows = [encoder.features(encoder.prepare(image)) for encoder in (one, other)]
+        assert not np.array_equal(*rows)
+        return {key for key in one.fingerprint if one.fingerprint[key] != other.fingerprint[key]}
+
+    weights = shutil.copytree(folder, tmp_path / "weights")
+    vision = SiglipVisionModel.from_pretrained(weights)
     with torch.no_grad():
         next(vision.parameters()).add_(0.01)
-    vision.save_pretrained(changed)
-    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
-    assert one.fingerprint["weights_sha256"] != other.fingerprint["weights_sha256"]
-
-
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [("num_attention_heads", 4), ("hidden_act", "relu"), ("layer_norm_eps", 0.5)],
-)
-def test_other_settings_are_another_encoder(
-    setting: str, value: object, model: str, tmp_path: Path
-) -> None:
-    folder = Path(model.partition(":")[2])
-    changed = shutil.copytree(folder, tmp_path / "tiny")
-    config = json.loads((changed / "config.json").read_text())
-    config["vision_config"][setting] = value
-    (changed / "config.json").write_text(json.dumps(config))
-    one, other = (make_encoder(f"siglip:{path}", device="cpu") for path in (folder, changed))
-    differing = {key for key in one.fingerprint if one.fingerprint[key] != other.fingerprint[key]}
-    assert differing == {"tower"} and other.fingerprint["tower"][setting] == value
-    # They are told apart because they see differently.
-    image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
-    rows = [encoder.features(encoder.prepare(image)) for encoder in (one, other)]
-    assert not np.array_equal(*rows)
+    vision.save_pretrained(weights)
+    assert changed(weights) == {"weights_sha256"}
+    settings = {"num_attention_heads": 4, "hidden_act": "relu", "layer_norm_eps": 0.5}
+    for setting, value in settings.items():
+        path = shutil.copytree(folder, tmp_path / setting)
+        config = json.loads((path / "config.json").read_text())
+        config["vision_config"][setting] = value
+        (path / "config.json").write_text(json.dumps(config))
+        assert changed(path) == {"tower"}
 
 
 def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) -> None:
