@@ -19,23 +19,24 @@ _DIGITS = 6
 _SAMPLE = 1024
 
 
-def cosines(embeddings: NDArray[np.float16], query: NDArray[np.floating]) -> NDArray[np.float32]:
+def cosines(embeddings: NDArray[np.floating], query: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the cosine of each embedding with one, `(T,) float32`.
 
     Args:
-        embeddings: `(T, D) float16`, each of length 1.
+        embeddings: `(T, D)`, each of length 1.
         query: `(D,)`, of length 1.
     """
-    return np.round(embeddings.astype(np.float32) @ query.astype(np.float32), _DIGITS)
+    rows = embeddings.astype(np.float32, copy=False)
+    return np.round(rows @ query.astype(np.float32), _DIGITS)
 
 
-def adjacent_cosines(embeddings: NDArray[np.float16]) -> NDArray[np.float32]:
+def adjacent_cosines(embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the cosine of each frame with the next, `(T - 1,) float32`; none of no frames.
 
     Args:
-        embeddings: `(T, D) float16`, each of length 1.
+        embeddings: `(T, D)`, each of length 1.
     """
-    rows = embeddings.astype(np.float32)
+    rows = embeddings.astype(np.float32, copy=False)
     return np.round(np.einsum("td,td->t", rows[:-1], rows[1:]), _DIGITS)
 
 

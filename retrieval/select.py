@@ -175,7 +175,7 @@ def measure(
     Raises:
         MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
     """
-    embeddings = buffer.embeddings(encoder, camera)
+    embeddings = buffer.embeddings(encoder, camera).astype(np.float32)
     return Measured(
         buffer.episode_id,
         buffer.condition,
