@@ -80,7 +80,7 @@ class Rule:
         if self.method not in METHODS:
             what = f"there is no method {self.method!r}"
             raise UnknownNameError(what, nearest(self.method, METHODS))
-        if self.cut != ADAPTIVE and not (isinstance(self.cut, float) and -1 <= self.cut <= 1):
+        if self.cut != ADAPTIVE and not (isinstance(self.cut, float | int) and -1 <= self.cut <= 1):
             expected = f"a cosine, from −1 to 1, or {ADAPTIVE}, such as max/0.923"
             raise InvalidOptionError.expected(f"the cut of {self.method}", self.cut, expected)
 
@@ -111,7 +111,7 @@ class Rule:
 
     def __str__(self) -> str:
         """Return what `parse` reads, with every digit of the cut."""
-        cut = ADAPTIVE if self.cut == ADAPTIVE else repr(self.cut).removesuffix(".0")
+        cut = ADAPTIVE if self.cut == ADAPTIVE else repr(float(self.cut)).removesuffix(".0")
         return f"{self.method}/{cut}"
 
 

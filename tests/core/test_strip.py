@@ -19,7 +19,7 @@ from support.splits import QUERIES
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError, UnknownNameError
-from robomme_interference_data.page import ink_on, open_page, tint
+from robomme_interference_data.page import ink_on, open_page
 from robomme_interference_data.sampling import spread
 from robomme_interference_data.strip import (
     COLORS,
@@ -131,11 +131,6 @@ def test_text_on_a_color_has_the_contrast_of_wcag_aa(color: str) -> None:
     ink = {"black": "#000000", "white": "#ffffff"}[ink_on(color)]
     dark, light = sorted((luminance(color), luminance(ink)))
     assert (light + 0.05) / (dark + 0.05) >= 4.5
-
-
-def test_tint() -> None:
-    # 255 · (1 − 0.5 · (1 − 0)) = 127.5 and 255 · (1 − 0.5 · (1 − 1)) = 255.
-    assert tint("#00ff00", 0.5) == "#80ff80"
 
 
 # --- pictures ----------------------------------------------------------------------------------

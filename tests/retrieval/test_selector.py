@@ -25,13 +25,6 @@ def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
         chosen = selector.select(buffer, buffer.query.frame())
         stored = choose(measure(buffer, "thumbnail"), selector.rule)
         assert (chosen.start, chosen.stop) == stored.span
-        # An even sample of the span with the live observation as the last of its frames.
-        roles = [*buffer.session_index[chosen.start : chosen.stop], -1]
-        count = min(len(roles), 32)
-        sample = [roles[j * (len(roles) - 1) // (count - 1)] for j in range(count)]
-        assert chosen.lesson_fraction == sample.count(0) / count
-        assert chosen.filler_fraction == sum(role > 0 for role in sample) / count
-        assert chosen.query_fraction == 1 / count
 
 
 def test_fractions_wherever_the_lesson_lies(indexed: Path) -> None:

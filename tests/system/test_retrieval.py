@@ -43,33 +43,14 @@ def episodes(shared_data: Path) -> Features:
     return features
 
 
-def unit(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a distractor unit keeps of a lesson."""
-    return features[:-1][:256:8]
-
-
-def centre_of(pool: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The mean of a pool, each episode weighing the same."""
-    return np.mean([one.mean(axis=0, dtype=np.float64) for one in pool], axis=0).astype(np.float32)
-
-
-def test_the_right_lessons_nearest_frame_is_nearest(episodes: Features) -> None:
-    for family, own in episodes.items():
-        centre = centre_of([unit(other) for name, other in episodes.items() if name != family])
-        query = normalised(own[-1:], centre)[0].astype(np.float32)
-        nearest = {
-            name: float((normalised(other[:-1], centre).astype(np.float32) @ query).max())
-            for name, other in episodes.items()
-        }
-        assert max(nearest, key=lambda name: nearest[name]) == family, nearest
-
-
 def test_the_lesson_is_chosen_among_eight_sessions(episodes: Features) -> None:
     # Without true boundaries; centre and adaptive cut come from the other families' units.
     purities, coverages = [], []
     for family, own in episodes.items():
-        pool = [unit(other) for name, other in episodes.items() if name != family]
-        centre = centre_of(pool)
+        # What a distractor unit keeps of a lesson; each weighs the same in the mean.
+        pool = [other[:-1][:256:8] for name, other in episodes.items() if name != family]
+        means = [one.mean(axis=0, dtype=np.float64) for one in pool]
+        centre = np.mean(means, axis=0).astype(np.float32)
         units = [normalised(one, centre) for one in pool]
         typical = typical_cosine(len(units), units.__getitem__)
         rows = normalised(own, centre)
