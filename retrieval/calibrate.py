@@ -125,9 +125,7 @@ def _shares(*endings: str) -> list[Column]:
     ]
 
 
-def calibrate(
-    measured: Sequence[Measured], rule: Rule, thresholds: Sequence[float]
-) -> Calibration:
+def calibrate(measured: Sequence[Measured], rule: Rule, thresholds: Sequence[float]) -> Calibration:
     """Fit a threshold, refit it without each family, and try others.
 
     Args:

@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.conditions import in_order
+from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.page import GREY, INK, open_figure, save_figure, tidy
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell
@@ -50,7 +50,8 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
             axes.set_title(head, size=8, color=INK)
             for number, (label, share, here) in enumerate(lines):
                 shift = 0.08 * (number - (len(lines) - 1) / 2)
-                _line(axes, names, here, share, label, number, shift)
+                places = {name: place + shift for place, name in enumerate(names)}
+                _line(axes, here, share, label, number, places)
             axes.set_xticks(range(len(names)), names)
             _percent(axes)
         for axes in grid[:, 0]:
@@ -69,23 +70,17 @@ def _most(cells: Sequence[Cell]) -> int:
 
 
 def _line(
-    axes: Any,
-    names: Sequence[str],
-    cells: Sequence[Cell],
-    share: str,
-    label: str,
-    number: int,
-    shift: float,
+    axes: Any, cells: Sequence[Cell], share: str, label: str, number: int, places: dict[str, float]
 ) -> None:
     """Draw a share by condition; conditions of different kinds are not joined."""
     colour, line = _COLOURS[number % len(_COLOURS)], _LINES[number % 2]
     style = {"color": colour, "marker": _MARKERS[number % len(_MARKERS)], "markersize": 4}
-    for _, group in groupby(cells, key=lambda cell: in_order([cell.condition])[0].kind.name):
-        found = [(names.index(cell.condition) + shift, cell) for cell in group]
-        values = [100 * getattr(cell, share) for _, cell in found]
-        places = [place for place, _ in found]
-        axes.plot(places, values, linewidth=1.4, linestyle=line, label=label, **style)
-        for place, cell in found:
+    for _, group in groupby(cells, key=lambda cell: parse_condition(cell.condition).kind):
+        found = list(group)
+        values = [100 * getattr(cell, share) for cell in found]
+        x = [places[cell.condition] for cell in found]
+        axes.plot(x, values, linewidth=1.4, linestyle=line, label=label, **style)
+        for place, cell in zip(x, found, strict=True):
             low, high = getattr(cell, f"{share}_low"), getattr(cell, f"{share}_high")
             if low is not None:
                 axes.plot((place, place), (100 * low, 100 * high), color=colour, linewidth=1)

@@ -55,7 +55,13 @@ class Siglip:
     def __init__(
         self, model: str = PAPER_ENCODER, *, device: str | None = None, batch: int | None = None
     ):
-        torch, transformers = _libraries()
+        try:
+            import PIL  # noqa: F401 - the image processor needs it
+            import torch
+            import transformers
+        except ImportError as error:
+            library = f"torch, transformers and Pillow ({error})"
+            raise MissingExtraError.needs("the encoder siglip", library, "retrieval") from error
         self._given = model, device, batch
         self._torch = torch
         self._transformers_version = str(transformers.__version__)
@@ -78,7 +84,9 @@ class Siglip:
         with _quiet(transformers):
             self._vision, self._processor = _load(transformers, model, folder)
         self._weights_sha256 = _weights_digest(self._vision)
-        self._dtype = self._precision()
+        self._dtype = torch.float32
+        if self._device.type == "cuda":
+            self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
         self._vision.to(self._device, self._dtype)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -120,23 +128,6 @@ class Siglip:
             pooled = self._vision(**inputs).pooler_output
         return pooled.float().cpu().numpy()
 
-    def _precision(self) -> Any:
-        if self._device.type != "cuda":
-            return self._torch.float32
-        supported = self._torch.cuda.is_bf16_supported()
-        return self._torch.bfloat16 if supported else self._torch.float16
-
-
-def _libraries() -> tuple[Any, Any]:
-    try:
-        import PIL  # noqa: F401 - the image processor needs it
-        import torch
-        import transformers
-    except ImportError as error:
-        library = f"torch, transformers and Pillow ({error})"
-        raise MissingExtraError.needs("the encoder siglip", library, "retrieval") from error
-    return torch, transformers
-
 
 @contextmanager
 def _quiet(transformers: Any) -> Iterator[None]:
@@ -161,16 +152,15 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
         kind = transformers.AutoConfig.from_pretrained(folder).model_type
         classes = {
             "siglip": transformers.SiglipVisionModel,
-            "siglip_vision_model": transformers.SiglipVisionModel,
             "siglip2": transformers.Siglip2VisionModel,
-            "siglip2_vision_model": transformers.Siglip2VisionModel,
         }
-        if kind not in classes:
+        tower = classes.get(kind.removesuffix("_vision_model"))
+        if tower is None:
             raise FormatError(
                 f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
                 f"For example: --encoder siglip:{PAPER_ENCODER}",
             )
-        vision, loading = classes[kind].from_pretrained(
+        vision, loading = tower.from_pretrained(
             folder, dtype="float32", local_files_only=True, output_loading_info=True
         )
         # transformers would make up what the file lacks, at random.
