@@ -1,12 +1,19 @@
-"""Image encoders: the thumbnail by hand, and the folders that encoders are known by."""
+"""Image encoders: the thumbnail by hand, names, and the folders that encoders are known by."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.embeddings import encoder_id, index_folder, normalised
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.retrieval.encoders import (
+    encoder_digest,
+    encoder_name,
+    make_encoder,
+    published_threshold,
+)
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 
 
@@ -21,7 +28,7 @@ def test_thumbnail_by_hand() -> None:
     assert not right.any()
     steps = below.reshape(7, 8, 3)
     assert steps[3].tolist() == [[1, 0, 0]] * 8 and steps.sum() == 8
-    with pytest.raises(InvalidOptionError, match="4 × 9 pixels"):
+    with pytest.raises(InvalidOptionError, match=r"pixels \(4, 9\)"):
         encoder.prepare(np.zeros((1, 4, 9, 3), np.uint8))
 
 
@@ -39,6 +46,12 @@ def test_normalising() -> None:
     assert rows[0] == pytest.approx([0.6, 0.8], abs=1e-3)
     # Nothing is left of the centre itself.
     assert normalised(np.array([[1, 1]]), np.array([1, 1], np.float32)).tolist() == [[0, 0]]
+
+
+def test_a_digest_is_of_encoder_and_centre() -> None:
+    encoder, centre = Thumbnail(), np.zeros(3, np.float32)
+    digests = {encoder_digest(encoder, one) for one in (None, centre, centre + 1)}
+    assert len(digests) == 3 and encoder_digest(Thumbnail(), centre.copy()) in digests
 
 
 @pytest.mark.parametrize(
@@ -67,3 +80,26 @@ def test_a_model_in_a_folder_is_called_by_its_name(
         assert encoder_id(f"siglip:{model}") == "siglip:tiny"
         assert index_folder(f"siglip:{model}") == "index/siglip-tiny"
     assert index_folder("siglip:/") == "index/siglip-"  # not the paper's model
+
+
+def test_names_of_encoders() -> None:
+    assert encoder_name(f"siglip:{PAPER_ENCODER}") == encoder_name("siglip") == "siglip"
+    assert published_threshold(f"siglip:{PAPER_ENCODER}") == 0.923
+    # At a revision it is the same model, and the revision is kept for loading it.
+    assert published_threshold(f"siglip:{PAPER_ENCODER}@main") == 0.923
+    assert encoder_name(f"siglip:{PAPER_ENCODER}@main") == f"siglip:{PAPER_ENCODER}@main"
+    assert published_threshold("siglip:google/siglip2-base-patch16-224") is None
+    assert published_threshold("thumbnail") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("thumbnial", UnknownNameError, "'thumbnail'"),
+        ("thumbnail:x", InvalidOptionError, "encoder 'thumbnail:x'"),
+        ("siglip:", InvalidOptionError, "id or folder of a model"),
+    ],
+)
+def test_names_that_are_none(name: str, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        make_encoder(name)
