@@ -7,6 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self, cast
 
+import pyarrow as pa
+
+from robomme_interference_data.rows import arrow_schema, to_dict
+
 __all__ = ["Column", "Kind", "Table", "percent", "points"]
 
 Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
@@ -45,13 +49,22 @@ class Table:
     note: str = ""
 
     @classmethod
-    def of(
+    def make(
         cls, name: str, title: str, columns: str, rows: Iterable[tuple[Any, ...]], note: str = ""
     ) -> Self:
         """Return a table whose columns are given as text, such as `system n:count rate:rate`."""
         named = (column.partition(":") for column in columns.split())
         found = tuple(Column(name, cast(Kind, kind or "text")) for name, _, kind in named)
         return cls(name, title, found, tuple(rows), note)
+
+    @classmethod
+    def of(cls, record: type, rows: Iterable[Any], name: str, title: str) -> Self:
+        """Return records of one type as a table: the columns are those of its Arrow schema."""
+        kinds: dict[Any, Kind] = {pa.int64(): "count", pa.float64(): "ratio", pa.bool_(): "flag"}
+        schema = arrow_schema(record)
+        columns = tuple(Column(field.name, kinds.get(field.type, "text")) for field in schema)
+        plain = map(to_dict, rows)
+        return cls(name, title, columns, tuple(tuple(map(r.get, schema.names)) for r in plain))
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows by column name, NaN as None, for JSON."""

@@ -130,7 +130,7 @@ def rate_table(cells: Iterable[Cell], name: str, title: str, parts: Sequence[str
             bounds = cell.interval if cell.n else (math.nan, math.nan)
             more = (cell.complete, cell.missing, cell.rank)
             rows.append((*own, cell.n, cell.rate, *bounds, *cell.counts, *more))
-    return Table.of(
+    return Table.make(
         name,
         title,
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
@@ -200,7 +200,7 @@ def coverage_table(cubes: Iterable[Cube]) -> Table:
                 lists = (_numbers(cube.episodes, flags) for flags in (missing, errors > 0, other))
                 own = (cube.simulator, cube.systems[s], cube.conditions[c], family)
                 rows.append((*own, due, n, int(errors.sum()), complete, *lists))
-    return Table.of(
+    return Table.make(
         "coverage",
         "Which episodes count",
         "simulator system condition family expected:count n:count errors:count complete:flag "

@@ -78,7 +78,7 @@ def compare(
         )
     notes += _left_out("a", sides[0], dict(met))
     notes += _left_out("b", sides[1], {b: a for a, b in met})
-    table = Table.of(
+    table = Table.make(
         "compare",
         "Two runs compared",
         "simulator system_a system_b family condition n:count rate_a:rate rate_b:rate "

@@ -166,7 +166,7 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
         )
         for c, p in zip(found, stats.holm([one.pairs.p for one in found]), strict=True)
     ]
-    return Table.of(
+    return Table.make(
         "lift",
         "Lift over no history",
         "simulator system condition no_history_of n:count rate:rate no_history_rate:rate "
@@ -192,7 +192,7 @@ def contrast_table(contrasts: Iterable[Contrast]) -> Table:
         )
         for c, p in zip(found, stats.holm([one.pairs.p for one in found]), strict=True)
     ]
-    return Table.of(
+    return Table.make(
         "effects",
         "Effects between conditions",
         "simulator system condition against_system against_condition n:count rate:rate "
@@ -204,7 +204,7 @@ def contrast_table(contrasts: Iterable[Contrast]) -> Table:
 
 def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:
     """Return each system's log-linear decay over the sessions in the buffer (see `effects_of`)."""
-    return Table.of(
+    return Table.make(
         "decay",
         "Decay over sessions",
         "simulator system conditions n:count slope:points low:points high:points complete:flag",
@@ -229,7 +229,7 @@ def noise_table(cubes: Iterable[Cube]) -> Table:
                 flips = int((one != other)[repeated].sum())
                 cell = (cube.simulator, cube.systems[s], cube.conditions[c])
                 rows.append((*cell, pairs, flips, flips / pairs, *stats.wilson(flips, pairs)))
-    return Table.of(
+    return Table.make(
         "noise",
         "Flips between repeats",
         "simulator system condition pairs:count flips:count rate:rate low:rate high:rate",

@@ -95,7 +95,7 @@ def paper_table(cells: Sequence[Cell]) -> Table:
         ours = (cell.system, cell.condition, paper.system, cell.n, cell.rate, *cell.interval)
         change = (cell.rate - paper.rate, *bounds, cell.complete)
         rows.append((*ours, paper.n, paper.rate, *paper.interval, *change))
-    return Table.of(
+    return Table.make(
         "paper",
         "Beside the published rates",
         "system condition published_system n:count rate:rate low:rate high:rate published_n:count "

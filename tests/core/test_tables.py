@@ -6,7 +6,7 @@ import pytest
 
 from robomme_interference_data.tables import Column, Table, percent, points
 
-TABLE = Table.of(
+TABLE = Table.make(
     "rates",
     "Rates of systems",
     "system n:count rate:rate change:points kept:ratio p:p complete:flag",
