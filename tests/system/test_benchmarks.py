@@ -118,6 +118,17 @@ def test_policies(tiny_split: Path) -> None:
     assert is_quotient(decoding[1]["ratio"], decoding[1]["ms"], decoding[0]["ms"])
 
 
+@pytest.mark.slow
+def test_score() -> None:
+    pytest.importorskip("pandas")
+    grid, repeats = printed("score", "--rounds", "1", "--repeats", "2", "--draws", "50")
+    # 11 systems × 5 conditions and one under one condition, × 9 families × 50 episodes
+    assert {row["rows"] for row in grid} == {"25,200"}
+    assert {row["rows"] for row in repeats} == {"50,400"}
+    for row in grid:
+        assert is_quotient(row["× score"], row["s"], grid[0]["s"])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_help_and_refusals(name: str) -> None:
     shown = run(name, "--help")
