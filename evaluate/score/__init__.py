@@ -34,7 +34,7 @@ class Settings:
     rows: tuple[Path, ...] = setting(
         name="-",
         whole=True,
-        metavar="ROWS…",
+        metavar="ROWS",
         help="Folders of runs, or CSV, parquet or jsonl files.",
     )
     system: str | None = setting(None, help="Name of the system of rows that name none.")

@@ -31,10 +31,6 @@ __all__ = ["flips", "load_jinja2", "write_report"]
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 
-_RUN_FIELDS = ("status", "identity", "split", "planned", "counts", "merged")
-_START_FIELDS = ("policy", "versions", "git", "machine")
-"""What is shown of a run's `run.json`, and of the latest start in it, as far as it is there."""
-
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
     Grid.GIVEN: "those that any of the given rows is of",
@@ -174,27 +170,17 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
 
 
 def _source(path: Path, run: Mapping[str, Any] | None) -> dict[str, list[str]]:
-    header = run or {}
-    starts = [one for one in _listed(header.get("starts")) if isinstance(one, dict)]
-    commands = [line for one in starts for line in _listed(one.get("command"))]
-    told = {name: header.get(name) for name in _RUN_FIELDS}
-    told |= {name: one.get(name) for one in starts[-1:] for name in _START_FIELDS}
-    told = {name: value for name, value in told.items() if value not in (None, "", {}, [])}
-    return {
-        "SHA-256": [sha256_file(path)],
-        **({"command": [*dict.fromkeys(map(str, commands))]} if commands else {}),
-        **{name: [_told(value)] for name, value in told.items()},
-    }
-
-
-def _listed(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
-
-
-def _told(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_told(part)}" for name, part in sorted(value.items()))
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    """Return what there is to say of a file: commands to be copied, and all of `run.json`."""
+    facts = {"SHA-256": [sha256_file(path)]}
+    if run is not None:
+        starts = run.get("starts")
+        starts = (
+            [one for one in starts if isinstance(one, dict)] if isinstance(starts, list) else []
+        )
+        lines = [line for one in starts for line in one.get("command") or ()]
+        facts |= {"command": [*dict.fromkeys(map(str, lines))]} if lines else {}
+        facts["run.json"] = [json.dumps(run, indent=2, sort_keys=True, ensure_ascii=False)]
+    return facts
 
 
 def _facts(score: Score, command: str | None) -> dict[str, list[str]]:

@@ -155,7 +155,7 @@ def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
         "500 draws, seeded by the simulator",
         f"Python {platform.python_version()}, robomme-interference-data ",
         *(f"{name} {metadata.version(name)}" for name in ("numpy", "pyarrow", "matplotlib")),
-        "numpy 2.2.0, python 3.12.0",
+        '"numpy": "2.2.0",',
         sha256_file(run / "rollouts.jsonl"),
         made.REVISION,
         "those that any of the given rows is of",
