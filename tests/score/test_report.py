@@ -14,7 +14,9 @@ from support import scoring as made
 from support.browser import open_page
 from support.scoring import BASE, OWN, cells
 
-from robomme_interference_data.evaluate.score.figures import draw_figures
+from robomme_interference_data.drawing import open_figure, save_figure
+from robomme_interference_data.evaluate.score.curves import Data
+from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure, draw_figures
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.report import flips, write_report
 from robomme_interference_data.evaluate.score.scoring import Score
@@ -166,19 +168,24 @@ def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
 
 
 def test_the_report_and_figures_are_the_same_bytes_each_time(
-    report: Path, run: Path, small: Score
+    report: Path, small: Score, tmp_path: Path
 ) -> None:
-    out = run.parent / "again"
-    write_report(small, draw_figures(small, out / "figures"), out / "report.html")
-    assert (out / "report.html").read_bytes() == report.read_bytes()
-    names = sorted(path.name for path in (report.parent / "figures").iterdir())
-    assert names == sorted(path.name for path in (out / "figures").iterdir())
+    folder = report.parent / "figures"
     kinds = ("difficulty", "families", "heatmap", "retention", "retrieval", "success")
-    assert names == [f"{kind}-tabletop{suffix}" for kind in kinds for suffix in (".png", ".svg")]
-    for name in names:
-        one, other = (folder / "figures" / name for folder in (report.parent, out))
-        assert one.read_bytes() == other.read_bytes(), name
-        assert b"<dc:date>" not in one.read_bytes()
+    names = [f"{kind}-tabletop" for kind in kinds]
+    suffixes = (".png", ".svg")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        n + s for n in names for s in suffixes
+    ]
+    again = {name: folder / f"{name}.svg" for kind in FIGURES for name in [f"{kind}-tabletop"]}
+    write_report(small, again, report.parent / "again.html")
+    assert (report.parent / "again.html").read_bytes() == report.read_bytes()
+    for suffix in suffixes:
+        with open_figure() as figure:
+            draw_figure("success", figure, Data(small, "tabletop"))
+            save_figure(figure, path := tmp_path / f"success{suffix}")
+        assert path.read_bytes() == (folder / f"success-tabletop{suffix}").read_bytes()
+        assert b"<dc:date>" not in path.read_bytes()
 
 
 def test_where_episodes_flip(filler: None) -> None:
