@@ -26,15 +26,16 @@ def score(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Score rollout rows: tables, statistics, figures and one report.
+    r"""Score rollout rows: tables, statistics, figures and one report.
 
     Reads rows only, never a simulator, and can be run again at any time.
 
     Examples:
+    ```
     robomme-interference score my-run another-run --out my-score
-
-    robomme-interference score rollouts.csv --system retrieval-framesamp-modul --against paper
-    --out my-score
+    robomme-interference score rollouts.csv --system retrieval-framesamp-modul \
+        --against paper --out my-score
+    ```
     """
     from robomme_interference_data.evaluate.score.headline import headline
     from robomme_interference_data.evaluate.score.scoring import score as compute
@@ -80,9 +81,10 @@ def compare(
     """Compare two runs, paired over the episodes that both have.
 
     Examples:
+    ```
     robomme-interference compare my-run my-run-with-retrieval
-
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
+    ```
     """
     from robomme_interference_data.evaluate.score.compare import compare as compute
 
