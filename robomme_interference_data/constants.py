@@ -85,3 +85,10 @@ DISTRACTORS = "distractors"
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"
+
+# --- files of a run -----------------------------------------------------------------------------
+
+RUN_HEADER = "run.json"
+RUN_RECORD = "rollouts.jsonl"
+RUN_TABLES = ("rollouts.parquet", "rollouts.csv")
+"""Exported from the record when a run ends."""

@@ -42,6 +42,8 @@ class Policy(Protocol):
     observation; `act`; up to 16 of its actions are executed; `observe` with what was seen after
     each of them; `act`; and so on.
 
+    A policy of one's own need not be a subclass; one that is has what it leaves out from here.
+
     Attributes:
         cameras: Cameras whose live frames it wants, such as `("front", "wrist")`: no others are
             drawn.
@@ -52,15 +54,14 @@ class Policy(Protocol):
             the observation on which it acts next, and simulators need not draw the others.
     """
 
-    cameras: tuple[str, ...]
-    history_cameras: tuple[str, ...]
-    wants_history: bool
-    privileged: bool
-    every_frame: bool
+    cameras: tuple[str, ...] = ()
+    history_cameras: tuple[str, ...] = ()
+    wants_history: bool = True
+    privileged: bool = False
+    every_frame: bool = False
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget everything and prepare for a rollout."""
-        ...
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         """Take the next chunk of the history.
@@ -70,7 +71,6 @@ class Policy(Protocol):
             states: `(T, 8) float32`.
             exec_start_idx: Number of history frames in all, the same with every chunk.
         """
-        ...
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
         """Take the live observations since the last call.
@@ -79,7 +79,6 @@ class Policy(Protocol):
             frames: `(T, H, W, 3) uint8` of each of `cameras`.
             states: `(T, 8) float32`.
         """
-        ...
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next actions, `(n, 8) float32`, n at least 1; 16 at most are executed.
@@ -96,4 +95,3 @@ class Policy(Protocol):
 
     def close(self) -> None:
         """Release everything."""
-        ...

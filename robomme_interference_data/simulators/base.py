@@ -2,21 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.records import Status
 
 __all__ = [
+    "ACTION_SIZE",
     "CAMERAS",
     "Demonstration",
     "EpisodeInfo",
     "Observation",
     "Simulator",
-    "Status",
     "action_array",
     "camera_names",
 ]
@@ -24,18 +24,8 @@ __all__ = [
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""
 
-
-class Status(StrEnum):
-    """How an episode stands after a step.
-
-    `error` means that the simulator itself broke: such a rollout is no failure of the policy.
-    """
-
-    ONGOING = "ongoing"
-    SUCCESS = "success"
-    FAIL = "fail"
-    TIMEOUT = "timeout"
-    ERROR = "error"
+ACTION_SIZE = 8
+"""Numbers of an action, and of a state: 7 joints, then the gripper."""
 
 
 @dataclass(frozen=True)
@@ -163,31 +153,36 @@ def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:
         UnknownNameError: There is no such camera.
     """
     if not isinstance(cameras, list | tuple):
-        raise InvalidOptionError(
-            f"cameras {cameras!r}; expected a list of names", f"Known: {', '.join(CAMERAS)}"
-        )
+        raise InvalidOptionError.expected("cameras", cameras, "a list of names")
     for camera in cameras:
         if camera not in CAMERAS:
-            raise UnknownNameError(
-                f"the {simulator} simulator has no camera {camera!r}",
-                nearest(str(camera), CAMERAS),
-            )
+            raise UnknownNameError.among("camera", camera, f"the {simulator} simulator", CAMERAS)
     return tuple(camera for camera in CAMERAS if camera in cameras)
 
 
-def action_array(action: ArrayLike) -> NDArray[np.float32]:
-    """Return an action as `(8,) float32`.
+def action_array(action: ArrayLike, *, chunk: bool = False) -> NDArray[np.float32]:
+    """Return an action as `(8,) float32`: the one check of actions.
+
+    Args:
+        action: 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.
+        chunk: Whether these are several actions, returned as `(n, 8) float32`, n at least 1.
 
     Raises:
         InvalidOptionError: It has another shape, or is not finite numbers.
     """
-    hint = "Expected 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
     try:
-        array = np.asarray(action, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise InvalidOptionError(f"an action is 8 finite numbers, not {action!r}", hint) from error
-    if array.shape != (8,) or not np.isfinite(array).all():
-        raise InvalidOptionError(
-            f"an action is 8 finite numbers, not {array.shape} {array.tolist()}", hint
-        )
-    return array
+        given = np.asarray(action)
+    except ValueError:  # rows of several lengths
+        given = np.empty(0)
+    shape = given.shape[1:] if chunk else given.shape
+    if shape == (ACTION_SIZE,) and given.dtype.kind in "fiu":
+        with np.errstate(over="ignore"):
+            array = given.astype(np.float32)
+        if len(array) and np.isfinite(array).all():
+            return array
+    expected = f"(n, {ACTION_SIZE}) actions, n at least 1" if chunk else f"({ACTION_SIZE},) action"
+    raise InvalidOptionError(
+        f"{given.dtype} {given.shape} {np.array2string(given, threshold=2 * ACTION_SIZE)} is no "
+        f"{expected}, of finite numbers",
+        "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
+    )

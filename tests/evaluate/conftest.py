@@ -1,0 +1,27 @@
+"""The world of the tests of rollouts: a simulator without physics over the tiny split."""
+
+from pathlib import Path
+
+import pytest
+from support import worlds
+
+
+@pytest.fixture(scope="session")
+def tiny_split() -> Path:
+    """A split of a few episodes, with the conditions no-history, k0, k1, k3 and k7."""
+    return Path(__file__).parent.parent / "golden" / "split"
+
+
+@pytest.fixture
+def world(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the simulator `support.worlds:World` find the split, in other processes too."""
+    monkeypatch.setenv(worlds.SPLIT, str(tiny_split))
+
+
+@pytest.fixture
+def trouble(world: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder whose files make episodes break; see `World`."""
+    folder = tmp_path / "trouble"
+    folder.mkdir()
+    monkeypatch.setenv(worlds.TROUBLE, str(folder))
+    return folder

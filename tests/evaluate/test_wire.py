@@ -1,0 +1,207 @@
+"""The messages of the policy servers: golden bytes, round trips, and what is refused."""
+
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from robomme_interference_data.errors import WireError
+from robomme_interference_data.evaluate.policies.wire import pack, unpack
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "wire_messages.txt"
+MESSAGES: dict[str, Any] = {
+    "reset": {"reset": True},
+    "add_buffer": {
+        "add_buffer": True,
+        "images": np.array([[[[[0, 1, 2], [253, 254, 255]]]]], np.uint8),
+        "state": np.array([[0, 1, -2, 0.5, 3, 4, -0.125, -1]], np.float32),
+        "exec_start_idx": 300,
+    },
+    "reset_finished": {"reset_finished": True, "reset_time_ms": 1.5, "step": np.int32(-1)},
+    "no frames": np.zeros((0, 8)),
+}
+
+
+def golden() -> dict[str, bytes]:
+    found: dict[str, str] = {}
+    name = ""
+    for line in GOLDEN.read_text(encoding="utf-8").splitlines():
+        text = line.partition("#")[0].strip()
+        if header := re.fullmatch(r"\[(.+)\]", text):
+            name = header[1]
+        elif text:
+            found[name] = found.get(name, "") + text
+    return {name: bytes.fromhex(text) for name, text in found.items()}
+
+
+def same(one: Any, other: Any) -> bool:
+    """Equal in value, type, dtype and shape; NaN equals NaN, and a tuple is a list."""
+    if isinstance(one, dict):
+        return (
+            isinstance(other, dict)
+            and list(one) == list(other)
+            and all(same(value, other[key]) for key, value in one.items())
+        )
+    if isinstance(one, list | tuple):
+        return (
+            isinstance(other, list)
+            and len(one) == len(other)
+            and all(same(a, b) for a, b in zip(one, other, strict=True))
+        )
+    if isinstance(one, np.ndarray):
+        return (
+            isinstance(other, np.ndarray)
+            and (one.dtype, one.shape) == (other.dtype, other.shape)
+            and one.tobytes() == other.tobytes()
+        )
+    both = {type(one), type(other)}
+    return len(both) == 1 and (one == other or str(one) == str(other) == "nan")
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_golden_bytes(name: str) -> None:
+    assert golden().keys() == MESSAGES.keys()
+    assert pack(MESSAGES[name]) == golden()[name]
+    assert same(MESSAGES[name], unpack(golden()[name]))
+
+
+def test_arrays_read_are_read_only_views_of_the_message() -> None:
+    actions = unpack(pack({"actions": np.ones((16, 8))}))["actions"]
+    assert not actions.flags.writeable
+    assert not actions.flags.owndata
+
+
+def test_arrays_travel_in_c_order_whatever_theirs() -> None:
+    images = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+    for array in (images, np.asfortranarray(images), images[::-1], images.transpose(2, 0, 1)):
+        assert same(array.copy(order="C"), unpack(pack(array)))
+
+
+ARRAYS = hnp.arrays(
+    st.one_of(
+        hnp.boolean_dtypes(),
+        hnp.integer_dtypes(),
+        hnp.unsigned_integer_dtypes(),
+        hnp.floating_dtypes(),
+        hnp.byte_string_dtypes(min_len=1),
+        hnp.unicode_string_dtypes(min_len=1),
+    ),
+    hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=4),
+)
+NUMBERS = st.one_of(
+    st.integers(-128, 127).map(np.int8),
+    st.integers(0, 2**64 - 1).map(np.uint64),
+    st.floats(width=32).map(np.float32),
+    st.floats(width=16).map(np.float16),
+    st.booleans().map(np.bool_),
+)
+PLAIN = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**63), 2**64 - 1),
+    st.floats(),
+    st.text(max_size=8),
+    st.binary(max_size=8),
+)
+ANYTHING = st.recursive(
+    st.one_of(PLAIN, ARRAYS, NUMBERS),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@given(ANYTHING)
+def test_round_trip(message: Any) -> None:
+    assert same(message, unpack(pack(message)))
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_a_message_or_a_clear_error(data: bytes) -> None:
+    with suppress(WireError):
+        unpack(data)
+
+
+FIELDS = st.one_of(PLAIN, st.lists(st.integers(-2, 2**40), max_size=3), st.just("<f4"))
+
+
+@given(
+    st.sampled_from([b"__ndarray__", b"__npgeneric__"]),
+    st.fixed_dictionaries({}, optional={b"data": FIELDS, b"dtype": FIELDS, b"shape": FIELDS}),
+)
+def test_any_claimed_array_is_one_or_a_clear_error(kind: bytes, fields: dict[bytes, Any]) -> None:
+    with suppress(WireError):
+        unpack(msgpack.packb({kind: True, **fields}))
+
+
+@given(ANYTHING.map(pack), st.data())
+def test_a_cut_message_is_an_error(data: bytes, draw: st.DataObject) -> None:
+    cut = draw.draw(st.integers(0, len(data) - 1))
+    with pytest.raises(WireError, match="are not a message"):
+        unpack(data[:cut])
+    with pytest.raises(WireError, match="are not a message"):
+        unpack(data + b"\x00")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (np.array([object()]), "dtype object"),
+        (np.zeros(1, "c8"), "dtype complex64"),
+        (np.complex64(1), "dtype complex64"),
+        (np.zeros(1, "V3"), r"dtype \|V3"),
+        (np.zeros(1, "i4,f4"), "dtype"),
+        (np.zeros(1, "M8[s]"), "dtype datetime64"),
+        ({1, 2}, "a set: {1, 2}"),
+        (object(), "a object"),
+        (2**64, "a int: 18446744073709551616"),
+        ("\ud800", "cannot be sent"),
+    ],
+)
+def test_what_cannot_be_sent(value: Any, text: str) -> None:
+    with pytest.raises(WireError, match=text):
+        pack({"a": [value]})
+
+
+def array(**fields: Any) -> bytes:
+    entries = {"data": b"\x00" * 4, "dtype": "<f4", "shape": [1], **fields}
+    return msgpack.packb(
+        {b"__ndarray__": True} | {key.encode(): value for key, value in entries.items()}
+    )
+
+
+def number(**fields: Any) -> bytes:
+    entries = {"data": 1, "dtype": "<i4", **fields}
+    return msgpack.packb(
+        {b"__npgeneric__": True} | {key.encode(): value for key, value in entries.items()}
+    )
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"", "0 bytes are not a message"),
+        (b"Traceback", "9 bytes are not a message"),
+        (array(dtype="|O"), "dtype object"),
+        (array(dtype="float99"), "float99"),
+        (array(dtype="<c8"), "dtype complex64"),
+        (array(dtype="2<f4"), "cannot hold NumPy data"),
+        (array(data="0000"), "without bytes and shape"),
+        (array(data=b"\x00" * 5), "4 bytes with 5 bytes of data"),
+        (array(shape=[2]), "are not a message"),
+        (array(shape=1), "without bytes and shape"),
+        (number(data=2**40), "are not a message"),
+        (msgpack.packb({"a": msgpack.ExtType(5, b"")}), "extension type 5"),
+    ],
+)
+def test_what_is_not_read(data: bytes, text: str) -> None:
+    with pytest.raises(WireError, match=text):
+        unpack(data)
