@@ -106,7 +106,7 @@ class BuildServer:
 
 def _serve(log: str) -> None:
     from robomme_interference_data import cli
-    from robomme_interference_data.build_dataset.writer import load_lerobot
+    from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot
 
     load_lerobot()
     # The one other thread is pyarrow's allocator, which is made to be forked.
