@@ -38,6 +38,7 @@ class RunConfig:
     policy_options: tuple[str, ...] = setting(
         (),
         name="--policy-option",
+        whole=True,
         metavar="NAME=VALUE…",
         help="Options of the policy, such as device=cpu or response_s=60.",
     )

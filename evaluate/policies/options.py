@@ -22,26 +22,19 @@ _WORDS = {
 def split_options(texts: Iterable[str]) -> dict[str, str]:
     """Read options as they are typed, `NAME=VALUE`.
 
-    The command line parts values at their commas, so a text without a name belongs to the one
-    before it.
-
     Raises:
         InvalidOptionError: A text is something else, or a name is given twice.
     """
     options: dict[str, str] = {}
-    last = ""
     for text in texts:
         name, equals, value = text.partition("=")
-        if last and not equals:
-            options[last] += f",{text}"
-            continue
         if not name.isidentifier() or not equals:
             raise InvalidOptionError.expected(
                 "--policy-option", text, "NAME=VALUE, such as device=cpu"
             )
         if name in options:
             raise InvalidOptionError(f"--policy-option {name} is given twice", "Give it once.")
-        options[name], last = value, name
+        options[name] = value
     return options
 
 

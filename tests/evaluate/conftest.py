@@ -6,12 +6,6 @@ import pytest
 from support import worlds
 
 
-@pytest.fixture(scope="session")
-def tiny_split() -> Path:
-    """A split of a few episodes, with the conditions no-history, k0, k1, k3 and k7."""
-    return Path(__file__).parent.parent / "golden" / "split"
-
-
 @pytest.fixture
 def world(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the simulator `support.worlds:World` find the split, in other processes too."""

@@ -119,11 +119,6 @@ def test_options_reach_the_policy_with_the_declared_type() -> None:
     }
 
 
-def test_a_value_with_commas_is_one_value() -> None:
-    """The command line parts values at commas."""
-    assert split_options(["names=a", "b", "sizes=[1", "2]"]) == {"names": "a,b", "sizes": "[1,2]"}
-
-
 @pytest.mark.parametrize("texts", [["gripper"], ["=1"], ["two words=1"], ["a=1", "b=1", "a=2"]])
 def test_what_is_no_option(texts: list[str]) -> None:
     with pytest.raises(InvalidOptionError, match="--policy-option"):
