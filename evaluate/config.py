@@ -20,9 +20,8 @@ class RunConfig:
     """What to roll out, and how."""
 
     policy: str = setting(
-        help="replay, replay:framesamp, replay:window, oracle, guess, hold, "
-        "websocket://host:port[,host:port…], lerobot:REPO[@REVISION], lerobot:FOLDER or "
-        "python:module:factory."
+        help="replay, replay:framesamp, replay:window, oracle, guess, hold, websocket://HOST:PORT "
+        "(several with commas), lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
     )
     split: Path = setting(help="Folder of the split of buffers.")
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")

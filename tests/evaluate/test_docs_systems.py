@@ -1,24 +1,22 @@
-"""docs/systems.md: its table is the one in the code, its policy runs, its servers' order holds."""
+"""docs/systems.md and docs/evaluate.md against the code: table, commands, policy, settings."""
 
 import re
 import sys
 from pathlib import Path
 
-import factories
-import policy_server
 import pytest
-import rollout_doubles
+from support import worlds
+from support.policy_server import PolicyServer
+from support.runs import run
 
-from robomme_interference_data import load_split
-from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate import run_evaluation
+from robomme_interference_data import evaluate
 from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIABLE
+from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS, System
-from robomme_interference_data.ids import EpisodeId
 
-pytestmark = pytest.mark.usefixtures("world")
-
-PAGE = (Path(__file__).parent.parent / "docs" / "systems.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "systems.md").read_text(encoding="utf-8")
+GUARD = 'if __name__ == "__main__":'
 
 
 def row(system: System) -> list[str]:
@@ -64,69 +62,49 @@ def test_it_says_how_to_start_the_server_of_every_system_of_the_paper() -> None:
 
 def test_the_names_that_it_gives_are_the_codes() -> None:
     assert API_KEY_VARIABLE in PAGE
+    section = PAGE.split("### Options")[1].split("\n## ")[0]
+    named = re.findall(r"`(\w+_\w+)`", section)
+    assert set(policy_options("websocket://a:1")) == set(named) - {
+        "run_evaluation",
+        "policy_options",
+    }
 
 
-def test_the_policy_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_policy_of_the_page_runs(
+    tmp_path: Path, world: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = re.search(r"<!-- example: policy -->\n```python\n(.*?)```", PAGE, flags=re.S)
     assert found is not None
     (tmp_path / "retrace.py").write_text(found[1], encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "retrace", raising=False)
-    result = run_evaluation(
-        "python:retrace:make",
-        factories.split(),
-        tmp_path / "run",
-        simulator="rollout_doubles:World",
-        conditions=["no-history", "k0"],
-        families=["PatternLock"],
-        episodes="0",
-        system="retrace",
-    )
+    result = run(tmp_path / "run", policy="python:retrace:make", families=("MoveCube",))
     # The world asks for the lesson's pose 3: the fourth action of the first chunk.
     assert [(row.condition, row.status, row.steps) for row in result.rows] == [
-        ("no-history", "fail", rollout_doubles.STEPS),
+        ("no-history", "fail", worlds.STEPS),
         ("k0", "success", 4),
     ]
 
 
-def test_a_run_over_servers_keeps_their_account(tmp_path: Path) -> None:
-    """Two servers, two workers, with history: every server checks the order of its calls."""
-    with (
-        policy_server.PolicyServer().running() as one,
-        policy_server.PolicyServer().running() as other,
-    ):
-        policy = f"{one.url},{other.url.removeprefix('websocket://')}"
-        result = run_evaluation(
-            policy,
-            factories.split(),
-            tmp_path / "run",
-            simulator="rollout_doubles:World",
-            conditions=["no-history", "k1"],
-            families=["MoveCube", "PatternLock"],
-            episodes="0",
-            system="perceptual-framesamp-modul",
-            workers=2,
-        )
-        calls = [*one.calls, *other.calls]
+def test_a_run_over_a_server_keeps_its_account(tmp_path: Path, world: None) -> None:
+    """With history and without: the server checks the order of its calls."""
+    with PolicyServer().running() as server:
+        system = "perceptual-framesamp-modul"
+        names = ("no-history", "k1")
+        result = run(tmp_path / "run", policy=server.url, system=system, conditions=names)
+        calls = server.calls
     # The policy holds still, so every episode ends after 40 steps.
     assert [(row.status, row.error) for row in result.rows] == [("fail", None)] * 4
-    split = load_split(factories.split(), threads=1)
-    lengths = {
-        len(split.load(EpisodeId(family, "test", 0), 1)) for family in ("MoveCube", "PatternLock")
-    }
-    assert {call["exec_start_idx"] for call in calls if "exec_start_idx" in call} == {0, *lengths}
-    assert [call["call"] for call in calls].count("reset") == 4
+    assert {call["exec_start_idx"] for call in calls if "exec_start_idx" in call} == {0, 80}
     # 40 steps in chunks of 16: asked three times a rollout.
-    assert [call["call"] for call in calls].count("infer") == 4 * 3
+    kinds = [call["call"] for call in calls]
+    assert (kinds.count("reset"), kinds.count("infer")) == (4, 4 * 3)
 
 
-def test_fewer_servers_than_workers_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="2 workers need 2 policy servers"):
-        run_evaluation(
-            "websocket://127.0.0.1:9",
-            factories.split(),
-            tmp_path / "run",
-            simulator="rollout_doubles:World",
-            system="mine",
-            workers=2,
-        )
+def test_examples_in_python_have_the_guard_and_are_the_code() -> None:
+    page = (DOCS / "evaluate.md").read_text(encoding="utf-8")
+    for text in (page, evaluate.__doc__ or ""):
+        snippet = text.split("```python\n")[1].split("```")[0]
+        assert snippet.index(GUARD) < snippet.index("run_evaluation(")
+        compile(snippet, "example", "exec")
+        assert "RunConfig(" in snippet
