@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
-from robomme_interference_data.retrieval.selector import Selection, Selector
 from robomme_interference_data.sampling import lesson_frames, lesson_share
 from robomme_interference_data.simulators.base import (
     Observation,
@@ -29,6 +28,9 @@ from robomme_interference_data.simulators.base import (
     action_array,
 )
 from robomme_interference_data.split import Split
+
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selection, Selector
 
 __all__ = ["read_ahead", "run_rollout"]
 
@@ -55,7 +57,7 @@ def run_rollout(
     simulator: Simulator,
     policy: Policy,
     split: Split,
-    selector: Selector | None = None,
+    selector: "Selector | None" = None,
     clip: Clip | None = None,
     worker: Worker | None = None,
 ) -> Rollout:
@@ -83,7 +85,7 @@ def run_rollout(
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)
     buffer = split.load(item.episode, item.condition)
-    chosen: Selection | None = None
+    chosen: "Selection | None" = None
     start, stop = 0, len(buffer)
     with ExitStack() as stack:
         history = None
@@ -181,7 +183,7 @@ def _checked(actions: Any) -> NDArray[np.float32]:
         raise PolicyError(f"the policy's answer: {error.message}", error.hint) from None
 
 
-def _retrieval_columns(selector: Selector | None, chosen: Selection | None) -> dict[str, Any]:
+def _retrieval_columns(selector: "Selector | None", chosen: "Selection | None") -> dict[str, Any]:
     columns: dict[str, Any] = {"retrieval_model": selector.name} if selector else {}
     if chosen is not None:
         columns |= {"retrieval_start": chosen.start, "retrieval_stop": chosen.stop}

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.errors import PolicyServerError, WorkerRetiredError, first_line
@@ -16,10 +16,12 @@ from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
-from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.simulators.base import CAMERAS, Simulator
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.split import Split, load_split
+
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selector
 
 __all__ = ["RolloutTask", "make_selector", "simulator_options"]
 
@@ -40,7 +42,7 @@ class RolloutTask:
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._split: Split | None = None
-        self._selector: Selector | None = None
+        self._selector: "Selector | None" = None
 
     def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
         """Run a rollout; return its row, and the traceback of a clip that failed, or None.
@@ -114,7 +116,7 @@ class RolloutTask:
             policy.close()
 
 
-def make_selector(config: RunConfig) -> Selector | None:
+def make_selector(config: RunConfig) -> "Selector | None":
     """Make the retrieval step of a run, None if it has none.
 
     Raises:
@@ -123,6 +125,8 @@ def make_selector(config: RunConfig) -> Selector | None:
     """
     if config.retrieval is None:
         return None
+    from robomme_interference_data.retrieval.selector import Selector
+
     return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
 
 

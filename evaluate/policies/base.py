@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ class RolloutInfo:
     simulator: Simulator | None = None
 
 
-class Policy(Protocol):
+class Policy:
     """A policy together with its memory, one rollout at a time.
 
     The calls come in this order:
@@ -87,11 +87,11 @@ class Policy(Protocol):
             observation: What is seen now; `observe` has had it.
             goal: The goal in words.
         """
-        ...
+        raise NotImplementedError
 
     def metadata(self) -> dict[str, Any]:
         """Return plain values that say which policy this is, for the record of the run."""
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
         """Release everything."""

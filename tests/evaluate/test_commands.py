@@ -73,7 +73,7 @@ def test_what_broke_is_told_with_the_command_to_go_on(
     assert done.exit_code == 1
     assert "1 rollouts broke (see" in done.stderr
     assert "Stopped: 1 rollouts in a row broke" in done.stderr
-    assert done.stderr.rstrip().splitlines()[-1].startswith("robomme-interference ")
+    assert done.stderr.rstrip().splitlines()[-1].startswith("robomme-interference")
 
 
 def test_a_full_disk_names_the_file_and_the_command_to_go_on(

@@ -62,7 +62,7 @@ def test_it_says_how_to_start_the_server_of_every_system_of_the_paper() -> None:
 
 def test_the_names_that_it_gives_are_the_codes() -> None:
     assert API_KEY_VARIABLE in PAGE
-    section = PAGE.split("### Options")[1].split("\n## ")[0]
+    section = PAGE.split("\n## Options")[1].split("\n## ")[0]
     named = re.findall(r"`(\w+_\w+)`", section)
     assert set(policy_options("websocket://a:1")) == set(named) - {
         "run_evaluation",

@@ -26,7 +26,7 @@ from robomme_interference_data.evaluate.policies.registry import (
 )
 
 OWN = "python:support.own_policies:"
-MEMBERS = frozenset(Policy.__protocol_attrs__)  # type: ignore[attr-defined]
+MEMBERS = {name for name in vars(Policy) if not name.startswith("_")}
 
 
 @pytest.mark.parametrize(
