@@ -1,9 +1,11 @@
 """The world of the tests of rollouts: a simulator without physics over the tiny split."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support import worlds
+from support.policy_server import PolicyServer
 
 
 @pytest.fixture
@@ -19,3 +21,10 @@ def trouble(world: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Pat
     folder.mkdir()
     monkeypatch.setenv(worlds.TROUBLE, str(folder))
     return folder
+
+
+@pytest.fixture
+def server() -> Iterator[PolicyServer]:
+    """A policy server in a thread of this process."""
+    with PolicyServer().running() as running:
+        yield running

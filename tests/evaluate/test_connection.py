@@ -3,7 +3,7 @@
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
@@ -22,35 +22,33 @@ from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIA
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
 
-@pytest.fixture
-def server() -> Iterator[PolicyServer]:
-    with PolicyServer().running() as running:
-        yield running
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+@contextmanager
+def listening(backlog: int = 1) -> Iterator[int]:
+    """A port that accepts connections and never answers; not even that with a backlog of -1."""
+    with socket.socket() as mute:
+        mute.bind(("127.0.0.1", 0))
+        if backlog >= 0:
+            mute.listen(backlog)
+        yield mute.getsockname()[1]
 
 
 @contextmanager
-def listening() -> Iterator[int]:
-    """A port that accepts connections and never answers."""
-    with socket.socket() as mute:
-        mute.bind(("127.0.0.1", 0))
-        mute.listen()
-        yield mute.getsockname()[1]
+def handling(handle: Callable[[Any], Any], **options: Any) -> Iterator[int]:
+    """A websocket server of another kind."""
+    with serve(handle, "127.0.0.1", 0, **options) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        yield other.socket.getsockname()[1]
+        other.shutdown()
 
 
 # --- connecting --------------------------------------------------------------------------------
 
 
 def test_nobody_listens() -> None:
-    port = free_port()
-    policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
-    with pytest.raises(PolicyServerError) as raised:
-        policy.reset(info(0))
+    with listening(-1) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
+        with pytest.raises(PolicyServerError) as raised:
+            policy.reset(info(0))
     assert f"policy server 127.0.0.1:{port} cannot be reached: " in raised.value.message
     assert raised.value.message.endswith("refused (for 0.5 s)")
     assert "docs/systems.md" in (raised.value.hint or "")
@@ -70,62 +68,59 @@ def test_a_port_that_never_answers_is_told_soon_and_given_up(
 
 
 def test_a_server_that_never_speaks_is_given_up() -> None:
-    with serve(lambda connection: connection.recv(), "127.0.0.1", 0) as other:
-        threading.Thread(target=other.serve_forever, daemon=True).start()
-        port = other.socket.getsockname()[1]
+    with handling(lambda connection: connection.recv()) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
         with pytest.raises(PolicyServerError, match="did not answer within"):
-            WebsocketPolicy("127.0.0.1", port, connect_s=0.5).metadata()
-        other.shutdown()
+            policy.metadata()
 
 
 def test_a_server_that_starts_late_is_waited_for(capsys: pytest.CaptureFixture[str]) -> None:
-    server = PolicyServer(port=free_port())
-    policy = client(server)
-    failed: list[BaseException] = []
+    with listening(-1) as port:
+        server = PolicyServer(port=port)
 
-    def play() -> None:
-        try:
-            rollout(policy, 0, [], [])
-        except BaseException as error:
-            failed.append(error)
+    def begin() -> None:
+        time.sleep(0.3)
+        running.__enter__()
 
-    thread = threading.Thread(target=play)
+    running = server.running()
+    thread = threading.Thread(target=begin)
     thread.start()
-    time.sleep(0.3)
-    with server.running():
-        thread.join(60)
-        policy.close()
-    assert (failed, len(server.calls)) == ([], 3)
+    with client(server) as policy:
+        rollout(policy, 0, [], [])
+    thread.join()
+    running.__exit__(None, None, None)
+    assert len(server.calls) == 3
     assert capsys.readouterr().err == ""  # that was no time
 
 
 def test_a_server_that_is_not_ready_is_asked_again(server: PolicyServer) -> None:
     server.status = HTTPStatus.SERVICE_UNAVAILABLE
-    policy = client(server, connect_s=0.5)
-    with pytest.raises(PolicyServerError, match=r"it answers 503 \(for 0\.5 s\)"):
-        policy.reset(info(0))
-    server.status = None
-    rollout(policy, 0, [], [])
-    policy.close()
+    with client(server, connect_s=0.5) as policy:
+        with pytest.raises(PolicyServerError, match=r"it answers 503 \(for 0\.5 s\)"):
+            policy.reset(info(0))
+        server.status = None
+        rollout(policy, 0, [], [])
 
 
 def test_something_else_listens(server: PolicyServer) -> None:
     server.status = HTTPStatus.NOT_FOUND
-    with pytest.raises(PolicyServerError, match=r"is no policy server.* websocket.* 404"):
-        client(server).reset(info(0))
+    with (
+        client(server) as policy,
+        pytest.raises(PolicyServerError, match=r"is no policy server.* websocket.* 404"),
+    ):
+        policy.reset(info(0))
     assert server.connections == 0
 
 
 def test_the_key_is_sent(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) -> None:
     server.api_key = "abc"
     monkeypatch.delenv(API_KEY_VARIABLE, raising=False)
-    policy = client(server)
-    with pytest.raises(PolicyServerError, match="refuses with 401") as raised:
-        policy.reset(info(0))
-    assert API_KEY_VARIABLE in (raised.value.hint or "")
-    monkeypatch.setenv(API_KEY_VARIABLE, "abc")
-    rollout(policy, 0, [], [])
-    policy.close()
+    with client(server) as policy:
+        with pytest.raises(PolicyServerError, match="refuses with 401") as raised:
+            policy.reset(info(0))
+        assert API_KEY_VARIABLE in (raised.value.hint or "")
+        monkeypatch.setenv(API_KEY_VARIABLE, "abc")
+        rollout(policy, 0, [], [])
 
 
 # --- connections that break --------------------------------------------------------------------
@@ -134,7 +129,7 @@ def test_the_key_is_sent(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) 
 def test_a_server_that_was_restarted_is_connected_again_at_the_next_reset() -> None:
     server = PolicyServer()
     with server.running():
-        policy = client(server)
+        policy = WebsocketPolicy("127.0.0.1", server.port)
         rollout(policy, 2, [2], [16])
         policy.observe(*section(0, 4))
     with pytest.raises(PolicyServerError, match="closed the connection"):
@@ -146,38 +141,22 @@ def test_a_server_that_was_restarted_is_connected_again_at_the_next_reset() -> N
 
 
 def test_a_connection_that_broke_between_rollouts_costs_none(server: PolicyServer) -> None:
-    policy = client(server)
-    rollout(policy, 0, [], [])
-    closed: list[int] = []
-
-    def close_once(message: dict[str, Any]) -> Any:
-        if not closed:
-            closed.append(1)
-            return PolicyServer.CLOSE
-        return None
-
-    server.before = close_once
-    rollout(policy, 4, [4], [])
-    policy.close()
+    answers = iter([PolicyServer.CLOSE])
+    with client(server) as policy:
+        rollout(policy, 0, [], [])
+        server.before = lambda message: next(answers, None)
+        rollout(policy, 4, [4], [])
     assert server.memory.count == 5
 
 
-@pytest.mark.parametrize("call", ["infer", "reset"])
+@pytest.mark.parametrize("call", ["prompt", "reset"])
 def test_a_server_that_hangs_is_given_up(server: PolicyServer, call: str) -> None:
     go_on = threading.Event()
-
-    def hang(message: dict[str, Any]) -> None:
-        if call in message or (call == "infer" and "prompt" in message):
-            go_on.wait(30)
-
-    server.before = hang
-    policy = client(server, response_s=0.3)
-    try:
+    server.before = lambda message: go_on.wait(30) and None if call in message else None
+    with client(server, response_s=0.3) as policy:
         with pytest.raises(PolicyServerError, match=r"did not answer within 0\.3 s"):
             rollout(policy, 0, [], [])
-    finally:
         go_on.set()
-    policy.close()
 
 
 def test_a_server_that_does_not_even_read_is_given_up() -> None:
@@ -190,10 +169,7 @@ def test_a_server_that_does_not_even_read_is_given_up() -> None:
         connection.send(msgpack.packb({"reset_finished": True}))
         gone.wait(30)
 
-    options: dict[str, Any] = {"max_queue": 1, "max_size": None}
-    with serve(handle, "127.0.0.1", 0, **options) as other:
-        threading.Thread(target=other.serve_forever, daemon=True).start()
-        port = other.socket.getsockname()[1]
+    with handling(handle, max_queue=1, max_size=None) as port:
         policy = WebsocketPolicy("127.0.0.1", port, response_s=0.5, chunk_frames=4000)
         policy.reset(info(2000))
         frames = {"front": np.zeros((2000, 64, 64, 3), np.uint8)}
@@ -202,7 +178,18 @@ def test_a_server_that_does_not_even_read_is_given_up() -> None:
             policy.observe({"front": frames["front"][:1]}, np.zeros((1, 8), np.float32))
         gone.set()
         policy.close()
-        other.shutdown()
+
+
+def test_a_close_with_1011_alone_is_told() -> None:
+    def handle(connection: Any) -> None:
+        connection.send(msgpack.packb({}))
+        connection.recv()
+        connection.close(1011, "out of memory")
+
+    with handling(handle) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=1.0)
+        with pytest.raises(PolicyServerError, match=r"received 1011 .* out of memory"):
+            policy.reset(info(0))
 
 
 def test_a_server_that_computes_for_long_is_not_dropped(
@@ -214,48 +201,35 @@ def test_a_server_that_computes_for_long_is_not_dropped(
 
     monkeypatch.setattr(connection, "connect", impatient)
     server.before = lambda message: time.sleep(0.5) if "prompt" in message else None
-    policy = client(server)
-    rollout(policy, 0, [], [16])
-    policy.close()
+    with client(server) as policy:
+        rollout(policy, 0, [], [16])
     assert server.connections == 1
 
 
 def test_pings_of_the_server_are_answered_while_the_simulator_runs() -> None:
     server = PolicyServer()
     server.options |= {"ping_interval": 0.05, "ping_timeout": 0.4}
-    with server.running():
-        policy = client(server)
+    with server.running(), client(server, response_s=0.5) as policy:
         rollout(policy, 0, [], [])
-        time.sleep(1)
+        time.sleep(1)  # nor does the time limit of a message that was answered end it
         policy.observe(*section(1, 2))
-        policy.close()
     assert server.connections == 1
 
 
 def test_an_interrupt_leaves_no_answer_behind(
     server: PolicyServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy = client(server)
-    rollout(policy, 0, [], [])
     receive = ClientConnection.recv
 
     def interrupted(opened: ClientConnection) -> Any:
         receive(opened)
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch:
-        patch.setattr(ClientConnection, "recv", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            policy.act(observation(0), "pick")
-    rollout(policy, 1, [1], [])  # a fresh connection, or the order would be wrong
-    policy.close()
+    with client(server) as policy:
+        rollout(policy, 0, [], [])
+        with monkeypatch.context() as patch:
+            patch.setattr(ClientConnection, "recv", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                policy.act(observation(0), "pick")
+        rollout(policy, 1, [1], [])  # a fresh connection, or the order would be wrong
     assert server.connections == 2
-
-
-def test_a_time_limit_of_an_answer_ends_with_it(server: PolicyServer) -> None:
-    policy = client(server, response_s=0.5)
-    rollout(policy, 0, [], [])
-    time.sleep(0.8)  # no timer of an answered message closes the connection later
-    rollout(policy, 0, [], [])
-    policy.close()
-    assert server.connections == 1

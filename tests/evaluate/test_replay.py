@@ -24,26 +24,18 @@ def state(joint: float, opening: float = 0.04) -> Vector:
     return np.array([joint] * 7 + [opening], np.float32)
 
 
-def view(shade: int) -> NDArray[np.uint8]:
-    return np.full((32, 32, 3), shade, np.uint8)
+def seen(shade: int, joint: float, opening: float = 0.04) -> Observation:
+    return Observation({"front": np.full((32, 32, 3), shade, np.uint8)}, state(joint, opening))
 
 
-# --- memory -----------------------------------------------------------------------------------
-
-
-def test_full_keeps_everything() -> None:
+def test_what_memories_keep() -> None:
     assert list(MEMORIES["full"](5)) == [0, 1, 2, 3, 4]
-
-
-def test_window_keeps_the_last_32_with_the_live_one() -> None:
-    assert list(MEMORIES["window"](100)) == list(range(69, 100))
-    assert list(MEMORIES["window"](4)) == [0, 1, 2, 3]
-
-
-def test_framesamp_is_the_integer_linspace() -> None:
+    assert list(MEMORIES["window"](100)) == list(range(69, 100))  # 32 with the live one
     assert list(MEMORIES["framesamp"](30)) == list(range(30))
     # numpy truncates linspace(0, 310, 32) to 0, 10, …, 310; the last one is the live frame.
     assert list(MEMORIES["framesamp"](310)) == list(range(0, 310, 10))
+    with pytest.raises(UnknownNameError, match="Did you mean 'window'"):
+        ReplayPolicy("windw")
 
 
 @given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 5000))
@@ -57,22 +49,19 @@ def test_a_memory_keeps_frames_that_were_there(name: str, live: int) -> None:
 # --- the trajectory ---------------------------------------------------------------------------
 
 
-def test_seen_frames_are_followed_one_a_step() -> None:
-    states = np.stack([state(0.0), state(0.02), state(0.05)])
-    plan = follow(state(0.0), np.arange(3), states)
-    np.testing.assert_allclose(plan[:, 0], [0.0, 0.02, 0.05], atol=1e-7)
-    assert (plan[:, 7] == 1).all()
-
-
-def test_missing_frames_are_interpolated() -> None:
-    plan = follow(state(0.0), np.array([0, 4]), np.stack([state(0.0), state(0.08)]))
-    np.testing.assert_allclose(plan[:, 0], [0.0, 0.02, 0.04, 0.06, 0.08], atol=1e-7)
-
-
-def test_no_joint_moves_too_fast() -> None:
-    # 0.2 rad to the first frame: three steps of 0.0667, as 0.2 / 0.08 = 2.5.
-    plan = follow(state(0.2), np.array([7]), state(0.0)[None])
-    np.testing.assert_allclose(plan[:, 0], [0.4 / 3, 0.2 / 3, 0.0], atol=1e-6)
+@pytest.mark.parametrize(
+    ("kept", "joints", "plan"),
+    [
+        ([0, 1, 2], [0.0, 0.02, 0.05], [0.0, 0.02, 0.05]),  # one a step
+        ([0, 4], [0.0, 0.08], [0.0, 0.02, 0.04, 0.06, 0.08]),  # what is missing, between
+        # 0.24 rad to the first frame: three steps of 0.08.
+        ([7], [0.24], [0.08, 0.16, 0.24]),
+    ],
+)
+def test_kept_frames_are_followed(kept: list[int], joints: list[float], plan: list[float]) -> None:
+    found = follow(state(0.0), np.array(kept), np.stack([state(joint) for joint in joints]))
+    np.testing.assert_allclose(found[:, 0], plan, atol=1e-6)
+    assert (found[:, 7] == 1).all()
 
 
 def test_the_gripper_closes_and_opens_when_it_was_seen_to() -> None:
@@ -80,19 +69,12 @@ def test_the_gripper_closes_and_opens_when_it_was_seen_to() -> None:
     states = np.stack([state(0.0, opening) for opening in openings])
     plan = follow(states[0], np.arange(7), states)
     assert plan[:, 7].tolist() == [1, 1, -1, -1, -1, 1, 1]
-
-
-def test_between_missing_frames_the_gripper_moves_after_the_arm() -> None:
+    # Between missing frames after the arm: one step to the first frame, two to the second, five
+    # to close, two to the third.
     states = np.stack([state(0.0, 0.04), state(0.02, 0.02), state(0.04, 0.02)])
     plan = follow(states[0], np.array([0, 2, 4]), states)
-    # One step to the first frame, two to the second, five to close, two to the third.
     np.testing.assert_allclose(plan[:, 0], [0, 0.01, *[0.02] * 6, 0.03, 0.04], atol=1e-7)
     assert plan[:, 7].tolist() == [1, 1, 1, -1, -1, -1, -1, -1, -1, -1]
-
-
-def test_with_nothing_to_follow_it_holds() -> None:
-    plan = follow(state(0.3, 0.0), np.array([], np.int64), np.empty((0, 8), np.float32))
-    np.testing.assert_array_equal(plan, [[*[np.float32(0.3)] * 7, -1.0]])
 
 
 @given(
@@ -115,7 +97,7 @@ def test_it_ends_where_it_should_and_never_jumps(joints: list[float], gaps: list
 def fed(memory: str, shades: list[int], joints: list[float]) -> ReplayPolicy:
     policy = ReplayPolicy(memory)
     policy.reset(RolloutInfo("goal", len(shades), 0))
-    frames = np.stack([view(shade) for shade in shades])
+    frames = np.stack([np.full((32, 32, 3), shade, np.uint8) for shade in shades])
     states = np.stack([state(joint) for joint in joints])
     for start in range(0, len(shades), 7):  # chunks do not matter
         part = slice(start, start + 7)
@@ -123,56 +105,28 @@ def fed(memory: str, shades: list[int], joints: list[float]) -> ReplayPolicy:
     return policy
 
 
-def test_it_takes_up_where_the_view_is_nearest() -> None:
+def test_it_takes_up_where_the_view_is_nearest_the_first_of_equals() -> None:
     policy = fed("full", [10, 90, 50, 200], [0.0, 0.01, 0.02, 0.03])
-    actions = policy.act(Observation({"front": view(88)}, state(0.01)), "goal")
+    actions = policy.act(seen(88, 0.01), "goal")
     assert actions.shape == (16, 8) and actions.dtype == np.float32
     np.testing.assert_allclose(actions[:4, 0], [0.01, 0.02, 0.03, 0.03], atol=1e-6)
-
-
-def test_of_equal_views_the_first_one_counts() -> None:
-    policy = fed("full", [10, 50, 10], [0.0, 0.02, 0.05])
-    actions = policy.act(Observation({"front": view(10)}, state(0.0)), "goal")
+    actions = fed("full", [10, 50, 10], [0.0, 0.02, 0.05]).act(seen(10, 0.0), "goal")
     np.testing.assert_allclose(actions[:3, 0], [0.0, 0.02, 0.05], atol=1e-6)
+    # A window has lost what came before.
+    policy = fed("window", [200] + [0] * 40, [0.5] + [0.0] * 40)
+    assert (policy.act(seen(200, 0.0), "goal")[:, 0] == 0).all()
 
 
-def test_it_goes_on_from_call_to_call_and_then_holds() -> None:
+def test_it_goes_on_from_call_to_call_then_holds_and_a_reset_forgets() -> None:
     joints = [0.01 * step for step in range(20)]
     policy = fed("full", [0] * 20, joints)
-    seen = Observation({"front": view(0)}, state(0.0))
-    got = np.concatenate([policy.act(seen, "goal") for _ in range(3)])[:, 0]
+    got = np.concatenate([policy.act(seen(0, 0.0), "goal") for _ in range(3)])[:, 0]
     np.testing.assert_allclose(got, joints + [0.19] * 28, atol=1e-6)
-
-
-def test_window_has_lost_what_came_before() -> None:
-    policy = fed("window", [200] + [0] * 40, [0.5] + [0.0] * 40)
-    actions = policy.act(Observation({"front": view(200)}, state(0.0)), "goal")
-    assert (actions[:, 0] == 0).all()
-
-
-def test_without_history_it_holds() -> None:
-    policy = ReplayPolicy("full")
     policy.reset(RolloutInfo("goal", 0, 0))
-    actions = policy.act(Observation({"front": view(0)}, state(0.2, 0.0)), "goal")
-    np.testing.assert_array_equal(actions, np.tile([*[np.float32(0.2)] * 7, -1], (16, 1)))
-
-
-def test_a_reset_forgets() -> None:
-    policy = fed("full", [10, 20], [0.1, 0.2])
-    policy.act(Observation({"front": view(10)}, state(0.1)), "goal")
-    policy.reset(RolloutInfo("goal", 0, 0))
-    actions = policy.act(Observation({"front": view(10)}, state(0.0)), "goal")
-    assert (actions[:, 0] == 0).all()
-
-
-def test_it_must_be_reset() -> None:
+    held = policy.act(seen(0, 0.2, 0.0), "goal")  # without history
+    np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, -1], (16, 1)))
     with pytest.raises(PolicyError, match="not reset"):
-        ReplayPolicy("full").act(Observation({"front": view(0)}, state(0.0)), "goal")
-
-
-def test_an_unknown_memory_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match="Did you mean 'window'"):
-        ReplayPolicy("windw")
+        ReplayPolicy().act(seen(0, 0.0), "goal")
 
 
 def test_thumbnails_are_mean_colours_of_tiles() -> None:

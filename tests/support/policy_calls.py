@@ -1,5 +1,7 @@
 """Calls of a rollout, with frames and states that tell their number."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -18,8 +20,13 @@ def added(frames: int, exec_start_idx: int) -> dict[str, Any]:
     return {"call": "add_buffer", "frames": frames, "exec_start_idx": exec_start_idx}
 
 
-def client(server: PolicyServer, **options: Any) -> WebsocketPolicy:
-    return WebsocketPolicy("127.0.0.1", server.port, **options)
+@contextmanager
+def client(server: PolicyServer, **options: Any) -> Iterator[WebsocketPolicy]:
+    policy = WebsocketPolicy("127.0.0.1", server.port, **options)
+    try:
+        yield policy
+    finally:
+        policy.close()
 
 
 def section(start: int, stop: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
