@@ -1,61 +1,41 @@
 """Small LeRobot policies with weights at random, saved with their processors, and played."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import (
     get_policy_class,
     make_policy_config,
     make_pre_post_processors,
 )
 
+from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
 from robomme_interference_data.evaluate.policies.base import RolloutInfo
 from robomme_interference_data.simulators.base import Observation
 
-FRONT, WRIST = "observation.images.front", "observation.images.wrist"
-STATE, ACTION = "observation.state", "action"
 SIZE = 256
 SEED = 5
 
 SMALL: dict[str, dict[str, Any]] = {
     "act": {
-        "chunk_size": 20,
-        "n_action_steps": 20,
-        "dim_model": 32,
-        "n_heads": 2,
-        "dim_feedforward": 32,
-        "n_encoder_layers": 1,
-        "use_vae": False,
+        **{"chunk_size": 20, "n_action_steps": 20, "dim_model": 32, "n_heads": 2},
+        **{"dim_feedforward": 32, "n_encoder_layers": 1, "use_vae": False},
     },
     "vqbet": {
-        "n_obs_steps": 2,
-        "n_action_pred_token": 3,
-        "action_chunk_size": 5,
-        "crop_shape": (64, 64),
-        "vqvae_n_embed": 4,
-        "vqvae_embedding_dim": 8,
-        "vqvae_enc_hidden_dim": 8,
-        "gpt_input_dim": 16,
-        "gpt_output_dim": 16,
-        "gpt_hidden_dim": 16,
-        "gpt_n_layer": 1,
-        "gpt_n_head": 2,
+        **{"n_obs_steps": 2, "n_action_pred_token": 3, "action_chunk_size": 5},
+        **{"crop_shape": (64, 64), "vqvae_n_embed": 4, "vqvae_embedding_dim": 8},
+        **{"vqvae_enc_hidden_dim": 8, "gpt_input_dim": 16, "gpt_output_dim": 16},
+        **{"gpt_hidden_dim": 16, "gpt_n_layer": 1, "gpt_n_head": 2},
     },
     "diffusion": {
-        "n_obs_steps": 2,
-        "horizon": 16,
-        "n_action_steps": 8,
-        "down_dims": (16, 32),
-        "num_inference_steps": 2,
-        "crop_shape": (64, 64),
-        "spatial_softmax_num_keypoints": 4,
+        **{"n_obs_steps": 2, "horizon": 16, "n_action_steps": 8, "down_dims": (16, 32)},
+        **{"num_inference_steps": 2, "crop_shape": (64, 64), "spatial_softmax_num_keypoints": 4},
     },
 }
 
@@ -72,12 +52,8 @@ def stats(cameras: tuple[str, ...]) -> dict[str, dict[str, torch.Tensor]]:
     """Statistics that make normalization matter."""
     numbers = torch.arange(8, dtype=torch.float32)
     vector = {"mean": numbers / 8, "std": numbers + 1, "min": -numbers - 1, "max": numbers + 2}
-    image = {
-        "mean": torch.full((3, 1, 1), 0.4),
-        "std": torch.full((3, 1, 1), 0.2),
-        "min": torch.zeros(3, 1, 1),
-        "max": torch.ones(3, 1, 1),
-    }
+    values = {"mean": 0.4, "std": 0.2, "min": 0.0, "max": 1.0}
+    image = {name: torch.full((3, 1, 1), value) for name, value in values.items()}
     return {STATE: vector, ACTION: vector, **dict.fromkeys(cameras, image)}
 
 
@@ -96,29 +72,17 @@ def save_policy(
     return folder
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Models this small are slower on several threads, and much slower on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_policy(tmp_path_factory.mktemp("act"), "act")
-
-
-@pytest.fixture(scope="module")
-def vqbet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_policy(tmp_path_factory.mktemp("vqbet"), "vqbet", (FRONT,))
+def loaded(folder: Path) -> tuple[Any, Any, Any]:
+    """Load policy and processors as LeRobot's own evaluation does."""
+    config = PreTrainedConfig.from_pretrained(folder)
+    model = get_policy_class(config.type).from_pretrained(folder, config=config)
+    return model, *make_pre_post_processors(config, pretrained_path=str(folder))
 
 
 @cache
 def section(start: int, stop: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Made-up frames and states, each number its own."""
-    frames = {"front": [], "wrist": []}
+    frames: dict[str, list[np.ndarray]] = {"front": [], "wrist": []}
     states = []
     for number in range(start, stop):
         draw = np.random.default_rng(number)
@@ -129,29 +93,30 @@ def section(start: int, stop: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     return {name: np.stack(part) for name, part in frames.items()}, np.stack(states)
 
 
-def observation(number: int) -> Observation:
+def prepared(number: int) -> dict[str, Any]:
+    """An observation as LeRobot's processors take it."""
     frames, states = section(number, number + 1)
-    return Observation({name: part[0] for name, part in frames.items()}, states[0])
-
-
-def only(cameras: tuple[str, ...], frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name: frames[name] for name in cameras}
+    batch: dict[str, Any] = {STATE: torch.from_numpy(states), "task": ["pick the cube"]}
+    for name, part in frames.items():
+        image = torch.from_numpy(part).permute(0, 3, 1, 2).float() / 255
+        batch[f"observation.images.{name}"] = image
+    return batch
 
 
 def play(policy: Any, history: int, live: list[int]) -> list[np.ndarray]:
     """Give history in two chunks, then live frames; return the actions of each time."""
     policy.reset(RolloutInfo("pick the cube", history, SEED))
-    if policy.wants_history and history:
+    if policy.wants_history:
         for start, stop in [(0, history // 2), (history // 2, history)]:
             if stop > start:
-                frames, states = section(start, stop)
-                policy.add_history(only(policy.history_cameras, frames), states, history)
+                policy.add_history(*section(start, stop), history)
     at, actions = history, []
     for count in live:
-        frames, states = section(at, at + count)
-        policy.observe(only(policy.cameras, frames), states)
+        policy.observe(*section(at, at + count))
         at += count
-        actions.append(policy.act(observation(at - 1), "pick the cube"))
+        frames, states = section(at - 1, at)
+        seen = Observation({name: part[0] for name, part in frames.items()}, states[0])
+        actions.append(policy.act(seen, "pick the cube"))
     return actions
 
 
