@@ -89,24 +89,26 @@ def merge(
     from robomme_interference_data.evaluate.progress import rate_table
 
     merged = merge_runs(runs, out)
-    told = {
-        "missing": merged.missing,
-        "broken, to be run again": merged.broken,
-        "in more than one run, the first one kept": merged.double,
-        "of those did not end alike": merged.differing,
-    }
+    lists = {name: getattr(merged, name) for name in _TOLD}
     if as_json:
-        lists = {
-            what: [{"episode": str(one.episode), "condition": one.condition} for one in items]
-            for what, items in zip(
-                ("missing", "broken", "double", "differing"), told.values(), strict=True
-            )
+        told = {
+            name: [{"episode": str(one.episode), "condition": one.condition} for one in items]
+            for name, items in lists.items()
         }
-        print_json({"planned": merged.planned, "rows": len(merged.rows), **lists})
+        print_json({"planned": merged.planned, "rows": len(merged.rows), **told})
         return
     typer.echo(rate_table(merged.rows).text())
-    for what, items in told.items():
+    for name, items in lists.items():
         if items:
             more = f" and {len(items) - 5:,} more" if len(items) > 5 else ""
-            MESSAGES.print(f"{len(items):,} {what}: {', '.join(map(str, items[:5]))}{more}")
+            shown = ", ".join(map(str, items[:5]))
+            MESSAGES.print(f"{len(items):,} {_TOLD[name]}: {shown}{more}")
     typer.echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
+
+
+_TOLD = {
+    "missing": "missing",
+    "broken": "broken, to be run again",
+    "double": "in more than one run, the first one kept",
+    "differing": "of those did not end alike",
+}

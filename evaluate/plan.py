@@ -119,37 +119,34 @@ def plan_work(
         InvalidOptionError: Numbers or shard do not read as such, or there is nothing to run.
         UnknownNameError: The split lacks a family or episode that is asked for.
     """
-    here: dict[str, list[int]] = {}
     there = sorted(known)
+    here: dict[str, list[int]] = {episode.family: [] for episode in there}
     for episode in there:
-        numbers = here.setdefault(episode.family, [])
         if episode.split == episode_split:
-            numbers.append(episode.index)
+            here[episode.family].append(episode.index)
     for family in families:
         if family not in here:
             raise UnknownNameError.among("family", family, "the split", here)
     asked = None if episodes is None else parse_numbers(episodes)
     chosen = {}
-    for family, numbers in here.items():
-        if families and family not in families:
-            continue
-        wanted = numbers if asked is None else asked
-        missing = sorted(set(wanted) - set(numbers))
+    for family in [name for name in here if not families or name in families]:
+        numbers, group = here[family], f"{family}/{episode_split}"
+        missing = sorted(set(asked or ()) - set(numbers))
         if missing or (families and not numbers):
+            has = f"It has {format_numbers(numbers)} of {group}." if numbers else ""
             raise UnknownNameError(
-                f"the split has no query episode {family}/{episode_split}/{(missing or [0])[0]}"
+                f"the split has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"It has {format_numbers(numbers)} of {family}/{episode_split}."
-                if numbers
-                else f"It has no {episode_split} episode of {family}: see --episode-split.",
+                has or f"It has no {episode_split} episode of {family}: see --episode-split.",
             )
-        if wanted:
-            chosen[f"{family}/{episode_split}"] = format_numbers(wanted)
+        if numbers:
+            chosen[group] = format_numbers(asked or numbers)
     names = tuple(one.name for one in in_order(conditions))
     if not chosen:
+        splits = sorted({one.split for one in there})
         raise InvalidOptionError(
             f"there is nothing to run: the split has no {episode_split} episode",
-            f"Give --episode-split; there are {', '.join(sorted({one.split for one in there}))}.",
+            f"Give --episode-split; there are {', '.join(splits)}.",
         )
     return Plan(chosen, names, shard)
 

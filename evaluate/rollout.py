@@ -85,7 +85,7 @@ def run_rollout(
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)
     buffer = split.load(item.episode, item.condition)
-    chosen: "Selection | None" = None
+    chosen: Selection | None = None
     start, stop = 0, len(buffer)
     with ExitStack() as stack:
         history = None

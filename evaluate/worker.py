@@ -42,7 +42,7 @@ class RolloutTask:
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._split: Split | None = None
-        self._selector: "Selector | None" = None
+        self._selector: Selector | None = None
 
     def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
         """Run a rollout; return its row, and the traceback of a clip that failed, or None.

@@ -23,6 +23,8 @@ class WebsocketPolicy(Policy):
 
     The seed of a rollout means nothing to a server: it was started with a seed of its own, to
     which it returns at every reset. A server without a memory ignores the frames that it is sent.
+    Every call raises `PolicyServerError` if the server cannot be reached, reports an error, is gone
+    or too slow.
 
     Args:
         host: Name or address of the server.
@@ -59,11 +61,7 @@ class WebsocketPolicy(Policy):
         self._held: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
 
     def reset(self, info: RolloutInfo) -> None:
-        """Empty the server's memory, connecting first, or again if the connection was lost.
-
-        Raises:
-            PolicyServerError: The server cannot be reached, or reports an error.
-        """
+        """Empty the server's memory, connecting first, or again if the connection was lost."""
         self._history, self._live, self._held = info.history_frames, False, None
         if self._server.is_open:
             # It may have broken since the last rollout; there is no memory yet that it could lose.
@@ -74,11 +72,7 @@ class WebsocketPolicy(Policy):
         self._server.request({"reset": True}, "reset_finished")
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Send history in whole chunks; what is left waits for the first live observation.
-
-        Raises:
-            PolicyServerError: The server reports an error, or is gone.
-        """
+        """Send history in whole chunks; what is left waits for the first live observation."""
         images, states = self._with_held(frames["front"], states)
         whole = len(images) // self._chunk * self._chunk
         self._send(images[:whole], states[:whole])
@@ -86,11 +80,7 @@ class WebsocketPolicy(Policy):
         self._held = images[whole:].copy(), states[whole:].copy()
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Send live observations; the first of them ends the last chunk of the history.
-
-        Raises:
-            PolicyServerError: The server reports an error, or is gone.
-        """
+        """Send live observations; the first of them ends the last chunk of the history."""
         self._send(*self._with_held(frames["front"], states))
         self._live = True
 
@@ -116,14 +106,7 @@ class WebsocketPolicy(Policy):
             self._server.request(message, "add_buffer_finished")
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Ask the server for actions.
-
-        Returns:
-            What the server gives: `(n, 8)`, checked where it is executed.
-
-        Raises:
-            PolicyServerError: The server reports an error, or is gone.
-        """
+        """Return the actions that the server gives, `(n, 8)`; they are checked where executed."""
         message = {
             "observation/image": observation.images["front"],
             "observation/wrist_image": observation.images["wrist"],
@@ -134,11 +117,7 @@ class WebsocketPolicy(Policy):
         return actions
 
     def metadata(self) -> dict[str, Any]:
-        """Return the server's address and what it said of itself, connecting if it never was asked.
-
-        Raises:
-            PolicyServerError: The server cannot be reached.
-        """
+        """Return the server's address and what it said of itself, connecting if need be."""
         if self._server.metadata is None:
             self._server.open()
         said = self._server.metadata
