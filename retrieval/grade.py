@@ -1,35 +1,32 @@
-"""Grade what was chosen against the true sessions, without a simulator: pure but for look-ups.
+"""Grade what was chosen against the true sessions, without a simulator: pure.
 
-A cell is a family under one k; it is good when mean purity and mean coverage are both at least
-`PASS_MARK` (released reference).
+A cell is a family under one condition; it is good when mean purity and mean coverage are both at
+least `PASS_MARK` (released reference).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robomme_interference_data.bootstrap import Interval, Resampler, mean
-from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.intervals import wilson
-from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
-from robomme_interference_data.retrieval.select import Rule, pick
-from robomme_interference_data.retrieval.selector import lot_of, true_lesson
-from robomme_interference_data.sessions import Session
+from robomme_interference_data.retrieval.select import Measured, Rule, choose
+from robomme_interference_data.tables import Column, Table, percent
 
 __all__ = [
     "ALL",
     "PASS_MARK",
     "Cell",
     "Grade",
-    "Measured",
-    "TrueSession",
+    "cell_table",
     "cells",
     "grade",
-    "mean_of",
-    "measure",
+    "verdict",
 ]
 
 PASS_MARK = 0.9
@@ -40,44 +37,6 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class TrueSession:
-    """A session of a buffer, for grading.
-
-    Attributes:
-        span: First frame in the buffer, and the one after the last.
-        family: Its family.
-        stored: Names the stored frames that it holds, the same in every buffer of a split.
-    """
-
-    span: Span
-    family: str
-    stored: str
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """What grading needs to know of a buffer: all rules and cuts share it.
-
-    Attributes:
-        episode_id: The query episode.
-        k: Number of distractor sessions.
-        sessions: The true sessions in order.
-        lesson: The true lesson.
-        adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
-        query_cosines: Cosine of each frame with the first live observation, `(T,) float32`.
-        typical: Median cosine of two frames of different distractor units.
-    """
-
-    episode_id: EpisodeId
-    k: int
-    sessions: tuple[TrueSession, ...]
-    lesson: Span
-    adjacent: NDArray[np.float32]
-    query_cosines: NDArray[np.float32]
-    typical: float
-
-
-@dataclass(frozen=True)
 class Grade:
     """How well one rule chose for one buffer.
 
@@ -85,15 +44,16 @@ class Grade:
         rule: The rule, its cut named.
         threshold: Cosine below which it cut.
         episode_id: The query episode.
-        k: Number of distractor sessions.
+        condition: Name of the condition.
         history_frames: Frames of the history.
         segments: Segments that it was cut into.
         start: First chosen frame.
         stop: Frame after the last chosen one.
         chosen_frames: How many were chosen; fewer than `stop - start` for single frames.
-        purity: Share of the chosen frames that are of the lesson.
-        coverage: Share of the lesson's frames that were chosen.
-        false_sessions: Sessions other than the lesson of which a frame was chosen.
+        hit: Whether any frame of the lesson was chosen.
+        purity: Share of the chosen frames that are of the lesson, in however many parts.
+        coverage: Share of the lesson's frames that were chosen; None where there are none.
+        false_sessions: Sessions that are no lesson of which a frame was chosen.
         true_cuts: Borders between true sessions.
         found_cuts: How many of them are borders of segments.
         false_cuts: Borders of segments inside a true session.
@@ -102,162 +62,193 @@ class Grade:
     rule: str
     threshold: float
     episode_id: EpisodeId
-    k: int
+    condition: str
     history_frames: int
     segments: int
     start: int
     stop: int
     chosen_frames: int
+    hit: bool
     purity: float
-    coverage: float
+    coverage: float | None
     false_sessions: int
     true_cuts: int
     found_cuts: int
     false_cuts: int
 
-    @property
-    def hit(self) -> bool:
-        """Whether any frame of the lesson was chosen."""
-        return self.coverage > 0
-
 
 @dataclass(frozen=True)
 class Cell:
-    """How well one rule chose for all queries of a family under one k.
+    """How well one rule chose for all queries of a family under one condition.
+
+    Shares and means have 95% intervals, from `…_low` to `…_high`: Wilson's for `hit`, BCa bootstrap
+    over episodes for the others, None for a single episode.
 
     Attributes:
         rule: The rule.
         family: A family, or `ALL`.
-        k: Number of distractor sessions.
-        episodes: Query episodes.
-        hit: Share of them with a frame of the lesson chosen, with its 95% Wilson interval.
-        purity: Mean purity, with its 95% BCa bootstrap interval over episodes; bounds are NaN for
-            a single episode.
-        coverage: Mean coverage, likewise.
-        false_sessions: Mean number of false sessions, likewise.
+        condition: Name of the condition.
+        queries: Query episodes.
+        hit: Share of them with a frame of the lesson chosen.
+        purity: Mean purity.
+        coverage: Mean coverage.
+        false_sessions: Mean number of false sessions.
         true_cuts: Borders between true sessions, in all its queries together.
         found_cuts: How many of them are borders of segments.
         false_cuts: Borders of segments inside true sessions.
+        passed: Whether mean purity and mean coverage reach the pass mark.
     """
 
     rule: str
     family: str
-    k: int
-    episodes: int
-    hit: Interval
-    purity: Interval
-    coverage: Interval
-    false_sessions: Interval
+    condition: str
+    queries: int
+    hit: float
+    hit_low: float
+    hit_high: float
+    purity: float
+    purity_low: float | None
+    purity_high: float | None
+    coverage: float
+    coverage_low: float | None
+    coverage_high: float | None
+    false_sessions: float
+    false_sessions_low: float | None
+    false_sessions_high: float | None
     true_cuts: int
     found_cuts: int
     false_cuts: int
-
-    @property
-    def passed(self) -> bool:
-        """Whether mean purity and mean coverage reach the pass mark."""
-        return self.purity.value >= PASS_MARK and self.coverage.value >= PASS_MARK
-
-
-def measure(buffer: Buffer, encoder: str, camera: str = "front") -> Measured:
-    """Look up the embeddings of a buffer and of its first live observation, and compare them.
-
-    Raises:
-        MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
-        InvalidOptionError: The buffer has no lesson, or has it in several parts.
-    """
-    embeddings = buffer.embeddings(encoder, camera)
-    return Measured(
-        buffer.episode_id,
-        buffer.k,
-        tuple(_true_session(session) for session in buffer.sessions),
-        true_lesson(buffer),
-        adjacent_cosines(embeddings),
-        cosines(embeddings, buffer.query_embedding(encoder, camera)),
-        buffer.query_index(encoder, camera).typical_cosine,
-    )
-
-
-def _true_session(session: Session) -> TrueSession:
-    entry = session.entry
-    stored = f"{entry.dataset}/{entry.episode_index}/{entry.start}-{entry.stop}x{entry.repeat}"
-    return TrueSession(session.span, session.family, stored)
+    passed: bool
 
 
 def grade(measured: Measured, rule: Rule) -> Grade:
-    """Choose by a rule, its cut settled, and compare with the true sessions."""
-    threshold = rule.threshold(measured.typical)
-    choice = pick(
-        measured.adjacent,
-        measured.query_cosines,
-        threshold=threshold,
-        method=rule.method,
-        lesson=measured.lesson,
-        lot=lot_of(measured.episode_id, measured.k),
-    )
-    frames = choice.frames
-    start, stop = measured.lesson
-    of_lesson = int(((frames >= start) & (frames < stop)).sum())
-    spans = [session.span for session in measured.sessions]
-    starts = [first for first, _ in spans]
+    """Choose by a rule, and compare with the true sessions.
+
+    Raises:
+        InvalidOptionError: See `choose`.
+    """
+    choice = choose(measured, rule)
+    frames, sessions = choice.frames, measured.sessions
+    lesson = sum(b - a for a, b in measured.lesson)
+    inside = sum(int(((frames >= a) & (frames < b)).sum()) for a, b in measured.lesson)
+    starts = [session.start for session in sessions]
     borders, cuts = set(starts[1:]), {first for first, _ in choice.segments[1:]}
-    touched = {spans[n] for n in np.searchsorted(starts, frames, side="right") - 1}
+    touched = set(np.searchsorted(starts, frames, side="right").tolist())
     return Grade(
-        str(rule),
-        threshold,
-        measured.episode_id,
-        measured.k,
-        len(measured.query_cosines),
-        len(choice.segments),
-        int(frames[0]),
-        int(frames[-1]) + 1,
-        len(frames),
-        of_lesson / len(frames),
-        of_lesson / (stop - start),
-        len(touched - {measured.lesson}),
-        len(borders),
-        len(borders & cuts),
-        len(cuts - borders),
+        rule=str(rule),
+        threshold=choice.threshold,
+        episode_id=measured.episode_id,
+        condition=measured.condition,
+        history_frames=len(measured.alike),
+        segments=len(choice.segments),
+        start=int(frames[0]),
+        stop=int(frames[-1]) + 1,
+        chosen_frames=len(frames),
+        hit=inside > 0,
+        purity=inside / len(frames),
+        coverage=inside / lesson if lesson else None,
+        false_sessions=sum(sessions[number - 1].role != "lesson" for number in touched),
+        true_cuts=len(borders),
+        found_cuts=len(borders & cuts),
+        false_cuts=len(cuts - borders),
     )
 
 
 def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
-    """Yield the cells of grades: by rule, then by family and last all together, then by k.
+    """Yield the cells of grades: by rule, then by family and last all together, then by condition.
 
-    Rules and families keep the order in which they first occur.
+    Rules and families keep the order in which they first occur. The grades are of buffers that
+    hold frames of the lesson.
     """
     rules = dict.fromkeys(one.rule for one in grades)
     families = dict.fromkeys(one.episode_id.family for one in grades)
+    conditions = {one.condition for one in grades}
     for rule in rules:
         for family in [*families, ALL]:
             here = [g for g in grades if g.rule == rule and family in (ALL, g.episode_id.family)]
-            for k in sorted({one.k for one in here}):
-                yield _cell(rule, family, k, [one for one in here if one.k == k])
+            for condition in sorted(conditions, key=lambda name: parse_condition(name).sort_key):
+                if found := [one for one in here if one.condition == condition]:
+                    yield _cell(rule, family, condition, found)
 
 
-def _cell(rule: str, family: str, k: int, grades: Sequence[Grade]) -> Cell:
+def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Cell:
     count, hits = len(grades), sum(one.hit for one in grades)
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
-    # One key: equal values have equal intervals, whatever the rule, family and k.
+    # One key: equal values have equal intervals, whatever the rule, family and condition.
     drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
-    hit = Interval(hits / count, *wilson(hits, count))
-    purity, coverage, false_sessions = drawn
+    purity, coverage, false_sessions = map(_bounds, drawn)
     return Cell(
         rule,
         family,
-        k,
+        condition,
         count,
-        hit,
-        purity,
-        coverage,
-        false_sessions,
+        hits / count,
+        *wilson(hits, count),
+        *purity,
+        *coverage,
+        *false_sessions,
         sum(one.true_cuts for one in grades),
         sum(one.found_cuts for one in grades),
         sum(one.false_cuts for one in grades),
+        min(purity[0], coverage[0]) >= PASS_MARK,
     )
 
 
-def mean_of(grades: Iterable[Grade]) -> tuple[float, float]:
-    """Return mean purity and mean coverage."""
-    pairs = np.array([(one.purity, one.coverage) for one in grades], float)
-    purity, coverage = pairs.mean(axis=0)
-    return float(purity), float(coverage)
+def _bounds(one: Interval) -> tuple[Any, Any, Any]:
+    low, high = (None if math.isnan(bound) else bound for bound in (one.low, one.high))
+    return one.value, low, high
+
+
+# --- in words ----------------------------------------------------------------------------------
+
+_NOTE = (
+    "hit: queries for which any lesson frame was chosen, with the 95% Wilson interval. Means over "
+    "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of the "
+    "chosen frames that are lesson; coverage, the share of the lesson that was chosen; false "
+    "sessions, how many others were touched. cuts found: of all cuts between true sessions, in all "
+    "queries together; false cuts: those inside one. pass: mean purity and mean coverage are both "
+    f"at least {PASS_MARK:.0%}."
+)
+
+
+def verdict(cells: Sequence[Cell]) -> str:
+    """Say for each rule how many cells of a family and a condition pass."""
+    parts = []
+    for rule in dict.fromkeys(cell.rule for cell in cells):
+        here = [cell for cell in cells if cell.rule == rule and cell.family != ALL]
+        parts.append(f"{rule}: {sum(cell.passed for cell in here)} of {len(here)}")
+    return "Cells of a family and a condition that pass: " + ", ".join(parts)
+
+
+def cell_table(cells: Sequence[Cell], title: str) -> Table:
+    """Return the table for the terminal: one rule by family, or several rules, by condition."""
+    several = len({cell.rule for cell in cells}) > 1
+    columns = (
+        *(Column(name) for name in ("rule" if several else "family", "condition")),
+        Column("queries", "count"),
+        *(Column(name) for name in ("hit", "purity", "coverage")),
+        Column("false_sessions", "ratio"),
+        Column("cuts_found"),
+        Column("false_cuts", "count"),
+        Column("pass", "flag"),
+    )
+    rows = tuple(
+        (
+            cell.rule if several else cell.family,
+            cell.condition,
+            cell.queries,
+            *(_share(cell, name) for name in ("hit", "purity", "coverage")),
+            cell.false_sessions,
+            f"{cell.found_cuts} of {cell.true_cuts}",
+            cell.false_cuts,
+            cell.passed,
+        )
+        for cell in cells
+        if not several or cell.family == ALL
+    )
+    return Table("retrieval", title, columns, rows, _NOTE)
+
+
+def _share(cell: Cell, name: str) -> str:
+    value, low, high = (getattr(cell, name + suffix) for suffix in ("", "_low", "_high"))
+    return percent(value) + ("" if low is None else f" ({100 * low:.1f} to {100 * high:.1f})")

@@ -1,56 +1,63 @@
-"""Make the index of a dataset: embed every stored frame of a camera, and keep it beside the data.
+"""Make the index of datasets: embed every stored frame of a camera, and keep it beside the data.
 
-An index is made in a hidden folder beside its place, an episode at a time, so that an interrupted
-run goes on from there. The header is written last: without it there is no index.
+Features are kept in a hidden folder beside the index's place, an episode at a time, so that an
+interrupted run goes on from there. The index gets its name when it is whole.
 """
 
+import shutil
+from collections import deque
 from collections.abc import Sequence
-from contextlib import ExitStack
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
     FORMAT_VERSION,
-    INDEX_CENTRE,
-    INDEX_EMBEDDINGS,
     INDEX_HEADER,
-    INDEX_ROWS,
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.embeddings import (
+    CENTRE_FILE,
+    INDEX_SUMS,
     EmbeddingIndex,
+    EncoderRecord,
+    IndexHeader,
     encoder_id,
+    episode_file,
     index_folder,
     normalised,
 )
 from robomme_interference_data.errors import (
     BuildError,
-    FormatError,
+    InterferenceError,
     InvalidOptionError,
-    UnknownNameError,
-    nearest,
+    first_line,
 )
+from robomme_interference_data.execution import Executor, Serial, Worker
 from robomme_interference_data.files import (
+    Files,
     LocalFiles,
     atomic_path,
     canonical_json,
-    read_json,
+    format_sums,
+    hold,
     sha256_file,
     write_json,
+    write_text,
 )
-from robomme_interference_data.locks import hold
-from robomme_interference_data.progress import BuildProgress
-from robomme_interference_data.retrieval.encoders.base import Encoder, fingerprint_digest
-from robomme_interference_data.retrieval.parts import Parts
+from robomme_interference_data.retrieval.encoders import Encoder, encoder_digest
 from robomme_interference_data.retrieval.segment import typical_cosine
+from robomme_interference_data.rows import to_dict
 
 __all__ = ["IndexReport", "build_index"]
 
@@ -61,29 +68,24 @@ class IndexReport:
 
     Attributes:
         folder: Where the index lies.
-        frames: Frames in it.
         embedded: Frames that were embedded now; the others were there already.
-        typical_cosine: Median cosine of two frames of the train pool.
-        computed_in: Where and in which precision it was computed, in words.
-        batch: How many images at a time.
+        header: What it is.
     """
 
-    folder: Path
-    frames: int
+    folder: str
     embedded: int
-    typical_cosine: float
-    computed_in: str
-    batch: int
+    header: IndexHeader
 
 
 def build_index(
     roots: Sequence[Path],
     encoder: Encoder,
-    progress: BuildProgress,
+    progress: WorkProgress,
     *,
     camera: str = "front",
     threads: int = 1,
     force: bool = False,
+    executor: Executor | None = None,
 ) -> list[IndexReport]:
     """Embed every stored frame of datasets whose frames are to be compared with each other.
 
@@ -99,182 +101,178 @@ def build_index(
         camera: Camera to embed, with or without `observation.images.`.
         threads: Threads that decode and preprocess beside the encoder.
         force: Make all of it again.
+        executor: Who embeds the episodes; None for this process.
 
     Raises:
         UnknownNameError: A dataset has no such camera.
         InvalidOptionError: There are no distractor units among them.
-        BuildError: Another process makes one of the indexes, an interrupted run computed its part
-            differently, or the encoder gave something that is no finite number.
+        BuildError: Another process makes one of the indexes, or the encoder gave something that is
+            no finite number.
         MissingFileError, FormatError, TruncatedVideoError: A dataset cannot be read.
     """
     if threads < 1:
-        raise InvalidOptionError(f"threads={threads}; expected 1 or more")
+        raise InvalidOptionError.expected("threads", threads, "1 or more")
     datasets = [Dataset(LocalFiles(root)) for root in roots]
     units = next((dataset for dataset in datasets if dataset.kind == DISTRACTORS), None)
     if units is None:
         raise InvalidOptionError(
             f"{datasets[0].files.describe()} holds {datasets[0].kind}; expected distractor units "
             "beside them, which tell what any two frames share",
-            "Index both at once: robomme-interference index --data SPLIT",
+            "Index both at once: robomme-interference index SPLIT",
         )
-    works = [_Work(dataset, encoder, camera, units.revision) for dataset in datasets]
+    works = [_Work(root, one, encoder, camera) for root, one in zip(roots, datasets, strict=True)]
     with ExitStack() as held:
         for work in works:
-            held.enter_context(work.holding())
-        progress.start(encoder.name, sum(work.frames for work in works))
+            held.enter_context(work.held())
+        progress.start(encoder.name, sum(sum(work.lengths) for work in works))
         pool: EmbeddingIndex | None = None
         reports = {}
         for work in sorted(works, key=lambda work: work.dataset is not units):
-            reports[work] = work.make(progress, threads, pool, force=force)
-            if pool is None:
-                pool = units.index(encoder.name, camera)
+            header, embedded = None if force else work.found(pool), 0
+            if header is not None:
+                progress.advance(header.frames, before=True)
+            else:
+                embedded = work.embed(executor or Serial(), threads, progress, force=force)
+                header = work.write(pool)
+            shutil.rmtree(work.hidden)
+            reports[work] = IndexReport(str(work.folder), embedded, header)
+            pool = pool or units.index(encoder.name, camera)
         return [reports[work] for work in works]
 
 
+@dataclass
+class _EmbedTask:
+    """Embeds an episode; a worker that is another process opens dataset and encoder of its own."""
+
+    files: Files
+    camera: str
+    encoder: Encoder
+    threads: int
+
+    @cached_property
+    def _dataset(self) -> Dataset:
+        return Dataset(self.files)
+
+    def __call__(self, task: int, worker: Worker) -> NDArray[np.float32]:
+        """Return the features of an episode, `(T, D) float32`."""
+        dataset, batch = self._dataset, self.encoder.batch
+        length = dataset.record(task).length
+        features, waiting = [], deque[Future[Any]]()
+
+        def prepare(start: int) -> Any:
+            shape = min(batch, length - start), *dataset.shape(self.camera)
+            images = np.empty(shape, np.uint8)
+            dataset.read_frames(task, self.camera, start, images)
+            return self.encoder.prepare(images)
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            for start in range(0, length, batch):
+                waiting.append(pool.submit(prepare, start))
+                if len(waiting) > 2 * self.threads:  # prepared images are large
+                    features.append(self.encoder.features(waiting.popleft().result()))
+            features += [self.encoder.features(one.result()) for one in waiting]
+        return np.concatenate(features)
+
+
 class _Work:
-    """The index of one dataset, being made."""
+    """The index of one dataset, being made; `pool` is that of the units, None if this is it."""
 
-    def __init__(self, dataset: Dataset, encoder: Encoder, camera: str, pool: str):
-        assert isinstance(dataset.files, LocalFiles)
-        self.dataset = dataset
-        self.encoder = encoder
-        feature = CAMERA_PREFIX + camera.removeprefix(CAMERA_PREFIX)
-        if feature not in dataset.cameras:
-            known = [name.removeprefix(CAMERA_PREFIX) for name in dataset.cameras]
-            raise UnknownNameError(
-                f"camera {camera!r} is not in {dataset.files.describe()}", nearest(camera, known)
-            )
-        self.folder = dataset.files.root / index_folder(encoder.name, feature)
-        self.parts = Parts(self.folder.parent / f".{self.folder.name}.building", dataset, feature)
-        self.frames = sum(self.parts.lengths)
-        self.plan: dict[str, Any] = {
-            "format_version": FORMAT_VERSION,
-            "encoder": {"name": encoder_id(encoder.name), "fingerprint": encoder.fingerprint},
-            "computed": {"in": encoder.computed_in, "batch": encoder.batch},
-            "camera": feature,
-            "pool": pool,
-            "revision": dataset.revision,
-        }
+    def __init__(self, root: Path, dataset: Dataset, encoder: Encoder, camera: str):
+        dataset.shape(camera)  # there is such a camera
+        self.dataset, self.encoder = dataset, encoder
+        self.camera = camera.removeprefix(CAMERA_PREFIX)
+        self.lengths = [record.length for record in dataset.records()]
+        self.computed = {"in": encoder.computed_in, "batch": encoder.batch}
+        self.folder = root / index_folder(encoder.name, camera)
+        self.hidden = self.folder.with_name(f".{self.folder.name}")
+        # Features that were made otherwise have another place: they are never mixed.
+        made_of = canonical_json([encoder.fingerprint, self.computed, dataset.revision])
+        kept = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
+        self.features = [kept / episode_file(episode) for episode in range(len(self.lengths))]
 
-    def holding(self) -> Any:
-        self.parts.folder.mkdir(parents=True, exist_ok=True)
+    def held(self) -> AbstractContextManager[None]:
+        """Keep other processes from making this index."""
+        self.hidden.mkdir(parents=True, exist_ok=True)
         busy = BuildError(f"another process makes {self.folder}", "Wait for it to end, or stop it.")
-        return hold(self.parts.folder / "lock", busy)
+        return hold(self.hidden / "lock", busy)
 
-    def make(
-        self, progress: BuildProgress, threads: int, pool: EmbeddingIndex | None, *, force: bool
-    ) -> IndexReport:
-        """Make the index unless it is there.
-
-        Args:
-            progress: Shows how far it is.
-            threads: Threads that decode and preprocess.
-            pool: The index of the train pool, or None if this is the one.
-            force: Make it even if it is there.
-        """
-        for folder in (self.folder, self.parts.folder):
-            for partial in folder.glob(".*.partial"):  # of a run that was killed while writing
-                partial.unlink()
-        embedded = 0
-        if not force and self.is_done(pool):
-            progress.advance(self.frames, before=True)
-        else:
-            self.parts.begin(self.plan, force=force)
-            embedded = self.parts.embed(self.encoder, progress, threads)
-            self.finish(pool)
-        self.parts.remove()
-        header = read_json(self.folder / INDEX_HEADER)
-        computed = header["computed"]
-        typical = header["typical_cosine"]
-        return IndexReport(
-            self.folder, self.frames, embedded, typical, computed["in"], computed["batch"]
-        )
-
-    def is_done(self, pool: EmbeddingIndex | None) -> bool:
-        """Tell whether the index is there, made as planned on whatever device, and whole."""
+    def found(self, pool: EmbeddingIndex | None) -> IndexHeader | None:
+        """Return the header of the index that is there, if it is right."""
+        files, revision = self.dataset.files, self.dataset.revision
         try:
-            header = read_json(self.folder / INDEX_HEADER)
-            if pool is not None and (
-                header["encoder"]["sha256"] != pool.fingerprint
-                or header["typical_cosine"] != pool.typical_cosine
-            ):
-                return False
-            computed = {name: header["computed"][name] for name in self.plan["computed"]}
-            described = {name: header[name] for name in self.plan}
-            described["encoder"] = {n: header["encoder"][n] for n in self.plan["encoder"]}
-            wanted = {**self.plan, "computed": computed}
-            return canonical_json(described) == canonical_json(wanted) and all(
-                sha256_file(self.folder / name) == file["sha256"]
-                for name, file in header["files"].items()
-            )
-        except (OSError, KeyError, TypeError, FormatError):
-            return False
+            index = EmbeddingIndex(files, revision, self.encoder.name, self.camera)
+            index.check(dict(enumerate(self.lengths)))
+        except InterferenceError:
+            return None
+        wanted = encoder_digest(self.encoder, index.centre), self.camera, revision
+        return index.header if index.made == (pool.made if pool else wanted) else None
 
-    def finish(self, pool: EmbeddingIndex | None) -> None:
-        """Write the index, its header last."""
-        (self.folder / INDEX_HEADER).unlink(missing_ok=True)
-        centre = None
-        if self.encoder.centred:
-            centre = self._mean() if pool is None else pool.centre
-        size = next(self.parts.features()).shape[1]
-        names = [INDEX_EMBEDDINGS, INDEX_ROWS]
-        with atomic_path(self.folder / INDEX_EMBEDDINGS) as partial:
-            out = np.lib.format.open_memmap(  # type: ignore[no-untyped-call]
-                partial, mode="w+", dtype=np.float16, shape=(self.frames, size)
-            )
-            first = 0
-            for features in self.parts.features():
-                out[first : first + len(features)] = normalised(features, centre)
-                first += len(features)
-            out.flush()
-            if pool is None:
-                typical = typical_cosine(np.split(out, np.cumsum(self.parts.lengths)[:-1]))
+    def embed(
+        self, executor: Executor, threads: int, progress: WorkProgress, *, force: bool
+    ) -> int:
+        """Make the features that are missing; return the number of embedded frames."""
+        missing = []
+        for episode, (path, length) in enumerate(zip(self.features, self.lengths, strict=True)):
+            if path.is_file() and not force:
+                progress.advance(length, before=True)
             else:
-                typical = pool.typical_cosine
-            del out
-        with atomic_path(self.folder / INDEX_ROWS) as partial:
-            pq.write_table(self._rows(), partial)
-        centre_sha256 = None
+                missing.append(episode)
+        task = _EmbedTask(self.dataset.files, self.camera, self.encoder, threads)
+        for outcome in executor.run(task, missing):
+            about = self.dataset.record(outcome.task).episode_id
+            if isinstance(outcome.error, InterferenceError):
+                raise outcome.error
+            if outcome.error is not None:
+                what = f"{about} cannot be embedded: {first_line(outcome.error)}"
+                raise BuildError(what, "Finished episodes are kept: mend it, and go on.")
+            if not np.isfinite(outcome.value).all():
+                raise BuildError(
+                    f"encoder {self.encoder.name!r} gave values that are not finite for {about}",
+                    "Its weights may be damaged, or its precision too low: try --device cpu",
+                )
+            with atomic_path(self.features[outcome.task]) as partial, partial.open("wb") as file:
+                np.save(file, outcome.value)
+            progress.advance(len(outcome.value))
+        return sum(self.lengths[episode] for episode in missing)
+
+    def write(self, pool: EmbeddingIndex | None) -> IndexHeader:
+        """Write the index, and give it its name."""
+        made, encoder = self.hidden / "made", self.encoder
+        shutil.rmtree(made, ignore_errors=True)
+        centre = pool.centre if pool else self._mean() if encoder.centred else None
+        names = [episode_file(episode) for episode in range(len(self.lengths))]
+        for name, path in zip(names, self.features, strict=True):
+            (made / name).parent.mkdir(parents=True, exist_ok=True)
+            embeddings = normalised(np.load(path), centre)
+            np.save(made / name, embeddings)
+        typical = (
+            pool.header.typical_cosine
+            if pool
+            else typical_cosine(len(names), lambda episode: np.load(made / names[episode]))
+        )
         if centre is not None:
-            names.append(INDEX_CENTRE)
-            with atomic_path(self.folder / INDEX_CENTRE) as partial, partial.open("wb") as file:
-                np.save(file, centre)
-            centre_sha256 = sha256_file(self.folder / INDEX_CENTRE)
-        else:
-            (self.folder / INDEX_CENTRE).unlink(missing_ok=True)
-        encoder = self.plan["encoder"]
-        digest = fingerprint_digest(encoder["fingerprint"], centre_sha256)
-        header = {
-            **self.plan,
-            "encoder": {**encoder, "sha256": digest},
-            "frames": self.frames,
-            "size": size,
-            "typical_cosine": typical,
-            "files": {
-                name: {
-                    "bytes": (self.folder / name).stat().st_size,
-                    "sha256": sha256_file(self.folder / name),
-                }
-                for name in names
-            },
-        }
-        write_json(self.folder / INDEX_HEADER, header)
+            names.append(CENTRE_FILE)
+            np.save(made / CENTRE_FILE, centre)
+        write_text(made / INDEX_SUMS, format_sums(made, names))
+        digest = encoder_digest(encoder, centre)
+        header = IndexHeader(
+            format_version=FORMAT_VERSION,
+            encoder=EncoderRecord(encoder_id(encoder.name), encoder.fingerprint, digest),
+            computed=self.computed,
+            camera=self.camera,
+            revision=self.dataset.revision,
+            pool=pool.header.pool if pool else self.dataset.revision,
+            frames=sum(self.lengths),
+            size=embeddings.shape[1],
+            typical_cosine=typical,
+            sums=sha256_file(made / INDEX_SUMS),
+        )
+        write_json(made / INDEX_HEADER, to_dict(header))
+        shutil.rmtree(self.folder, ignore_errors=True)
+        made.rename(self.folder)
+        return header
 
     def _mean(self) -> NDArray[np.float32]:
         """Return the mean of the features, `(D,) float32`, each episode weighing the same."""
-        means = (features.mean(axis=0, dtype=np.float64) for features in self.parts.features())
-        return np.asarray(sum(means) / len(self.parts.lengths), np.float32)
-
-    def _rows(self) -> pa.Table:
-        lengths = self.parts.lengths
-        episodes = np.repeat(np.arange(len(lengths)), lengths)
-        firsts = np.cumsum([0, *lengths[:-1]])
-        rows = np.arange(self.frames)
-        return pa.table(
-            {
-                "episode_index": pa.array(episodes, pa.int64()),
-                "episode_id": self.dataset.episodes["episode_id"].take(pa.array(episodes)),
-                "frame": pa.array(rows - np.repeat(firsts, lengths), pa.int32()),
-                "row": pa.array(rows, pa.int64()),
-            }
-        )
+        means = (np.load(path).mean(axis=0, dtype=np.float64) for path in self.features)
+        return np.asarray(sum(means) / len(self.features), np.float32)

@@ -1,34 +1,17 @@
 """Cut a history into segments where it stops resembling itself: pure.
 
-The paper's rule: a cut wherever the cosine of adjacent frames is below a threshold. 0.923 is the
-threshold for its encoder alone; `adaptive_threshold` gives one for any encoder.
+The paper's rule: a cut wherever the cosine of adjacent frames is below a threshold.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidOptionError
-
-__all__ = [
-    "MIN_FRAMES",
-    "Span",
-    "adaptive_threshold",
-    "adjacent_cosines",
-    "cosines",
-    "segments",
-    "typical_cosine",
-]
+__all__ = ["Span", "adjacent_cosines", "cosines", "segments", "typical_cosine"]
 
 Span = tuple[int, int]
 """First frame, and the one after the last."""
-
-MIN_FRAMES = 4
-"""Frames of the shortest segment that may be chosen (released reference)."""
-
-_BLOCK = 4096
-"""Embeddings that are held as float32 at a time."""
 
 _DIGITS = 6
 """Cosines are rounded, so that frames that are equal tie on every machine."""
@@ -36,36 +19,25 @@ _DIGITS = 6
 _SAMPLE = 1024
 
 
-def cosines(
-    embeddings: NDArray[np.float16], query: NDArray[np.floating], block: int = _BLOCK
-) -> NDArray[np.float32]:
-    """Return the cosine of each embedding with one, `(T,) float32`, in bounded memory.
+def cosines(embeddings: NDArray[np.floating], query: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the cosine of each embedding with one, `(T,) float32`.
 
     Args:
-        embeddings: `(T, D) float16`, each of length 1; may be a memory map.
+        embeddings: `(T, D)`, each of length 1.
         query: `(D,)`, of length 1.
-        block: Embeddings that are held as float32 at a time.
     """
-    wanted = query.astype(np.float32)
-    out = np.empty(len(embeddings), np.float32)
-    for first in range(0, len(embeddings), block):
-        rows = embeddings[first : first + block].astype(np.float32)
-        out[first : first + block] = rows @ wanted
-    return np.round(out, _DIGITS)
+    rows = embeddings.astype(np.float32, copy=False)
+    return np.round(rows @ query.astype(np.float32), _DIGITS)
 
 
-def adjacent_cosines(embeddings: NDArray[np.float16], block: int = _BLOCK) -> NDArray[np.float32]:
-    """Return the cosine of each frame with the next, `(T - 1,) float32`, in bounded memory.
+def adjacent_cosines(embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the cosine of each frame with the next, `(T - 1,) float32`; none of no frames.
 
     Args:
-        embeddings: `(T, D) float16`, each of length 1; may be a memory map.
-        block: Embeddings that are held as float32 at a time.
+        embeddings: `(T, D)`, each of length 1.
     """
-    out = np.empty(max(len(embeddings) - 1, 0), np.float32)
-    for first in range(0, len(out), block):
-        rows = embeddings[first : first + block + 1].astype(np.float32)
-        out[first : first + block] = np.einsum("td,td->t", rows[:-1], rows[1:])
-    return np.round(out, _DIGITS)
+    rows = embeddings.astype(np.float32, copy=False)
+    return np.round(np.einsum("td,td->t", rows[:-1], rows[1:]), _DIGITS)
 
 
 def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[Span, ...]:
@@ -83,7 +55,7 @@ def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[Span, ...
     return tuple(zip(starts, stops, strict=True))
 
 
-def typical_cosine(episodes: Sequence[NDArray[np.float16]]) -> float:
+def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float16]]) -> float:
     """Return the median cosine of two frames of different episodes.
 
     It tells what an encoder finds in two frames that have nothing to do with each other: near 1
@@ -91,17 +63,19 @@ def typical_cosine(episodes: Sequence[NDArray[np.float16]]) -> float:
     episode weighs the same: of each there are as many frames in an even sample of about 1024.
 
     Args:
-        episodes: The train pool: of each episode `(T, D) float16`, each of length 1, T at least 1;
-            may be memory maps.
+        episodes: How many the pool holds.
+        read: Returns the embeddings of one of them, `(T, D) float16`, each of length 1, T at
+            least 1.
 
     Returns:
         From −1 to 1; 0 if there are fewer than two episodes.
     """
-    if len(episodes) < 2:
+    if episodes < 2:
         return 0.0
-    chosen = [episodes[n] for n in _middles(len(episodes), min(len(episodes), _SAMPLE))]
+    chosen = _middles(episodes, min(episodes, _SAMPLE))
     each = _SAMPLE // len(chosen)
-    sample = np.concatenate([one[_middles(len(one), each)] for one in chosen]).astype(np.float32)
+    parts = [found[_middles(len(found), each)] for found in map(read, chosen)]
+    sample = np.concatenate(parts).astype(np.float32)
     owner = np.repeat(np.arange(len(chosen)), each)
     pairs = (sample @ sample.T)[owner[:, None] < owner]
     return round(float(np.median(pairs)), 4)
@@ -110,23 +84,3 @@ def typical_cosine(episodes: Sequence[NDArray[np.float16]]) -> float:
 def _middles(length: int, count: int) -> list[int]:
     """Return the middle of each of `count` equal parts of `range(length)`."""
     return [(2 * part + 1) * length // (2 * count) for part in range(count)]
-
-
-def adaptive_threshold(typical: float) -> float:
-    """Return the cut that is halfway from what unrelated frames share (`typical`) to equality.
-
-    Ours. It has no free parameter, and knows the train pool but no test episode; with it, a
-    threshold need not be fitted for every encoder.
-
-    Raises:
-        InvalidOptionError: `typical` is no cosine.
-    """
-    if not -1 <= typical <= 1:
-        raise InvalidOptionError(f"typical cosine {typical}; expected −1 to 1")
-    return (1 + typical) / 2
-
-
-def long_enough(spans: tuple[Span, ...], least: int = MIN_FRAMES) -> Iterator[Span]:
-    """Yield the segments of at least `least` frames; all of them if none is so long (ours)."""
-    kept = [span for span in spans if span[1] - span[0] >= least]
-    yield from kept or spans

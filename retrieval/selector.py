@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.constants import CAMERA_PREFIX, INDEX_CENTRE
-from robomme_interference_data.draw import even_sample
+from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.embeddings import (
     EmbeddingIndex,
     encoder_id,
@@ -17,23 +16,24 @@ from robomme_interference_data.embeddings import (
     normalised,
 )
 from robomme_interference_data.errors import InvalidOptionError, StaleIndexError
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.retrieval.encoders import make_encoder, published_threshold
-from robomme_interference_data.retrieval.encoders.base import fingerprint_digest
-from robomme_interference_data.retrieval.segment import Span
-from robomme_interference_data.retrieval.select import SEGMENT_METHODS, Choice, Rule, choose
+from robomme_interference_data.retrieval.encoders import (
+    encoder_digest,
+    make_encoder,
+    published_threshold,
+)
+from robomme_interference_data.retrieval.select import Rule, choose, measure
+from robomme_interference_data.sampling import even_sample, lesson_share
 
-__all__ = ["Selection", "Selector", "lot_of", "select", "true_lesson"]
+__all__ = ["Selection", "Selector"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Selection:
-    """The span of a history that is handed to the policy, and what it was chosen by.
+    """The span of a history that is handed to the policy.
 
     Attributes:
         start: First frame in the buffer.
         stop: Frame after the last one.
-        choice: Segments, scores and cosines, for the picture.
         lesson_fraction: Share of lesson frames in an even 32-frame sample of the span and the
             first live observation, as in the released CSV.
         filler_fraction: The same for frames of other sessions.
@@ -42,7 +42,6 @@ class Selection:
 
     start: int
     stop: int
-    choice: Choice
     lesson_fraction: float
     filler_fraction: float
     query_fraction: float
@@ -63,7 +62,7 @@ class Selector:
     Raises:
         UnknownNameError: There is no such encoder or method.
         InvalidOptionError: The method chooses single frames, or the cut is no cosine.
-        MissingExtraError, MissingWeightsError, FormatError: See `make_encoder`.
+        MissingExtraError, HubError, FormatError: See `make_encoder`.
     """
 
     def __init__(
@@ -74,12 +73,10 @@ class Selector:
         camera: str = "front",
         device: str | None = None,
     ):
-        self.rule = Rule.parse(rule).settled(published_threshold(encoder))
+        self.rule = Rule.parse(rule, published_threshold(encoder))
         if self.rule.method == "top32":
-            raise InvalidOptionError(
-                "method 'top32' chooses single frames; a policy is handed a span",
-                f"Choose one of {', '.join(SEGMENT_METHODS)}.",
-            )
+            expected = "one that chooses a span: a policy is not handed single frames"
+            raise InvalidOptionError.expected("rule", rule, expected)
         self.camera = camera.removeprefix(CAMERA_PREFIX)
         self._encoder = make_encoder(encoder, device=device)
 
@@ -97,22 +94,20 @@ class Selector:
             buffer: Any buffer of the split whose index it looks up.
 
         Returns:
-            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the embeddings
-            (weights, settings, preprocessing, centre); `camera`; `method`; `cut`, a cosine or
-            `adaptive`; and `threshold`, the cosine that it comes to.
+            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the embeddings;
+            `camera`; `method`; `cut`; and `threshold`, the cosine that the cut comes to.
 
         Raises:
             MissingIndexError, StaleIndexError, FormatError: As for `select`.
         """
-        index = buffer.query_index(self._encoder.name, self.camera)
-        self._check(index)
+        header = self._index(buffer).header
         return {
             "encoder": encoder_id(self._encoder.name),
-            "fingerprint": index.fingerprint,
+            "fingerprint": header.encoder.sha256,
             "camera": self.camera,
             "method": self.rule.method,
             "cut": self.rule.cut,
-            "threshold": self.rule.threshold(index.typical_cosine),
+            "threshold": self.rule.threshold(header.typical_cosine),
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Selection:
@@ -125,88 +120,30 @@ class Selector:
         Raises:
             MissingIndexError: The data has no embeddings of this encoder.
             StaleIndexError: They were made of other data, or with another version of the encoder.
-            InvalidOptionError: The buffer is empty, or the image has another shape.
+            InvalidOptionError: The buffer is empty, or holds no lesson for `oracle`, or the image
+                has another shape.
         """
-        index = buffer.query_index(self._encoder.name, self.camera)
-        self._check(index)
+        index = self._index(buffer)
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise InvalidOptionError(
-                f"image of shape {image.shape}, {image.dtype}; expected (H, W, 3) uint8"
-            )
+            given = f"{image.dtype} of shape {image.shape}"
+            raise InvalidOptionError.expected("image", given, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = normalised(features, index.centre)[0]
-        return select(buffer, self._encoder.name, self.rule, query, camera=self.camera)
+        measured = measure(buffer, self._encoder.name, self.camera, query)
+        start, stop = choose(measured, self.rule).span
+        frames = len(even_sample(stop - start))
+        lesson = lesson_share(buffer.sessions, start, stop)
+        others = frames - 1 - round(lesson * frames)
+        return Selection(start, stop, lesson, others / frames, 1 / frames)
 
-    def _check(self, index: EmbeddingIndex) -> None:
-        """Check that the index was made with this very encoder."""
-        centre = index.header["files"].get(INDEX_CENTRE, {}).get("sha256")
-        if index.fingerprint != fingerprint_digest(self._encoder.fingerprint, centre):
+    def _index(self, buffer: Buffer) -> EmbeddingIndex:
+        """Return the index of the query, made with this very encoder."""
+        index = buffer.query.dataset.index(self._encoder.name, self.camera)
+        if index.header.encoder.sha256 != encoder_digest(self._encoder, index.centre):
             raise StaleIndexError(
                 f"the embeddings of {self._encoder.name!r} beside the data were made with another "
                 "version of the encoder: its weights, settings, preprocessing or code differ",
-                "Make them again: robomme-interference index --data SPLIT --encoder "
+                "Make them again: robomme-interference index SPLIT --encoder "
                 f"{self._encoder.name} --camera {self.camera}",
             )
-
-
-def select(
-    buffer: Buffer,
-    encoder: str,
-    rule: Rule,
-    query: NDArray[np.floating] | None = None,
-    *,
-    camera: str = "front",
-) -> Selection:
-    """Choose the span of a buffer by embeddings that are there; no encoder is needed.
-
-    Args:
-        buffer: The history.
-        encoder: Name of the encoder whose index is looked up.
-        rule: How to choose, its cut settled.
-        query: Embedding of the live observation, `(D,)`; None for the stored first one.
-        camera: Camera whose index is looked up.
-
-    Raises:
-        MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
-        InvalidOptionError: The buffer is empty, or the rule chooses single frames.
-    """
-    choice = choose(
-        buffer.embeddings(encoder, camera),
-        buffer.query_embedding(encoder, camera) if query is None else query,
-        threshold=rule.threshold(buffer.query_index(encoder, camera).typical_cosine),
-        method=rule.method,
-        lesson=true_lesson(buffer) if rule.method == "oracle" else None,
-        lot=lot_of(buffer.episode_id, buffer.k),
-    )
-    start, stop = choice.span
-    return Selection(start, stop, choice, *_fractions(buffer, start, stop))
-
-
-def lot_of(episode_id: EpisodeId, k: int) -> str:
-    """Return what the method `random` draws by for one buffer."""
-    return f"{episode_id} k{k}"
-
-
-def true_lesson(buffer: Buffer) -> Span:
-    """Return the span of the lesson in a buffer, for grading.
-
-    Raises:
-        InvalidOptionError: The buffer has no lesson, or has it in several parts.
-    """
-    found = [session.span for session in buffer.sessions if session.role == "lesson"]
-    if len(found) != 1:
-        raise InvalidOptionError(
-            f"the buffer of {buffer.episode_id} at k={buffer.k} has {len(found)} lesson sessions; "
-            "expected 1"
-        )
-    return found[0]
-
-
-def _fractions(buffer: Buffer, start: int, stop: int) -> tuple[float, float, float]:
-    """Return the shares of lesson, other sessions and live observation in an even sample."""
-    sample = even_sample(stop - start)
-    lessons = [session.span for session in buffer.sessions if session.role == "lesson"]
-    history = [start + index for index in sample if index < stop - start]
-    lesson = sum(any(first <= frame < last for first, last in lessons) for frame in history)
-    counts = (lesson, len(history) - lesson, len(sample) - len(history))
-    return counts[0] / len(sample), counts[1] / len(sample), counts[2] / len(sample)
+        return index

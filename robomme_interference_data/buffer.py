@@ -256,7 +256,7 @@ class Buffer:
                     f"--encoder {encoder}",
                 )
             values = index.span(entry.episode_index, entry.start, entry.stop)
-            parts.append(np.repeat(values, entry.repeat, axis=0))
+            parts.append(values if entry.repeat == 1 else np.repeat(values, entry.repeat, axis=0))
         return np.concatenate(parts)
 
     def verify(self) -> None:

@@ -27,7 +27,6 @@ __all__ = [
     "BadRowsError",
     "MissingIndexError",
     "StaleIndexError",
-    "MissingWeightsError",
     # what was to be written
     "BuildError",
     "PoolTooSmallError",
@@ -161,10 +160,6 @@ class MissingIndexError(InterferenceError, FileNotFoundError):
 
 class StaleIndexError(InterferenceError, ValueError):
     """Embeddings that were made of other data, or with another encoder, than is asked for."""
-
-
-class MissingWeightsError(InterferenceError, FileNotFoundError):
-    """The weights of a model are not on this machine."""
 
 
 class BuildError(InterferenceError, RuntimeError):

@@ -3,12 +3,15 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
+
+import pyarrow as pa
 
 from robomme_interference_data.files import atomic_path
+from robomme_interference_data.rows import arrow_schema, to_dict
 
 __all__ = ["Column", "Kind", "Table", "percent", "points", "write_tables"]
 
@@ -46,6 +49,15 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[tuple[Any, ...], ...]
     note: str = ""
+
+    @classmethod
+    def of(cls, record: type, rows: Iterable[Any], name: str, title: str) -> Self:
+        """Return records of one type as a table: the columns are those of its Arrow schema."""
+        kinds: dict[Any, Kind] = {pa.int64(): "count", pa.float64(): "ratio", pa.bool_(): "flag"}
+        schema = arrow_schema(record)
+        columns = tuple(Column(field.name, kinds.get(field.type, "text")) for field in schema)
+        plain = map(to_dict, rows)
+        return cls(name, title, columns, tuple(tuple(map(r.get, schema.names)) for r in plain))
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows by column name, NaN as None, for JSON."""

@@ -1,34 +1,111 @@
-"""Image encoders by name."""
+"""Image encoders by name: what each is to the rest, and what is known of it without its weights."""
+
+from hashlib import sha256
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.encoders.base import Encoder
-from robomme_interference_data.retrieval.encoders.names import (
-    KINDS,
-    encoder_name,
-    published_threshold,
-)
+from robomme_interference_data.embeddings import encoder_id
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.files import canonical_json
 
-__all__ = ["KINDS", "Encoder", "encoder_name", "make_encoder", "published_threshold"]
+__all__ = ["Encoder", "encoder_digest", "encoder_name", "make_encoder", "published_threshold"]
+
+_KINDS = ("siglip", "thumbnail")
+
+_PUBLISHED = {"siglip": 0.923}
+"""Encoder to the paper's cut (section "Adding Retrieval"), which was made for it alone."""
+
+
+class Encoder(Protocol):
+    """Turns images into vectors whose cosine tells how alike two images are; can be pickled.
+
+    An image's features depend on that image alone: not on its neighbours in a batch (beyond
+    what float16 keeps), nor on the data that it is from.
+
+    Attributes:
+        name: Under which `make_encoder` makes it.
+        centred: Whether the mean over a data set is taken off the features before they are
+            normalised.
+        batch: Images that it takes best at a time.
+    """
+
+    name: str
+    centred: bool
+    batch: int
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What determines the features, as plain values: model, weights, preprocessing."""
+        ...
+
+    @property
+    def computed_in(self) -> str:
+        """Where and in which precision it computes, in words."""
+        ...
+
+    def prepare(self, images: NDArray[np.uint8]) -> Any:
+        """Preprocess images, `(N, H, W, 3) uint8` RGB; may be called from several threads."""
+        ...
+
+    def features(self, prepared: Any) -> NDArray[np.float32]:
+        """Return the features, `(N, D) float32`, of what `prepare` returned."""
+        ...
+
+
+def encoder_digest(encoder: Encoder, centre: NDArray[np.float32] | None) -> str:
+    """Return the one hash of all that determines embeddings: encoder and centre."""
+    digest = None if centre is None else sha256(centre.tobytes()).hexdigest()
+    text = canonical_json({"centre": digest, "encoder": encoder.fingerprint})
+    return sha256(text.encode()).hexdigest()
+
+
+def encoder_name(name: str) -> str:
+    """Return the one name of an encoder: `siglip` for the paper's model, however it was given.
+
+    Args:
+        name: `thumbnail`, `siglip` (the paper's model), or `siglip:` and the id or folder of a
+            SigLIP or SigLIP 2 model, such as `siglip:google/siglip2-base-patch16-224`.
+
+    Raises:
+        UnknownNameError: There is no such encoder.
+        InvalidOptionError: It takes no model, or names none.
+    """
+    kind, colon, model = name.partition(":")
+    if kind not in _KINDS:
+        raise UnknownNameError(f"there is no encoder {name!r}", nearest(kind, _KINDS))
+    if colon and (kind == "thumbnail" or not model):
+        expected = "thumbnail, siglip, or siglip:ID with the id or folder of a model"
+        raise InvalidOptionError.expected("encoder", name, expected)
+    return "siglip" if model == PAPER_ENCODER else name
+
+
+def published_threshold(name: str) -> float | None:
+    """Return the cut that was published for an encoder, at whatever revision, or None.
+
+    A folder is not known to hold the published weights, whatever its name: None.
+    """
+    return _PUBLISHED.get(encoder_id(encoder_name(name)))
 
 
 def make_encoder(name: str, *, device: str | None = None, batch: int | None = None) -> Encoder:
     """Make an encoder; heavy libraries are loaded only if it needs them.
 
     Args:
-        name: `thumbnail`, `siglip` (the paper's model) or `siglip:` and the id or folder of a
-            SigLIP or SigLIP 2 model, such as `siglip:google/siglip2-base-patch16-224`.
+        name: As `encoder_name` reads it.
         device: Where to compute, such as `cpu`; None for a GPU if there is one.
         batch: Images at a time; None for what suits the encoder.
 
     Raises:
         UnknownNameError: There is no such encoder.
         InvalidOptionError: An option is out of range, or the encoder takes no model.
-        MissingExtraError, MissingWeightsError, FormatError: See `siglip.Siglip`.
+        MissingExtraError, HubError, FormatError: See `siglip.Siglip`.
     """
     kind, _, model = encoder_name(name).partition(":")
     if batch is not None and batch < 1:
-        raise InvalidOptionError(f"batch={batch}; expected 1 or more")
+        raise InvalidOptionError.expected("batch", batch, "1 or more")
     if kind == "thumbnail":
         from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 

@@ -1,11 +1,9 @@
-"""SigLIP and SigLIP 2, the paper's encoders, through transformers. The only file that imports it.
-
-Nothing is downloaded: weights are read from a folder or from the Hub's cache.
-"""
+"""SigLIP and SigLIP 2, the paper's encoders: the only file that imports transformers."""
 
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -18,9 +16,11 @@ from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
     MissingExtraError,
-    MissingWeightsError,
+    first_line,
 )
-from robomme_interference_data.retrieval.encoders.names import encoder_name
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.hub import locate
+from robomme_interference_data.retrieval.encoders import encoder_name
 
 __all__ = ["Siglip"]
 
@@ -31,6 +31,8 @@ _VERSION = 1
 
 _NOT_COMPUTING = ("_name_or_path", "architectures", "dtype", "transformers_version")
 """Settings of a vision tower that say where it came from, not what it computes."""
+
+_NOT_WHOLE = "The folder is not a whole model: download or save it again."
 
 
 class Siglip:
@@ -43,7 +45,7 @@ class Siglip:
 
     Raises:
         MissingExtraError: torch, transformers or Pillow is not installed.
-        MissingWeightsError: The model is not on this machine.
+        HubError: The model is neither on this machine nor can it be downloaded.
         FormatError: It is no SigLIP model, or not a whole one.
         InvalidOptionError: There is no such device.
     """
@@ -53,26 +55,43 @@ class Siglip:
     def __init__(
         self, model: str = PAPER_ENCODER, *, device: str | None = None, batch: int | None = None
     ):
-        torch, transformers = _libraries()
+        try:
+            import PIL  # noqa: F401 - the image processor needs it
+            import torch
+            import transformers
+        except ImportError as error:
+            library = f"torch, transformers and Pillow ({error})"
+            raise MissingExtraError.needs("the encoder siglip", library, "retrieval") from error
+        self._given = model, device, batch
+        self._torch = torch
         self._transformers_version = str(transformers.__version__)
         self.name = encoder_name(f"siglip:{model}")
-        self._torch = torch
-        folder, self._revision = _locate(model)
-        self._model = "/".join(model.partition("@")[0].split("/")[-2:]) if self._revision else None
+        self._model: str | None = None
+        self._revision: str | None = None
+        files = locate(model, "model")
+        if isinstance(files, LocalFiles):
+            folder = files.root
+        else:
+            folder = files.snapshot(*_FILES)
+            self._model, self._revision = files.repo_id, files.commit
         try:
             self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
             torch.empty(0, device=self._device)
         except (RuntimeError, AssertionError) as error:
-            reason = str(error).partition("\n")[0]
-            raise InvalidOptionError(
-                f"device {device!r} cannot be used: {reason}", "Try: --device cpu"
-            ) from None
+            what = f"device {device!r} cannot be used: {first_line(error)}"
+            raise InvalidOptionError(what, "Try: --device cpu") from None
         self.batch = batch or (32 if self._device.type == "cuda" else 8)
         with _quiet(transformers):
             self._vision, self._processor = _load(transformers, model, folder)
         self._weights_sha256 = _weights_digest(self._vision)
-        self._dtype = self._precision()
+        self._dtype = torch.float32
+        if self._device.type == "cuda":
+            self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
         self._vision.to(self._device, self._dtype)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let a worker process load the model itself."""
+        return partial(Siglip, self._given[0], device=self._given[1], batch=self._given[2]), ()
 
     @property
     def fingerprint(self) -> dict[str, Any]:
@@ -109,25 +128,6 @@ class Siglip:
             pooled = self._vision(**inputs).pooler_output
         return pooled.float().cpu().numpy()
 
-    def _precision(self) -> Any:
-        if self._device.type != "cuda":
-            return self._torch.float32
-        supported = self._torch.cuda.is_bf16_supported()
-        return self._torch.bfloat16 if supported else self._torch.float16
-
-
-def _libraries() -> tuple[Any, Any]:
-    try:
-        import PIL  # noqa: F401 - the image processor needs it
-        import torch
-        import transformers
-    except ImportError as error:
-        raise MissingExtraError(
-            f"the encoder siglip needs torch, transformers and Pillow: {error}",
-            'Install them: pip install "robomme-interference-data[retrieval]"',
-        ) from error
-    return torch, transformers
-
 
 @contextmanager
 def _quiet(transformers: Any) -> Iterator[None]:
@@ -144,31 +144,6 @@ def _quiet(transformers: Any) -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _locate(model: str) -> tuple[Path, str | None]:
-    """Return the folder that holds a model, and its commit if it is from the Hub."""
-    from huggingface_hub import constants, snapshot_download
-    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
-
-    if Path(model).is_dir():
-        return Path(model), None
-    repository, _, revision = model.partition("@")
-    try:
-        folder = Path(
-            snapshot_download(repository, revision=revision or None, local_files_only=True)
-        )
-    except (LocalEntryNotFoundError, HFValidationError):
-        folder = None
-    if folder is None or not any(folder.glob("*.safetensors")):
-        pinned = f" --revision {revision}" if revision else ""
-        patterns = " ".join(f'--include "{pattern}"' for pattern in _FILES)
-        raise MissingWeightsError(
-            f"the weights of {model} are neither a folder nor in the Hub's cache, "
-            f"{constants.HF_HUB_CACHE}",
-            f"Where there is a network, type: hf download {repository}{pinned} {patterns}",
-        )
-    return folder, folder.name
-
-
 def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
     """Return the vision tower, in float32 and for inference, and its image processor."""
     from safetensors import SafetensorError
@@ -177,16 +152,15 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
         kind = transformers.AutoConfig.from_pretrained(folder).model_type
         classes = {
             "siglip": transformers.SiglipVisionModel,
-            "siglip_vision_model": transformers.SiglipVisionModel,
             "siglip2": transformers.Siglip2VisionModel,
-            "siglip2_vision_model": transformers.Siglip2VisionModel,
         }
-        if kind not in classes:
+        tower = classes.get(kind.removesuffix("_vision_model"))
+        if tower is None:
             raise FormatError(
                 f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
                 f"For example: --encoder siglip:{PAPER_ENCODER}",
             )
-        vision, loading = classes[kind].from_pretrained(
+        vision, loading = tower.from_pretrained(
             folder, dtype="float32", local_files_only=True, output_loading_info=True
         )
         # transformers would make up what the file lacks, at random.
@@ -194,7 +168,7 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
             raise FormatError(
                 f"{folder} lacks {len(missing)} of the {len(vision.state_dict())} tensors of the "
                 f"vision tower of {model}, such as {missing[0]}",
-                "The folder is not a whole model: download or save it again.",
+                _NOT_WHOLE,
             )
         # Pillow resizes the same everywhere; the other backend only where torchvision is.
         processor = transformers.AutoImageProcessor.from_pretrained(
@@ -203,11 +177,8 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
     except FormatError:
         raise
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-        reason = str(error).partition("\n")[0]
-        raise FormatError(
-            f"{model} cannot be loaded from {folder}: {reason}",
-            "The folder is not a whole model: download or save it again.",
-        ) from error
+        what = f"{model} cannot be loaded from {folder}: {first_line(error)}"
+        raise FormatError(what, _NOT_WHOLE) from error
     return vision.eval(), processor
 
 

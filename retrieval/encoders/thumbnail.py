@@ -27,7 +27,7 @@ class Thumbnail:
 
     name = "thumbnail"
     centred = True
-    batch = 64
+    batch = 16  # the distance of key frames, from which threads decode
     computed_in = "numpy"
 
     @property
@@ -39,9 +39,8 @@ class Thumbnail:
         """Return the features, `(N, 528) float32`: colours from 0 to 1, then differences."""
         height, width = images.shape[1:3]
         if min(height, width) < CELLS:
-            raise InvalidOptionError(
-                f"images of {height} × {width} pixels; thumbnail needs {CELLS} × {CELLS} or more"
-            )
+            expected = f"{CELLS} × {CELLS} or more for thumbnail"
+            raise InvalidOptionError.expected("pixels", (height, width), expected)
         rows, columns = _edges(height), _edges(width)
         # Sums of integers: exact, in whatever order.
         bands = np.add.reduceat(images, rows[:-1], axis=1, dtype=np.uint32)

@@ -1,13 +1,20 @@
 """What every simulator serves, whatever engine is behind it."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 
 __all__ = [
@@ -16,6 +23,7 @@ __all__ = [
     "Demonstration",
     "EpisodeInfo",
     "Observation",
+    "OneAtATime",
     "Simulator",
     "action_array",
     "camera_names",
@@ -86,6 +94,9 @@ class EpisodeInfo:
     simulator: str
 
 
+Begun = tuple[Demonstration, Observation, EpisodeInfo]
+
+
 class Simulator(Protocol):
     """One episode at a time of the benchmark's task families.
 
@@ -93,9 +104,7 @@ class Simulator(Protocol):
     history while it begins the episode.
     """
 
-    def reset(
-        self, episode_id: str, demonstration: bool = True
-    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
+    def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
         """Start an episode: play its demonstration, then set the scene for execution.
 
         The same id gives the same frames, states and first observation, bit for bit.
@@ -104,6 +113,9 @@ class Simulator(Protocol):
             episode_id: `<Family>/<split>/<index>`, such as `MoveCube/test/3`.
             demonstration: Whether the frames of the demonstration are wanted. It is played in any
                 case; without, a simulator need not draw it, and its `images` may be empty.
+
+        Returns:
+            The demonstration, the first live observation, and what may be known of the episode.
 
         Raises:
             InvalidIdError: The text is not an episode id.
@@ -143,6 +155,71 @@ class Simulator(Protocol):
     def close(self) -> None:
         """Release everything. Further calls but `close` are errors."""
         ...
+
+
+class OneAtATime(ABC):
+    """What this package's simulators share: when there is an episode to step, and its time limit.
+
+    An episode that is refused, breaks or ends leaves none to step. One that goes on after 1300
+    steps has timed out.
+    """
+
+    _episode: EpisodeId | None = None
+    _steps = 0
+    _closed = False
+
+    def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
+        """Start an episode; see `Simulator.reset`."""
+        self._episode = None
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
+        episode = EpisodeId.parse(str(episode_id))
+        begun = self._begin(episode, demonstration)
+        self._episode, self._steps = episode, 0
+        return begun
+
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
+        """Execute one action; see `Simulator.step`."""
+        episode = self._running()
+        action = action_array(action)
+        self._episode = None
+        self._steps += 1
+        seen, status = self._execute(episode, action, observe)
+        if status is Status.ONGOING:
+            if self._steps >= MAX_STEPS:
+                return seen, Status.TIMEOUT
+            self._episode = episode
+        return seen, status
+
+    def close(self) -> None:
+        """Release everything; further calls but `close` are errors."""
+        self._episode, self._closed = None, True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def _running(self) -> EpisodeId:
+        """Return the episode that runs."""
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
+        if self._episode is None:
+            raise SimulatorCrashError(
+                "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
+            )
+        return self._episode
+
+    @abstractmethod
+    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+        """Start an episode."""
+
+    @abstractmethod
+    def _execute(
+        self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
+    ) -> tuple[Observation, Status]:
+        """Execute one action in the episode that runs."""
 
 
 def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:

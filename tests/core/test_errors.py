@@ -30,7 +30,6 @@ BUILTINS = {
     "BadRowsError": ValueError,
     "MissingIndexError": FileNotFoundError,
     "StaleIndexError": ValueError,
-    "MissingWeightsError": FileNotFoundError,
     "BuildError": RuntimeError,
     "PoolTooSmallError": ValueError,
     "HistoryTooLongError": ValueError,

@@ -1,0 +1,335 @@
+"""The film strip: its layout by hand, pictures read back, their bytes, and what cannot be drawn."""
+
+import base64
+import io
+import re
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from support.retrieval import remade, sessions_of
+from support.splits import QUERIES
+
+from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data.errors import InvalidOptionError, MissingExtraError, UnknownNameError
+from robomme_interference_data.page import ink_on, open_page
+from robomme_interference_data.sampling import spread
+from robomme_interference_data.strip import (
+    COLORS,
+    LESSON_COLOR,
+    Block,
+    arrange,
+    draw_strip,
+    session_colors,
+)
+
+pytest.importorskip("matplotlib")
+
+
+def labels(svg: Path) -> list[str]:
+    """All texts of the picture; matplotlib notes each in a comment beside its outline."""
+    return re.findall(r"<!-- (.*?) -->", svg.read_text(encoding="utf-8"))
+
+
+def pictures(svg: Path) -> list[NDArray[np.uint8]]:
+    from PIL import Image
+
+    found = re.findall(r'href="data:image/png;base64,([^"]*)"', svg.read_text(encoding="utf-8"))
+    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(png))))[..., :3] for png in found]
+
+
+def coarse(image: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Means of 4 × 4 fields: the same for a picture and a smaller or larger one of it."""
+    rows = np.array_split(image.astype(float), 4, axis=0)
+    return np.array([[f.mean((0, 1)) for f in np.array_split(r, 4, axis=1)] for r in rows])
+
+
+def of_lengths(split: Path, frames: Sequence[int], **changes: object) -> Buffer:
+    """A lesson and then units in turn, of so many frames each: more are had by holding them."""
+    lesson, *units = load_split(split).manifest(QUERIES[0], "k3").sessions
+    entries = []
+    for number, count in enumerate(frames):
+        entry = units[number % 3] if number else lesson
+        repeat = -(-count // entry.stop)
+        entries.append(replace(entry, stop=count // repeat, repeat=repeat))
+    return remade(split, entries, **changes)
+
+
+@pytest.fixture(scope="module")
+def buffer(tiny_split: Path) -> Buffer:
+    """A lesson of 48 frames and three units of 32."""
+    return load_buffer(QUERIES[0], "k3", split=tiny_split)
+
+
+@pytest.fixture(scope="module")
+def strip(buffer: Buffer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("strip") / "strip.svg"
+    draw_strip(buffer, out)
+    return out
+
+
+# --- layout ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frames", "slots", "blocks"),
+    [
+        ([], 3, []),
+        ([48], 3, [Block(0, 0, 3, 12)]),  # alone, it takes the row
+        ([5], 3, [Block(0, 0, 3, 5)]),
+        ([48, 32, 32, 32], 4, [Block(0, n, 1, 3) for n in range(4)]),
+        ([257, 32, 32, 32], 3, [Block(0, 0, 3, 12), *(Block(1, n, 1, 4) for n in range(3))]),
+        # A long session gives way where that saves a row.
+        ([1077, 32], 3, [Block(0, 0, 2, 8), Block(0, 2, 1, 4)]),
+        ([32, 257, 32], 4, [Block(0, 0, 1, 3), Block(0, 1, 2, 6), Block(0, 3, 1, 3)]),
+    ],
+)
+def test_layout(frames: list[int], slots: int, blocks: list[Block]) -> None:
+    found = arrange(frames)
+    assert found[1] == blocks and (not blocks or found[0] == slots)
+
+
+@given(st.lists(st.integers(1, 3000), min_size=1, max_size=64))
+def test_every_session_has_a_place_of_its_own(frames: list[int]) -> None:
+    slots, blocks = arrange(frames)
+    assert len(blocks) == len(frames)
+    places = [(b.row, b.slot + n) for b in blocks for n in range(b.slots)]
+    assert places == sorted(set(places))
+    assert {row for row, _ in places} == set(range(blocks[-1].row + 1))
+    assert max(slot for _, slot in places) < slots
+    for block, count in zip(blocks, frames, strict=True):
+        assert block.frames == min(count, block.slots * 12 // slots)
+
+
+def colors_of(families: str, lessons: Sequence[int]) -> list[str]:
+    names = [f"{family}/train/0" for family in families]
+    return session_colors(sessions_of(names, [(n, n + 1) for n in range(len(names))], lessons))
+
+
+def test_colors_by_family_in_order_of_appearance() -> None:
+    assert colors_of("MIRI", [0]) == [LESSON_COLOR, COLORS[0], COLORS[1], COLORS[0]]
+    assert colors_of("IMRM", [1, 3]) == [COLORS[0], LESSON_COLOR, COLORS[1], LESSON_COLOR]
+    assert colors_of("MM", []) == [COLORS[0]] * 2
+    colors = colors_of("ABCDEFGHIJ", [0])
+    assert len(set(colors[:9])) == 9 and colors[9] == colors[1]  # a tenth starts over
+
+
+@pytest.mark.parametrize("color", [LESSON_COLOR, *COLORS])
+def test_text_on_a_color_has_the_contrast_of_wcag_aa(color: str) -> None:
+    def luminance(rgb: str) -> float:
+        values = [int(rgb[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        r, g, b = (v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in values)
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+    ink = {"black": "#000000", "white": "#ffffff"}[ink_on(color)]
+    dark, light = sorted((luminance(color), luminance(ink)))
+    assert (light + 0.05) / (dark + 0.05) >= 4.5
+
+
+# --- pictures ----------------------------------------------------------------------------------
+
+
+def test_says_what_the_buffer_is(strip: Path, buffer: Buffer) -> None:
+    found = labels(strip)
+    assert f"{QUERIES[0]}   k3" in found
+    assert f"Goal: {buffer.goal}" in found
+    # 48 lesson frames of 144: samples are j · 144 // 31, so 0 to 10 of 32, 34%.
+    share = "an even 32-frame sample holds 34% lesson"
+    assert f"144 history frames = 48 lesson + 96 distractor;  {share}" in found
+    assert "0  LESSON" in found and "what the robot sees now" in found
+    assert found[-2:] == ["144", "first live observation"]
+    for number, session in enumerate(buffer.sessions):
+        assert session.family in found and str(session.source) in found
+        assert number == 0 or f"{number}  distractor" in found
+
+
+def test_counts_the_sample_in_each_session(strip: Path) -> None:
+    found = labels(strip)
+    # Of j · 144 // 31 with j = 0 … 31, below 48: j ≤ 10; below 80: j ≤ 17; below 112: j ≤ 24;
+    # below 144: j ≤ 30. So 11, 7, 7 and 6 fall into the sessions, and one is live.
+    counts = [found[found.index(name) + 1] for name in ("0 lesson", "1", "2", "3")]
+    assert counts == ["11", "7", "7", "6"]
+    assert "+1 live" in found
+
+
+def test_shows_the_right_frames_in_order_and_the_live_one_last(strip: Path, buffer: Buffer) -> None:
+    shown = [n for s in buffer.sessions for n in spread(s.start, s.stop, 3)]
+    assert shown == [0, 23, 47, 48, 63, 79, 80, 95, 111, 112, 127, 143]
+    found = labels(strip)
+    assert [int(text) for text in found if text in map(str, shown[1:])][:11] == shown[1:]
+    expected = [buffer.frame(index) for index in shown] + [buffer.query.frame()]
+    drawn = [image[::-1] for image in pictures(strip)]  # stored upside down
+    assert len(drawn) == len(expected)
+    for image, frame in zip(drawn, expected, strict=True):
+        assert np.abs(coarse(image) - coarse(frame)).max() < 12
+
+
+@pytest.mark.parametrize(
+    "frames", [[36], [1, 1], [1100, *[32] * 63]], ids=["k0", "tiny", "long-k63"]
+)
+def test_any_number_of_sessions(tiny_split: Path, tmp_path: Path, frames: list[int]) -> None:
+    out = tmp_path / "strip.svg"
+    made = of_lengths(tiny_split, frames)
+    draw_strip(made, out, camera="wrist")
+    lengths = [len(session) for session in made.sessions]
+    found = labels(out)
+    assert found[1].startswith("wrist camera")
+    live = pictures(out)[-1][::-1]
+    assert np.abs(coarse(live) - coarse(made.query.frame("wrist"))).max() < 12
+    counts = [text for text in found if re.fullmatch(r"\d+ frames?", text)]
+    assert counts == [f"{n} frame{'s' * (n > 1)}" for n in lengths]
+    for number, session in enumerate(made.sessions[1:], 1):
+        assert f"{number}  distractor" in found and str(session.source) in found
+    assert len(pictures(out)) == 1 + sum(block.frames for block in arrange(lengths)[1])
+    view = ET.parse(out).getroot().attrib["viewBox"].split()
+    assert float(view[2]) == pytest.approx(7.2 * 72)
+    assert float(view[3]) < 16 * 72
+
+
+@pytest.mark.parametrize(
+    ("order", "facts", "heads"),
+    [
+        ([], "0 history frames", []),
+        ([1], "32 history frames = 32 distractor", ["0  distractor"]),
+        ([1, 0], "80 history frames = 32 distractor + 48 lesson", ["0  distractor", "1  LESSON"]),
+        (
+            [-1, 1, 0],
+            "96 history frames = 64 lesson + 32 distractor",
+            ["0  LESSON", "1  distractor", "2  LESSON"],
+        ),
+    ],
+    ids=["empty", "absent", "second", "in parts"],
+)
+def test_any_condition(
+    buffer: Buffer,
+    tiny_split: Path,
+    tmp_path: Path,
+    order: list[int],
+    facts: str,
+    heads: list[str],
+) -> None:
+    lesson, unit, *_ = buffer.manifest.sessions
+    entries = [[lesson, unit, replace(lesson, stop=16)][number] for number in order]
+    draw_strip(remade(tiny_split, entries, lesson_share=0.0), tmp_path / "strip.svg")
+    found = labels(tmp_path / "strip.svg")
+    assert f"{facts};  an even 32-frame sample holds 0% lesson" in found
+    assert [text for text in found if re.match(r"\d  ", text)] == heads
+    blocks = arrange([entry.num_frames for entry in entries])[1]
+    assert len(pictures(tmp_path / "strip.svg")) == 1 + sum(block.frames for block in blocks)
+
+
+@pytest.mark.parametrize(
+    ("goal", "line"),
+    [
+        ("pay $5 and $6", "Goal: pay $5 and $6"),
+        ("a\tb\x00\n c", "Goal: a b c"),
+        ("拿起方块", "Goal: 拿起方块"),
+    ],
+)
+def test_odd_goals(
+    tiny_split: Path, tmp_path: Path, goal: str, line: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    draw_strip(of_lengths(tiny_split, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
+    ET.parse(tmp_path / "strip.svg")
+    assert line in labels(tmp_path / "strip.svg")
+    assert not recwarn.list
+
+
+def test_a_long_goal_takes_four_lines_at_most(tiny_split: Path, tmp_path: Path) -> None:
+    goal = " ".join(f"word{n}" for n in range(200))
+    draw_strip(of_lengths(tiny_split, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
+    lines = [text for text in labels(tmp_path / "strip.svg") if "word" in text]
+    assert len(lines) == 4
+    assert lines[0].startswith("Goal: word0 word1 ")
+    assert "…" in lines[3] and lines[3].endswith(" word199")
+
+
+def test_text_that_is_too_wide_shrinks_and_then_loses_its_middle(tmp_path: Path) -> None:
+    with open_page(tmp_path / "page.svg", 2) as page:
+        page.height = 1
+        page.text(0, 0, "fits", 8, width=1)
+        wide = page.text_width("a little too wide", 8)
+        page.text(0, 0.2, "a little too wide", 8, width=0.9 * wide)
+        page.text(0, 0.4, "much too wide for this", 8, width=0.5)
+        small = page.axes.texts[1]
+        assert small.get_size() == pytest.approx(7.2)
+        shortened = page.axes.texts[2].get_text()
+        assert page.text_width(shortened, 6) <= 0.5
+    assert labels(tmp_path / "page.svg") == ["fits", "a little too wide", shortened]
+    start, end = shortened.split("…")
+    assert start and end
+    assert "much too wide for this".startswith(start)
+    assert "much too wide for this".endswith(end)
+
+
+# --- bytes -------------------------------------------------------------------------------------
+
+
+def test_the_readers_own_settings_have_no_effect(
+    buffer: Buffer, strip: Path, tmp_path: Path
+) -> None:
+    import matplotlib
+
+    own = {"font.size": 31, "font.family": "serif", "svg.fonttype": "none", "savefig.dpi": 50}
+    with matplotlib.rc_context(own):
+        draw_strip(buffer, tmp_path / "strip.svg")
+        assert matplotlib.rcParams["font.size"] == 31  # nor are they touched
+    assert (tmp_path / "strip.svg").read_bytes() == strip.read_bytes()
+
+
+def test_no_date_or_version_is_written(buffer: Buffer, strip: Path, tmp_path: Path) -> None:
+    out = tmp_path / "strip.PNG"
+    draw_strip(buffer, out)
+    data = out.read_bytes()
+    position, kinds = 8, []
+    while position < len(data):
+        kinds.append(data[position + 4 : position + 8])
+        position += 12 + int.from_bytes(data[position : position + 4])
+    assert set(kinds) == {b"IHDR", b"pHYs", b"IDAT", b"IEND"}
+    text = strip.read_text(encoding="utf-8")
+    assert "<metadata" not in text and "atplotlib" not in text
+
+
+# --- refusals ----------------------------------------------------------------------------------
+
+
+def test_places_that_cannot_be_written(buffer: Buffer, tmp_path: Path) -> None:
+    for name in ("strip.gif", "strip", "strip.png.txt"):
+        with pytest.raises(InvalidOptionError, match=r"ends in \.png or \.svg") as caught:
+            draw_strip(buffer, tmp_path / name)
+        assert str(caught.value.hint).startswith("For example: ")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "strip.png").mkdir()
+    with pytest.raises(InvalidOptionError, match="is a folder"):
+        draw_strip(buffer, tmp_path / "strip.png")
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidOptionError, match=r"strip\.png cannot be written: "):
+        draw_strip(buffer, tmp_path / "file" / "strip.png")
+
+
+def test_without_matplotlib(
+    buffer: Buffer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(MissingExtraError) as caught:
+        draw_strip(buffer, tmp_path / "strip.png")
+    assert "robomme-interference-data[score]" in str(caught.value.hint)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_keeps_the_old_picture(buffer: Buffer, tmp_path: Path) -> None:
+    out = tmp_path / "strip.png"
+    out.write_bytes(b"old")
+    with pytest.raises(UnknownNameError, match="camera 'fornt'"):
+        draw_strip(buffer, out, camera="fornt")
+    assert out.read_bytes() == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["strip.png"]

@@ -1,0 +1,261 @@
+"""`index`, `retrieve`, `retrieval-score` and `calibrate`: what they print, write and refuse."""
+
+import csv
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from support.retrieval import FRAMES, remade
+from support.splits import QUERIES
+
+from robomme_interference_data import load_split
+from robomme_interference_data.retrieval import drawing, reasons, select
+
+Run = Callable[..., tuple[int, str, str]]
+
+EPISODE = QUERIES[0]
+CONDITIONS = ("k0", "k1", "k3", "k7")
+FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
+
+
+def picture(path: Path) -> tuple[int, int]:
+    """Width and height of a picture that decodes."""
+    with av.open(str(path)) as container:
+        frame = next(container.decode(video=0))
+        assert len(np.unique(frame.to_ndarray(format="rgb24").reshape(-1, 3), axis=0)) > 20
+        return frame.width, frame.height
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+# --- index -------------------------------------------------------------------------------------
+
+
+def test_index(own_split: Path, run: Run) -> None:
+    places = [f"{own_split}/{name}/index/thumbnail" for name in ("demonstrations", "distractors")]
+    code, out, err = run("index", own_split, "--encoder", "thumbnail", "--threads", 1)
+    assert code == 0 and "frames/s" in err
+    assert out.splitlines() == [
+        f"{place}: {count} frames, {count} embedded now"
+        for place, count in zip(places, FRAMES, strict=True)
+    ]
+    header = own_split / "distractors/index/thumbnail/index.json"
+    computed = {"computed": {"in": "cuda, bfloat16", "batch": 32}}
+    header.write_text(json.dumps(json.loads(header.read_text()) | computed))
+    assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_split)[2]
+    code, out, err = run("index", own_split, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert [(one["folder"], one["header"]["frames"], one["embedded"]) for one in found] == [
+        (place, count, 0) for place, count in zip(places, FRAMES, strict=True)
+    ]
+
+
+# --- retrieval-score ---------------------------------------------------------------------------
+
+
+def test_the_table_by_family_and_condition(run: Run, indexed: Path) -> None:
+    code, out, err = run("retrieval-score", indexed)
+    assert code == 0 and "buffers/s" in err
+    assert "3 of 15 buffers hold no lesson and are left out" in err
+    title, _, heads, rule, *rest = out.splitlines()
+    assert title == "Retrieval on split, encoder thumbnail, camera front, rule max/adaptive"
+    assert heads.split()[:3] == ["family", "condition", "queries"] and set(rule) == {"-", " "}
+    counts = dict.fromkeys(FAMILIES, "1") | {"all": "3"}
+    rows = [line.split()[:3] for line in rest[: rest.index("")]]
+    assert rows == [[family, name, counts[family]] for family in counts for name in CONDITIONS]
+    assert out.splitlines()[-1].startswith("Cells of a family and a condition that pass: max/")
+
+
+def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
+    options = ("--rules", "oracle", "last,max/-1", "--out", tmp_path)
+    code, out, err = run("retrieval-score", indexed, *options)
+    assert code == 0 and f"{tmp_path}/cells.csv, rows.csv and retrieval.png written" in err
+    lines = out.splitlines()
+    rows = lines[4 : lines.index("", 4)]
+    assert [row.split()[:3] for row in rows] == [
+        [rule, name, "3"]
+        for rule in ("oracle/adaptive", "last/adaptive", "max/-1")
+        for name in CONDITIONS
+    ]
+    assert all(row.endswith("yes") for row in rows[:4])
+    assert "oracle/adaptive: 12 of 12" in lines[-1]
+    # One segment, whatever comes: all of the lesson, and every other session.
+    whole = [row for row in rows_of(tmp_path / "cells.csv") if row["rule"] == "max/-1"]
+    assert {row["coverage"] for row in whole} == {"1.000000"}
+    for row in whole:
+        k = int(row["condition"].removeprefix("k"))
+        assert float(row["false_sessions"]) == k
+        assert (row["found_cuts"], row["false_cuts"]) == ("0", "0")
+        assert int(row["true_cuts"]) == k * int(row["queries"])
+    found = {
+        (r["rule"], r["episode_id"], r["condition"]): r for r in rows_of(tmp_path / "rows.csv")
+    }
+    assert len(found) == 3 * 12
+    one = found["max/-1", EPISODE, "k3"]
+    assert (one["start"], one["stop"], one["segments"]) == ("0", "144", "1")
+    assert one["purity"] == "0.333333"  # 48 of 144
+    assert picture(tmp_path / "retrieval.png") > (1000, 500)
+
+
+def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexed: Path) -> None:
+    runs = [run("retrieval-score", indexed, "--json", "--out", tmp_path / name) for name in "ab"]
+    assert runs[0][1] == runs[1][1]
+    for name in ("cells.csv", "rows.csv", "retrieval.png"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    found = json.loads(runs[0][1])
+    cells = {(cell["family"], cell["condition"]): cell for cell in found.pop("cells")}
+    assert found == {
+        "split": "split",
+        "revision": load_split(indexed).revision,
+        "encoder": "thumbnail",
+        "camera": "front",
+        "buffers": 12,
+        "left_out": 3,
+        "rules": ["max/adaptive"],
+        "pass_mark": 0.9,
+    }
+    first, every = cells["VideoRepick", "k0"], cells["all", "k0"]
+    assert (every["purity"], every["false_sessions"], every["queries"]) == (1, 0, 3)
+    assert first["queries"] == 1 and first["purity_low"] is None
+
+
+WITHOUT_INDEX = "robomme-interference index {bare} --encoder thumbnail"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("index nowhere", "build all --source KIND:PATH"),
+        ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
+        ("index {bare} --encoder thumbnail:x", "siglip:ID"),
+        ("index {bare} --camera side", "camera 'side'"),
+        ("index {bare} --batch 0", "batch 0"),
+        ("index {bare} --threads 0", "threads 0"),
+        ("index {bare} --workers 0", "workers 0"),
+        ("index {bare}/demonstrations", "expected distractor units"),
+        ("retrieval-score {bare}", WITHOUT_INDEX),
+        ("calibrate {bare}", WITHOUT_INDEX),
+        (f"retrieve {EPISODE} k1 --split {{bare}}", WITHOUT_INDEX),
+        ("retrieval-score {split} --rules best", "there is no method 'best'"),
+        ("retrieval-score {split} --rules max/2", "cut of max 2.0"),
+        ("retrieval-score {split} --encoder clip", "there is no encoder 'clip'"),
+        (f"retrieve {EPISODE} k2 --split {{split}}", "condition 'k2'"),
+        (f"retrieve {EPISODE} no-history --split {{split}}", "the history is empty"),
+        ("retrieve VideoRepick/test/9 k1 --split {split}", "VideoRepick/test/9"),
+        (f"retrieve {EPISODE} k1 --split {{split}} --rule top32", "single frames"),
+        (f"retrieve {EPISODE} k1 --split {{split}} --out why.gif", "ends in"),
+        ("calibrate {split} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
+        ("calibrate {split} --out cuts.pdf", "ends in"),
+    ],
+)
+def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_split: Path) -> None:
+    places = {"split": indexed, "bare": tiny_split}
+    code, out, err = run(*words.format(**places).split())
+    assert (code, out) == (1, "")
+    assert said.format(**places) in err and "Traceback" not in err
+    assert not list(tiny_split.glob("*/index"))
+
+
+# --- retrieve ----------------------------------------------------------------------------------
+
+
+def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
+    out_file = tmp_path / "why.png"
+    words = ("retrieve", EPISODE, "k3", "--split", indexed, "--out", out_file)
+    code, out, err = run(*words, "--rule", "oracle")
+    assert code == 0 and f"{out_file} written" in err
+    first, chosen, why, closest, lesson = out.splitlines()
+    about = f"{EPISODE} under k3, front camera, rule oracle/adaptive: 144 history frames, cut into"
+    assert first.startswith(about)
+    assert chosen == f"Chosen: frames 0 to 47, of lesson {EPISODE}"
+    assert why.startswith("Why: oracle takes the true lesson")
+    assert closest.startswith("What the robot sees now is closest to frame ")
+    assert "the closest one outside is frame " in closest
+    assert lesson.startswith(
+        "The lesson is frames 0 to 47: purity 100.0%, coverage 100.0%, 0 false"
+    )
+    assert picture(out_file) == (1296, 1098)
+
+
+@pytest.mark.parametrize("rule", ["max/-1", "mean/-1", "last/-1", "random/-1"])
+def test_why_is_the_reason_of_the_rule_and_what_the_score_says(
+    rule: str, run: Run, tmp_path: Path, indexed: Path
+) -> None:
+    words = ("retrieve", EPISODE, "k1", "--split", indexed, "--rule", rule)
+    code, out, _ = run(*words)
+    method, why = rule.partition("/")[0], out.splitlines()[2]
+    assert code == 0 and why.startswith(f"Why: {method} takes {select.METHODS[method]}")
+    found = json.loads(run(*words, "--json")[1])
+    score, grade = found["score"], found["grade"]
+    assert (score is None) == (method in ("last", "random"))
+    assert why.endswith(select.METHODS[method] if score is None else f", {score:.3f}")
+    if method == "max":  # one segment: its score is that of the closest frame
+        assert score == found["cosine"]
+    assert found["other"] is None and 0 <= found["closest"] < 80
+    run("retrieval-score", indexed, "--rules", rule, "--json", "--out", tmp_path)
+    [row] = (
+        row
+        for row in rows_of(tmp_path / "rows.csv")
+        if (row["episode_id"], row["condition"]) == (EPISODE, "k1")
+    )
+    shown = {name: row[name] for name in row if name in ("start", "stop", "segments", "rule")}
+    assert {name: str(grade[name]) for name in shown} == shown
+    assert (grade["purity"], row["purity"]) == (0.6, "0.600000")  # 48 of 80
+
+
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        ([1, 0], "lesson is frames 32 to 79: purity 60.0%, coverage 100.0%, 1 false session"),
+        ([1], "the history holds no lesson"),
+    ],
+    ids=["second", "absent"],
+)
+def test_why_wherever_the_lesson_lies(
+    order: list[int], said: str, indexed: Path, tmp_path: Path
+) -> None:
+    planned = load_split(indexed).manifest(EPISODE, "k1").sessions
+    buffer = remade(indexed, [planned[number] for number in order])
+    rule = select.Rule("max", -1.0)
+    measured = select.measure(buffer, "thumbnail")
+    choice = select.choose(measured, rule)
+    found = reasons.reasons(buffer, measured, choice, rule, "thumbnail", "front")
+    assert found.text().endswith(said)
+    drawing.draw_retrieval(buffer, measured, choice, found, tmp_path / "why.svg")
+    assert said.rpartition(": ")[2] in (tmp_path / "why.svg").read_text()
+
+
+# --- calibrate ---------------------------------------------------------------------------------
+
+
+def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
+    figure = tmp_path / "cuts.svg"
+    code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2", "--out", figure)
+    assert code == 0 and f"{figure} written" in err and figure.read_text().startswith("<?xml")
+    assert "Fitted by the released rule: " in out and "in use (max/adaptive): " in out
+    assert all(f"\n{family} " in out for family in FAMILIES)
+    lines = out.splitlines()
+    assert [line.split()[0] for line in lines[-11:]] == [f"{0.1 + n / 100:.2f}" for n in range(11)]
+    heads = lines[-13].split()
+    assert heads[1:3] == ["purity", "k0"] and heads[-2:] == ["coverage", "k7"]
+    code, out, err = run("calibrate", indexed, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "") and (found["left_out"], found["rule"]) == (3, "max/adaptive")
+    middle = (found["cut_percentile"] + found["lowest_percentile"]) / 2
+    assert found["threshold"] == pytest.approx(middle, abs=1e-5)
+    swept = [round(0.8 + n / 100, 2) for n in range(20)]
+    assert [trial["threshold"] for trial in found["sweep"][::4]] == swept
+    # Units return in many buffers, and cuts under several conditions: each counts once.
+    rows = list(load_split(indexed).manifests(condition="k7"))
+    pairs = {(a.source, b.source) for m in rows for a, b in pairwise(m.sessions)}
+    assert len(found["cuts"]) == len(pairs)
+    assert len(found["lowest"]) == len({s.source for m in rows for s in m.sessions})
+    assert [one["family"] for one in found["held_out"]] == list(FAMILIES)

@@ -1,0 +1,105 @@
+"""Image encoders: the thumbnail by hand, names, and the folders that encoders are known by."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robomme_interference_data.constants import PAPER_ENCODER
+from robomme_interference_data.embeddings import encoder_id, index_folder, normalised
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.retrieval.encoders import (
+    encoder_digest,
+    encoder_name,
+    make_encoder,
+    published_threshold,
+)
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+
+
+def test_thumbnail_by_hand() -> None:
+    # 16 × 16 pixels, 2 × 2 a cell: upper half black, lower half red.
+    image = np.zeros((16, 16, 3), np.uint8)
+    image[8:, :, 0] = 255
+    encoder = Thumbnail()
+    (row,) = encoder.features(encoder.prepare(image[None]))
+    colours, right, below = row[:192], row[192:360], row[360:]
+    assert colours.reshape(8, 8, 3)[:, 0].tolist() == [[0, 0, 0]] * 4 + [[1, 0, 0]] * 4
+    assert not right.any()
+    steps = below.reshape(7, 8, 3)
+    assert steps[3].tolist() == [[1, 0, 0]] * 8 and steps.sum() == 8
+    with pytest.raises(InvalidOptionError, match=r"pixels \(4, 9\)"):
+        encoder.prepare(np.zeros((1, 4, 9, 3), np.uint8))
+
+
+def test_cells_of_uneven_size_are_means() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (21, 11, 3), np.uint8)
+    (row,) = Thumbnail().prepare(image[None])
+    # Cell (2, 7): rows 5 to 6 (42 // 8, 63 // 8 = 7 excluded), columns 9 and 10.
+    expected = image[5:7, 9:11].mean(axis=(0, 1)) / 255
+    assert row[:192].reshape(8, 8, 3)[2, 7] == pytest.approx(expected, abs=1e-6)
+
+
+def test_normalising() -> None:
+    rows = normalised(np.array([[3, 4], [1, 1]]), np.array([0, 0], np.float32))
+    assert rows.dtype == np.float16
+    assert rows[0] == pytest.approx([0.6, 0.8], abs=1e-3)
+    # Nothing is left of the centre itself.
+    assert normalised(np.array([[1, 1]]), np.array([1, 1], np.float32)).tolist() == [[0, 0]]
+
+
+def test_a_digest_is_of_encoder_and_centre() -> None:
+    encoder, centre = Thumbnail(), np.zeros(3, np.float32)
+    digests = {encoder_digest(encoder, one) for one in (None, centre, centre + 1)}
+    assert len(digests) == 3 and encoder_digest(Thumbnail(), centre.copy()) in digests
+
+
+@pytest.mark.parametrize(
+    ("encoder", "folder"),
+    [
+        ("thumbnail", "index/thumbnail"),
+        ("siglip", "index/siglip"),
+        ("siglip:google/siglip2-base@abc", "index/siglip-siglip2-base"),
+        ("siglip:models/my model", "index/siglip-my-model"),
+        ("siglip:google/siglip-so400m-patch14-384", "index/siglip"),
+        ("siglip:google/siglip-so400m-patch14-384@main", "index/siglip"),
+    ],
+)
+def test_folders(encoder: str, folder: str) -> None:
+    assert index_folder(encoder) == index_folder(encoder, "observation.images.front") == folder
+    assert index_folder(encoder, "wrist") == f"{folder}@wrist"
+
+
+def test_a_model_in_a_folder_is_called_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    for model in (".", "../tiny", str(folder)):
+        assert encoder_id(f"siglip:{model}") == "siglip:tiny"
+        assert index_folder(f"siglip:{model}") == "index/siglip-tiny"
+    assert index_folder("siglip:/") == "index/siglip-"  # not the paper's model
+
+
+def test_names_of_encoders() -> None:
+    assert encoder_name(f"siglip:{PAPER_ENCODER}") == encoder_name("siglip") == "siglip"
+    assert published_threshold(f"siglip:{PAPER_ENCODER}") == 0.923
+    # At a revision it is the same model, and the revision is kept for loading it.
+    assert published_threshold(f"siglip:{PAPER_ENCODER}@main") == 0.923
+    assert encoder_name(f"siglip:{PAPER_ENCODER}@main") == f"siglip:{PAPER_ENCODER}@main"
+    assert published_threshold("siglip:google/siglip2-base-patch16-224") is None
+    assert published_threshold("thumbnail") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("thumbnial", UnknownNameError, "'thumbnail'"),
+        ("thumbnail:x", InvalidOptionError, "encoder 'thumbnail:x'"),
+        ("siglip:", InvalidOptionError, "id or folder of a model"),
+    ],
+)
+def test_names_that_are_none(name: str, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        make_encoder(name)

@@ -1,0 +1,146 @@
+"""Indexes that are damaged, or of other data or another encoder, are refused and named."""
+
+import json
+import random
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.retrieval import make_index
+from support.splits import QUERIES
+
+from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.embeddings import episode_file
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    MissingIndexError,
+    StaleIndexError,
+)
+from robomme_interference_data.files import format_sums, parse_sums, sha256_file
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.retrieval.selector import Selector
+
+FOLDER = "demonstrations/index/thumbnail"
+
+
+@pytest.fixture
+def whole(indexed: Path, tmp_path: Path) -> Path:
+    """A copy of the split with its index."""
+    return shutil.copytree(indexed, tmp_path / "whole")
+
+
+def look_up(split: Path, encoder: str = "thumbnail") -> None:
+    load_buffer(QUERIES[0], "k1", split=split).embeddings(encoder)
+
+
+def check(split: Path) -> None:
+    """Read all of the demonstrations' index."""
+    load_split(split).datasets["demonstrations"].index("thumbnail").check(
+        dict.fromkeys((0, 1, 2), 49)
+    )
+
+
+def test_without_an_index(tiny_split: Path) -> None:
+    with pytest.raises(MissingIndexError, match="no embeddings of encoder 'thumbnail'") as caught:
+        look_up(tiny_split)
+    expected = f"Type: robomme-interference index {tiny_split} --encoder thumbnail"
+    assert caught.value.hint == expected
+    with pytest.raises(MissingIndexError, match="camera 'wrist'") as caught:
+        load_buffer(QUERIES[0], "k0", split=tiny_split).embeddings("thumbnail", "wrist")
+    assert caught.value.hint == f"{expected} --camera wrist"
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "said"),
+    [
+        ({"revision": "0" * 64}, StaleIndexError, "revision 0000"),
+        ({"format_version": 2}, FormatError, "format version 2"),
+        ({"size": 7}, FormatError, "of shape"),
+        ({"camera": "wrist"}, StaleIndexError, "camera 'wrist'"),
+        ({"pool": "0" * 64}, StaleIndexError, "made differently"),
+        ({"encoder": None}, FormatError, "encoder: None"),
+        ({"sums": "0" * 64}, FormatError, "SHA256SUMS"),
+        ({"frames": "many"}, FormatError, "frames: 'many'"),
+        ({"qool": 1}, FormatError, "unknown qool"),  # as a flipped bit makes of a key
+    ],
+)
+def test_a_header_that_does_not_fit(
+    whole: Path, change: dict[str, Any], error: type[InterferenceError], said: str
+) -> None:
+    path = whole / FOLDER / "index.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(error, match=said) as caught:
+        look_up(whole)
+    assert "robomme-interference index " in str(caught.value.hint)
+
+
+def test_any_flipped_bit_is_an_error_or_does_no_harm(whole: Path) -> None:
+    path = whole / FOLDER / "index.json"
+    content, refused = path.read_bytes(), 0
+    for place in random.Random(0).sample(range(8 * len(content)), 60):
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        try:
+            check(whole)
+        except InterferenceError as error:
+            assert error.message
+            refused += 1
+    assert refused > 30
+
+
+@pytest.mark.parametrize("name", ["chunk-000/episode-000000.npy", "centre.npy", "SHA256SUMS"])
+def test_a_damaged_file_is_named(whole: Path, name: str) -> None:
+    path = whole / FOLDER / name
+    content = path.read_bytes()
+    for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:50], b"", None):
+        path.unlink() if damaged is None else path.write_bytes(damaged)
+        said = "is missing" if damaged is None else "does not have the SHA-256"
+        with pytest.raises(FormatError, match=f"{name} {said}") as caught:
+            check(whole)
+        assert f"index {whole} --encoder thumbnail" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize(
+    ("factor", "columns", "said"), [(np.nan, 528, "finite"), (1, 3, "of shape")]
+)
+def test_what_something_else_made(whole: Path, factor: float, columns: int, said: str) -> None:
+    # The hashes are right, the content is not.
+    folder = whole / FOLDER
+    path, sums, header = folder / episode_file(0), folder / "SHA256SUMS", folder / "index.json"
+    np.save(path, np.load(path)[:, :columns] * np.float16(factor))
+    names, before = parse_sums(sums.read_text(), sums), sha256_file(sums)
+    sums.write_text(format_sums(folder, names))
+    header.write_text(header.read_text().replace(before, sha256_file(sums)))
+    with pytest.raises(FormatError, match=said):
+        look_up(whole)
+
+
+def test_frames_that_are_not_there(indexed: Path) -> None:
+    index = load_split(indexed).datasets["demonstrations"].index("thumbnail")
+    for episode, start, stop in ((0, 0, 50), (3, 0, 1), (0, -1, 2), (0, 3, 2)):
+        with pytest.raises(LookupError, match="are not in"):
+            index.span(episode, start, stop)
+
+
+def test_two_models_of_one_name_are_told_apart(own_split: Path) -> None:
+    encoder = Thumbnail()
+    encoder.name = "siglip:one/tiny"
+    make_index(own_split, encoder)
+    look_up(own_split, "siglip:one/tiny@v2")
+    with pytest.raises(StaleIndexError, match="of encoder 'siglip:one/tiny'") as caught:
+        look_up(own_split, "siglip:two/tiny")
+    assert "robomme-interference index" in str(caught.value.hint)
+
+
+def test_an_index_of_another_version_of_the_encoder(whole: Path) -> None:
+    path = whole / FOLDER / "index.json"
+    header = json.loads(path.read_text())
+    header["encoder"]["sha256"] = "0" * 64
+    path.write_text(json.dumps(header))
+    buffer = load_buffer(QUERIES[0], "k0", split=whole)
+    with pytest.raises(StaleIndexError, match="another version of the encoder"):
+        Selector("thumbnail").select(buffer, buffer.query.frame())

@@ -1,0 +1,336 @@
+"""The command line: help, exit codes and errors without a traceback; as a program."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import typer
+from support.splits import QUERIES
+
+from robomme_interference_data import load_split
+from robomme_interference_data.cli import app
+from robomme_interference_data.rows import to_dict
+
+EPISODE = QUERIES[1]
+SCRIPT = Path(sys.executable).with_name("robomme-interference")
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def commands(
+    command: Any = None, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command and group, with the words that call it."""
+    command = command or typer.main.get_command(app)
+    yield path, command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from commands(inner, (*path, name))
+
+
+ALL = dict(commands())
+
+
+# --- help ------------------------------------------------------------------------------------
+
+
+def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) -> None:
+    code, out, err = run("--help")
+    assert (code, err) == (0, "")
+    # What is written, without the frames that are drawn around it.
+    words = [line.strip("│╭╰─╮╯ ").split("  ")[0].strip() for line in out.splitlines()]
+    listed = [word for word in words if (word,) in ALL or word in GROUPS]
+    assert listed == [
+        *("Data", "doctor", "build", "verify", "audit"),
+        *("Look", "list", "show", "simulate"),
+        *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
+        *("Rollouts", "evaluate", "merge"),
+        *("Scores", "score", "compare"),
+    ]
+
+
+GROUPS = ("Data", "Look", "Retrieval", "Rollouts", "Scores")
+
+
+@pytest.mark.parametrize("path", ALL, ids=" ".join)
+def test_help_of_every_command(path: tuple[str, ...], run: Run) -> None:
+    code, out, err = run(*path, "--help")
+    assert (code, err) == (0, "")
+    assert "Usage: robomme-interference" in out
+    assert "robomme-interference " in out.split("Usage:")[1].split("\n", 1)[1], "no example"
+    for parameter in ALL[path].params:
+        if parameter.name != "help":
+            assert str(parameter.help or "").strip(), f"{parameter.name} has no help"
+            if parameter.opts[0].startswith("--"):
+                assert max(parameter.opts, key=len) in out
+    for name in getattr(ALL[path], "commands", {}):
+        assert name in out
+
+
+@pytest.mark.parametrize(
+    "path", [path for path, command in ALL.items() if hasattr(command, "commands")], ids=" ".join
+)
+def test_groups_without_a_command_show_their_help(path: tuple[str, ...], run: Run) -> None:
+    code, out, err = run(*path)
+    assert code == 2
+    assert "Usage: robomme-interference" in out + err
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from robomme_interference_data.cli import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "Usage:" in done.stdout
+    found = set(done.stderr.split())
+    assert found.isdisjoint(
+        {"numpy", "pyarrow", "av", "scipy", "matplotlib", "torch", "lerobot", "huggingface_hub"}
+    )
+
+
+# --- usage errors ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lits"], "No such command 'lits'"),
+        (["list"], "Missing argument"),
+        (["list", ".", "--bad"], "No such option: --bad"),
+        (["show", EPISODE], "Missing argument 'CONDITION'"),
+        (["list", ".", "--condition", "k1", "k3"], "unexpected extra argument"),
+        (["build", "demonstrations", "--source", "frames:."], "Missing option '--out'"),
+    ],
+)
+def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert "Traceback" not in err
+
+
+# --- known errors ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["list", "{}/nowhere"], ("is not a split", "build all")),
+        (["list", "{}", "--family", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
+        (["list", "{}", "--condition", "k9"], ("'k9'", "k0", "k7")),
+        (["list", "{}", "--condition", "seven"], ("'seven'", "k3")),
+        (["show", "MoveCube/test/9", "k3", "--split", "{}"], ("MoveCube/test/9", EPISODE)),
+        (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
+        (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0 k1 k3 k7 k9")),
+        (["verify", "{}/nowhere"], ("is not a split",)),
+        (["audit", "{}/nowhere"], ("is not a split",)),
+        (
+            ["build", "distractors", "--source", "frmes:{}", "--out", "{}/out"],
+            ("frmes", "Did you mean 'frames'?"),
+        ),
+        (["build", "distractors", "--source", "sample", "--out", "{}/x", "--codec", "h264"], ("h264",)),
+    ],
+)
+def test_known_errors(
+    arguments: list[str], told: tuple[str, ...], run: Run, tiny_split: Path
+) -> None:
+    code, out, err = run(*(one.replace("{}", str(tiny_split)) for one in arguments))
+    assert (code, out) == (1, "")
+    assert err.startswith("Error: ") and "Traceback" not in err
+    assert all(text in err for text in told), err
+
+
+def test_a_bad_source_lists_every_kind(run: Run, tmp_path: Path) -> None:
+    _, _, err = run("build", "all", "--source", "hdf5:x", "--out", tmp_path / "S")
+    for kind in ("robomme-h5", "lerobot", "frames", "tabletop", "robomme", "sample"):
+        assert kind in err
+
+
+# --- list, show, verify, audit -------------------------------------------------------------------
+
+
+def table_rows(out: str) -> list[list[str]]:
+    lines = [line.split("│")[1:-1] for line in out.splitlines() if line.startswith("│")]
+    return [[cell.strip() for cell in line] for line in lines]
+
+
+def test_list(run: Run, tiny_split: Path) -> None:
+    code, out, err = run("list", tiny_split)
+    assert (code, err) == (0, "")
+    rows = table_rows(out)
+    assert len(rows) == 15
+    assert rows[8] == [EPISODE, "k3", "easy", "48", "144", "0.34"]
+
+
+def test_the_condition_is_there_in_a_narrow_terminal(
+    run: Run, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    code, out, _ = run("list", tiny_split, "--family", "MoveCube")
+    assert code == 0
+    assert all(condition in out for condition in ("no-history", "k0", "k1", "k3", "k7"))
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ([], 15),
+        (["--condition", "k3"], 3),
+        (["--family", "MoveCube", "--difficulty", "easy"], 5),
+    ],
+)
+def test_list_as_json_is_one_value(
+    options: list[str], count: int, run: Run, tiny_split: Path
+) -> None:
+    code, out, err = run("list", tiny_split, "--json", *options)
+    assert (code, err) == (0, "")
+    rows = json.loads(out)
+    assert len(rows) == count
+    known = [to_dict(manifest) for manifest in load_split(tiny_split).manifests()]
+    assert all(row in json.loads(json.dumps(known)) for row in rows)
+
+
+def test_names_of_folders_that_are_not_utf8(own_split: Path) -> None:
+    renamed = os.fsencode(own_split.parent) + b"/\xff\xfe"
+    os.rename(own_split, renamed)  # noqa: PTH104
+    done = subprocess.run([SCRIPT, "list", renamed], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"VideoRepick/test/0" in done.stdout
+
+
+def test_show(run: Run, tiny_split: Path) -> None:
+    code, out, err = run("show", EPISODE, "k3", "--split", tiny_split)
+    assert (code, err) == (0, "")
+    assert "watch the video carefully" in out
+    rows = table_rows(out)
+    assert rows[0] == ["0", "lesson", "MoveCube", EPISODE, "0 to 47"]
+    assert [row[4] for row in rows] == ["0 to 47", "48 to 79", "80 to 111", "112 to 143"]
+    assert "144 history frames" in out
+    assert "34% lesson" in " ".join(out.split())  # 11 of an even 32-frame sample
+
+
+def test_show_as_json_and_as_a_picture(run: Run, tiny_split: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "strip.png"
+    code, out, err = run("show", EPISODE, "k1", "--split", tiny_split, "--out", picture, "--json")
+    assert code == 0
+    manifest = to_dict(load_split(tiny_split).manifest(EPISODE, "k1"))
+    assert json.loads(out) == json.loads(json.dumps(manifest))
+    assert str(picture) in err
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_goals_are_shown_as_they_are(run: Run, own_split: Path) -> None:
+    """Brackets and colons in them are not taken for markup."""
+    goal = "put [red] :fire: into [/b] the [bold]box"
+    path = own_split / "manifests" / "buffers.parquet"
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("goals")
+    goals = pa.array([[goal]] * len(table), table.schema.field(place).type)
+    pq.write_table(table.set_column(place, table.schema.field(place), goals), path)
+    code, out, err = run("show", EPISODE, "k1", "--split", own_split)
+    assert (code, err) == (0, "")
+    assert goal in " ".join(out.split())
+
+
+def test_verify(run: Run, own_split: Path) -> None:
+    code, out, err = run("verify", own_split)
+    assert (code, out) == (0, "")
+    code, out, _ = run("verify", own_split, "--json", "--no-decode")
+    assert (code, json.loads(out)) == (0, [])
+    (video, *_) = sorted(own_split.glob("demonstrations/videos/*front/*/*.mp4"))
+    video.unlink()
+    code, out, err = run("verify", own_split)
+    assert code == 1
+    assert video.name in out and "Traceback" not in err
+    code, out, _ = run("verify", own_split, "--json")
+    assert code == 1
+    assert any(video.name in found["what"] + found["where"] for found in json.loads(out))
+
+
+def test_audit(run: Run, tiny_split: Path) -> None:
+    code, out, _ = run("audit", tiny_split)
+    assert code == 0 and "Uses of a unit" in out
+    code, out, err = run("audit", tiny_split, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["leaks"] == []
+
+
+# --- as a program ---------------------------------------------------------------------------------
+
+
+def script(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [SCRIPT, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        **options,
+    )
+
+
+def test_console_script_fails_without_a_traceback(tmp_path: Path) -> None:
+    done = script("show", EPISODE, "k3", "--split", tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith(f"Error: {tmp_path} is not a split")
+    assert "Traceback" not in done.stderr
+
+
+def test_a_folder_that_cannot_be_made_is_one_error(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "S"
+    code, told, err = run("build", "demonstrations", "--source", "sample", "--out", out)
+    assert (code, told) == (1, "")
+    assert f"Error: {out.parent}" in err and "Not a directory" in err
+    assert "Traceback" not in err
+
+
+def test_console_script_takes_the_split_from_the_environment(tiny_split: Path) -> None:
+    environment = {**os.environ, "ROBOMME_INTERFERENCE_SPLIT": str(tiny_split)}
+    done = script("show", EPISODE, "k3", "--json", env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["episode_id"] == EPISODE
+
+
+def test_the_reader_of_stdout_may_go_away(tiny_split: Path) -> None:
+    """As with `robomme-interference list … | head`."""
+    with subprocess.Popen(
+        [SCRIPT, "list", tiny_split, "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.wait(120) == 1
+        assert process.stderr.read() == ""
+
+
+# --- examples ---------------------------------------------------------------------------------
+
+
+def examples() -> list[str]:
+    found = []
+    for command in ALL.values():
+        text = f"{command.help}\n{command.epilog}".replace("\\\n", " ")
+        lines = map(str.strip, text.splitlines())
+        found += [line for line in lines if line.startswith("robomme-interference ")]
+    return found
+
+
+@pytest.mark.parametrize("line", examples())
+def test_examples_are_understood(line: str) -> None:
+    from support.command_lines import parse
+
+    parse(shlex.split(line)[1:])
