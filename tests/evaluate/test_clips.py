@@ -1,7 +1,5 @@
 """Clips of rollouts: what they show is what was given, and what fails in them harms no rollout."""
 
-import dataclasses
-import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +23,7 @@ from robomme_interference_data.strip import session_colors
 
 pytestmark = pytest.mark.usefixtures("trouble")
 
-K1, NONE = WorkItem("k1", EPISODE), WorkItem("no-history", EPISODE)
+K1 = WorkItem("k1", EPISODE)
 INFO = EpisodeInfo("do as shown", ("do as shown",), "easy", 1, "world")
 VIEW = Observation({"front": np.full((256, 256, 3), 90, np.uint8)}, np.zeros(8, np.float32))
 
@@ -182,20 +180,3 @@ def test_a_clip_that_fails_leaves_the_row_as_it_is(
     assert problem.startswith("the clip failed:\n")
     assert problem.rstrip().endswith("No space left on device")
     assert not list((tmp_path / "videos").iterdir())
-
-
-def test_pictures_are_not_kept(tmp_path: Path, buffer: Buffer) -> None:
-    """150 steps of a new picture each hold no more memory than the first 100 of them."""
-    clip = Clip(tmp_path, NONE, "mine")
-    clip.begin(buffer, 0, 0, VIEW, INFO)
-    tracemalloc.start()
-    held = []
-    for number in range(150):
-        images = {"front": np.full((256, 256, 3), number, np.uint8)}
-        clip.step(dataclasses.replace(VIEW, images=images), Status.ONGOING, None)
-        held.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    clip.close(Status.TIMEOUT)
-    assert clip.problem is None
-    assert max(held[100:]) < min(held[:100]) + 1_000_000  # five pictures of 256 × 256 × 3 bytes
-    assert len(frames(tmp_path / clip_name(NONE))) == 161

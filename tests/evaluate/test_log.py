@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -10,87 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError, RunFolderError
-from robomme_interference_data.evaluate.log import (
-    Start,
-    check_same_run,
-    open_log,
-    read_record,
-    read_run,
-)
+from robomme_interference_data.evaluate.log import check_same_run, open_log, read_record, read_run
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Rollout
 from robomme_interference_data.rows import to_dict
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "run"
 
-ROW: dict[str, Any] = {
-    "system": "replay-full",
-    "simulator": "tabletop",
-    "split": "my-split",
-    "revision": "ab" * 32,
-    "family": "MoveCube",
-    "condition": "k7",
-    "episode_split": "test",
-    "episode": 3,
-    "model_seed": 0,
-    "protocol_version": 1,
-    "seed": 19803,
-    "difficulty": "easy",
-    "goal": 'move the "red" cube, in the same manner',
-    "status": "success",
-    "success": True,
-    "steps": 151,
-    "history_frames": 410,
-    "lesson_frames": 186,
-    "lesson_share": 0.46875,
-    "reset_s": 0.5,
-    "history_s": 0.25,
-    "policy_s": 0.0125,
-    "simulator_s": 1.5,
-    "wall_s": 2.5,
-    "finished_at": "2026-01-31T12:00:00Z",
-}
-RETRIEVED = {
-    "condition": "k0",
-    "status": "timeout",
-    "success": False,
-    "steps": 1300,
-    "retrieval_model": "thumbnail/max/adaptive",
-    "retrieval_start": 0,
-    "retrieval_stop": 186,
-    "retrieval_selected_lesson_fraction": 0.96875,
-    "retrieval_selected_filler_fraction": 0.0,
-    "retrieval_selected_query_fraction": 0.03125,
-}
-BROKEN = {
-    "condition": "no-history",
-    "status": "error",
-    "success": None,
-    "steps": 0,
-    "lesson_share": None,
-    "history_frames": 0,
-    "lesson_frames": 0,
-    "error": "the simulator's reset took more than 8 s",
-    "attempt": 2,
-}
-ROWS = [Rollout(**ROW), Rollout(**ROW | RETRIEVED), Rollout(**ROW | BROKEN)]
-START = Start(
-    command=("robomme-interference evaluate --policy replay --split S --out R",),
-    settings={"workers": 1},
-    plan=Plan({"MoveCube/test": "3"}, ("no-history", "k0", "k7"), "1/1"),
-    versions={"python": "3.12.1"},
-    git=None,
-    machine="x86_64",
-    policy={"policy": "replay", "memory": "full"},
-    started="2026-01-31T11:00:00Z",
-)
-IDENTITY = {"system": "replay-full", "protocol_version": 1}
+HEADER, KNOWN = read_run(GOLDEN)
+ROWS = list(KNOWN.values())
+"""One of the lesson behind seven units, one with a retrieval step, and one that broke."""
 
 
 def test_golden_files(tmp_path: Path) -> None:
-    with open_log(tmp_path / "run", IDENTITY, "my-split") as log:
-        log.begin(START)
+    with open_log(tmp_path / "run", HEADER.identity, HEADER.split) as log:
+        log.begin(HEADER.starts[0])
         for row in ROWS:
             log.append(row, trace="Traceback\n…" if row.error else None)
         log.end(log.header)
@@ -101,16 +34,20 @@ def test_golden_files(tmp_path: Path) -> None:
 
 
 def test_golden_files_are_read() -> None:
-    header, rows = read_run(GOLDEN)
-    assert list(rows.values()) == ROWS
-    assert header.starts == (START,)
-    assert (header.status, header.planned, header.counts["error"]) == ("incomplete", 3, 1)
+    assert [(row.condition, row.status, row.steps) for row in ROWS] == [
+        ("k7", "success", 151),
+        ("k0", "timeout", 1300),
+        ("no-history", "error", 0),
+    ]
+    assert [row.retrieval_stop for row in ROWS] == [None, 186, None]
+    assert HEADER.plans == (Plan({"MoveCube/test": "3"}, ("no-history", "k0", "k7"), "1/1"),)
+    assert (HEADER.status, HEADER.planned, HEADER.counts["error"]) == ("incomplete", 3, 1)
 
 
 def test_a_killed_run_stands_as_its_record_says(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with open_log(out, IDENTITY, "my-split") as log:
-        log.begin(START)
+    with open_log(out, HEADER.identity, "my-split") as log:
+        log.begin(HEADER.starts[0])
         for row in ROWS[:2]:
             log.append(row)
     assert json.loads((out / "run.json").read_text())["status"] == "running"
@@ -130,7 +67,7 @@ def test_a_line_that_was_cut_short_is_dropped_and_only_that_one(
     (out / "rollouts.jsonl").write_bytes(text)
     kept = text.count(b"\n")
     assert list(read_record(out).values()) == ROWS[:kept]
-    with open_log(out, IDENTITY, "my-split") as log:
+    with open_log(out, HEADER.identity, "my-split") as log:
         assert list(log.rows.values()) == ROWS[:kept]
     assert (out / "rollouts.jsonl").read_bytes() == b"".join(whole.splitlines(True)[:kept])
 
@@ -164,7 +101,7 @@ def test_an_error_may_come_again(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_names_the_file(tmp_path: Path) -> None:
-    with open_log(tmp_path / "run", IDENTITY, "my-split") as log:
+    with open_log(tmp_path / "run", HEADER.identity, "my-split") as log:
         (tmp_path / "run" / "rollouts.jsonl").unlink()
         (tmp_path / "run" / "rollouts.jsonl").symlink_to("/dev/full")
         with pytest.raises(OSError, match="No space left") as raised:

@@ -200,65 +200,43 @@ def test_a_broken_simulator_is_an_error(kind: str, raised: type[Exception], trou
 # --- reading ahead -----------------------------------------------------------------------------
 
 
-class Stream:
-    """Counts to a number, and notes how far it came, where, and that it was closed."""
-
-    def __init__(self, stop: int, breaks_at: int | None = None):
-        self.made: list[int] = []
-        self.threads: set[int] = set()
-        self.closed = False
-        self._stop, self._breaks_at = stop, breaks_at
-
-    def items(self) -> Generator[int]:
-        try:
-            for number in range(self._stop):
-                if number == self._breaks_at:
-                    raise OSError("the disk is gone")
-                self.made.append(number)
-                self.threads.add(threading.get_ident())
-                yield number
-        finally:
-            self.closed = True
-
-    def wait_for(self, count: int) -> None:
-        until = time.monotonic() + 20
-        while len(self.made) < count and time.monotonic() < until:
-            time.sleep(0.001)
+def counting(stop: int, made: list[Any], breaks_at: int | None = None) -> Generator[int]:
+    """Count to a number, and note how far one came, in which thread, and that it was closed."""
+    try:
+        for number in range(stop):
+            if number == breaks_at:
+                raise OSError("the disk is gone")
+            made.append((number, threading.get_ident()))
+            yield number
+    finally:
+        made.append("closed")
 
 
 @given(stop=st.integers(0, 12), depth=st.integers(1, 5))
 def test_all_items_in_order(stop: int, depth: int) -> None:
-    stream = Stream(stop)
-    with read_ahead(stream.items(), depth) as items:
+    made: list[Any] = []
+    with read_ahead(counting(stop, made), depth) as items:
         assert list(items) == list(range(stop))
-    assert stream.closed
+    assert made[-1] == "closed" and len(made) == stop + 1
 
 
-def test_first_items_are_made_before_they_are_asked_for_and_no_more() -> None:
-    stream = Stream(10)
-    with read_ahead(stream.items(), 3) as items:
-        stream.wait_for(3)
-        time.sleep(0.05)  # a fourth one would be made by now
-        assert stream.made == [0, 1, 2]
-        assert next(items) == 0
-        stream.wait_for(4)
-        assert stream.made == [0, 1, 2, 3]
-    assert len(stream.threads) == 1 and threading.get_ident() not in stream.threads
-
-
-def test_a_stream_that_is_left_is_closed() -> None:
-    stream = Stream(100)
-    with pytest.raises(KeyboardInterrupt), read_ahead(stream.items(), 2) as items:
-        next(items)
+def test_first_items_are_made_in_a_thread_before_they_are_asked_for_and_no_more() -> None:
+    made: list[Any] = []
+    with pytest.raises(KeyboardInterrupt), read_ahead(counting(10, made), 3) as items:
+        for count in (3, 4):
+            until = time.monotonic() + 20
+            while len(made) < count and time.monotonic() < until:
+                time.sleep(0.001)
+            time.sleep(0.05)  # one more would be made by now
+            assert [number for number, _ in made] == list(range(count))
+            assert next(items) == count - 3
         raise KeyboardInterrupt
-    assert stream.closed and len(stream.made) <= 3
-    assert not [one for one in threading.enumerate() if one.name.startswith("read-ahead")]
+    assert made[-1] == "closed" and len(made) <= 6  # a stream that is left is closed
+    assert len({thread for _, thread in made[:4]} - {threading.get_ident()}) == 1
 
 
 def test_an_error_comes_where_its_item_would_have_come() -> None:
-    stream = Stream(5, breaks_at=2)
-    with read_ahead(stream.items(), 4) as items:
+    with read_ahead(counting(5, [], breaks_at=2), 4) as items:
         assert [next(items), next(items)] == [0, 1]
         with pytest.raises(OSError, match="the disk is gone"):
             next(items)
-    assert stream.closed

@@ -1,8 +1,5 @@
 """The websocket adapter against a server that keeps its own account of the memory."""
 
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -10,13 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import policy_server
 from support.policy_calls import INFER, RESET, added, client, info, observation, rollout, section
 from support.policy_server import Memory, PolicyServer
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.identity import plain
-from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
 
 @pytest.mark.parametrize(
@@ -178,19 +173,3 @@ def test_the_servers_account_refuses_a_wrong_order(calls: str, text: str) -> Non
         play(call)
     with pytest.raises(AssertionError, match=text):
         play(last)
-
-
-def test_the_server_in_a_process_of_its_own(tmp_path: Path) -> None:
-    log = tmp_path / "calls.jsonl"
-    command = [sys.executable, policy_server.__file__, "--log", str(log)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            address = process.stdout.readline().strip()
-            policy = WebsocketPolicy("127.0.0.1", int(address.rsplit(":", 1)[1]))
-            rollout(policy, 20, [20], [16])
-            policy.close()
-        finally:
-            process.kill()
-    calls = [line.split('"')[3] for line in log.read_text(encoding="utf-8").splitlines()]
-    assert calls == ["reset", "add_buffer", "add_buffer", "infer", "add_buffer", "infer"]

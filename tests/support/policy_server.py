@@ -6,20 +6,17 @@ memory is empty, an error goes out as a traceback in a text frame and then close
 while it works it answers nothing else, pings included. Beyond them it holds clients to the order
 of calls. It answers with actions that hold the arm where it is.
 
-As a script: python tests/support/policy_server.py --port 0 --log calls.jsonl
+As a script: python tests/support/policy_server.py --port 0
 """
 
 import argparse
 import asyncio
-import json
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -139,7 +136,7 @@ class PolicyServer:
 
     CLOSE = object()
 
-    def __init__(self, memory: Memory | None = None, *, port: int = 0, log: Path | None = None):
+    def __init__(self, memory: Memory | None = None, *, port: int = 0):
         self.memory = memory if memory is not None else Memory()
         self.metadata: dict[str, Any] = {"model": "none", "seed": np.int64(7)}
         self.port = port
@@ -148,7 +145,6 @@ class PolicyServer:
         self.status: HTTPStatus | None = None
         self.connections = 0
         self.options: dict[str, Any] = {"compression": None, "max_size": None}
-        self._log = log
         self._started = threading.Event()
 
     @property
@@ -210,15 +206,8 @@ class PolicyServer:
                 return
 
     def _answer(self, message: dict[str, Any]) -> Any:
-        began = time.perf_counter()
         answer = self.before(message)
-        if answer is None:
-            answer = msgpack.packb(self._call(message), default=encode)
-        if self._log is not None:
-            with self._log.open("a", encoding="utf-8") as file:
-                seconds = round(time.perf_counter() - began, 6)
-                file.write(json.dumps(self.calls[-1] | {"s": seconds}) + "\n")
-        return answer
+        return msgpack.packb(self._call(message), default=encode) if answer is None else answer
 
     def _call(self, message: dict[str, Any]) -> dict[str, Any]:
         if message.get("reset", False):
@@ -239,9 +228,8 @@ class PolicyServer:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Serve a policy that holds still.")
     parser.add_argument("--port", type=int, default=0, help="0: any free one; it is printed")
-    parser.add_argument("--log", type=Path, help="file that gets a JSON line for each call")
     options = parser.parse_args()
-    server = PolicyServer(Memory(keep=False), port=options.port, log=options.log)
+    server = PolicyServer(Memory(keep=False), port=options.port)
 
     def tell() -> None:
         sys.stdout.write(f"{server.url}\n")
