@@ -19,27 +19,26 @@ from numpy.typing import NDArray
 from timing import interleave, machine, positive, table
 
 from robomme_interference_data import DecodedCache, Split, load_split
-from robomme_interference_data.evaluate import run_evaluation
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.policies.base import Frames, RolloutInfo
+from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout import run_rollout
-from robomme_interference_data.evaluate.rows import Rollout
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.base import Observation, Status
+from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 CAMERAS = ("front", "wrist")
-BARE, WITHOUT, K0, CACHED = "bare loop", "no-history", "k0", "k0 --cache"
+BARE, WITHOUT, K0, CACHED = "bare loop", NO_HISTORY, "k0", "k0 --cache"
 
 
-class Recorded:
+class Recorded(Policy):
     """Takes the oracle's actions of an episode again, and wants every frame, as servers do."""
 
-    cameras: tuple[str, ...] = CAMERAS
-    history_cameras: tuple[str, ...] = ("front",)
-    wants_history = True
-    privileged = False
+    cameras = CAMERAS
+    history_cameras = ("front",)
     every_frame = True
 
     def __init__(self, actions: NDArray[np.float32]):
@@ -50,12 +49,6 @@ class Recorded:
         """Begin again."""
         self._next = 0
 
-    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Take it and do nothing."""
-
-    def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Take it and do nothing."""
-
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next 16 actions at most, `(n, 8) float32`."""
         start, self._next = self._next, self._next + 16
@@ -65,9 +58,6 @@ class Recorded:
         """Return its name."""
         return {"policy": "recorded"}
 
-    def close(self) -> None:
-        """There is nothing to release."""
-
 
 class Clock:
     """Notes when each row comes."""
@@ -75,7 +65,7 @@ class Clock:
     def __init__(self) -> None:
         self.times: list[float] = []
 
-    def start(self, plan: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
+    def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Take the plan."""
 
     def row(self, row: Rollout) -> None:
@@ -107,7 +97,7 @@ def main() -> None:
     )
     print(
         table(
-            f"`replay --memory full`, {options.rollouts} rollouts; the first of each worker, which "
+            f"`replay`, {options.rollouts} rollouts; the first of each worker, which "
             "starts its simulator, is left out. Aim ≥ 1.8.",
             ("<workers", ">s a rollout", ">ratio"),
             workers(options.split, options.rollouts),
@@ -133,25 +123,8 @@ def overhead(
     """Time an episode's rollout bare and in the harness; return the cells of its line."""
     actions = oracle_actions(episode, simulator)
     policy = Recorded(actions)
-    config = RunConfig(
-        system="recorded",
-        policy="python:recorded",
-        memory=None,
-        simulator="tabletop",
-        split=split.name,
-        split_name=split.name,
-        revision=split.revision,
-        episode_split=episode.split,
-        model_seed=0,
-        retrieval=None,
-        robomme_python=None,
-        check_lesson=False,
-        videos=False,
-        workers=1,
-        rollout_s=600.0,
-        history_chunk=64,
-        max_errors=1,
-    )
+    config = RunConfig("python:recorded", split.root, Path("nowhere"))
+    run = Run(config, "recorded", split.name, split.revision)
 
     def bare() -> None:
         simulator.reset(str(episode), demonstration=False)
@@ -161,7 +134,7 @@ def overhead(
 
     def harness(condition: str, data: Split) -> None:
         item = WorkItem(condition, episode)
-        row = run_rollout(config, item, simulator=simulator, policy=policy, split=data)
+        row = run_rollout(run, item, simulator=simulator, policy=policy, split=data)
         assert row.success and row.steps == len(actions)
 
     ways = {
@@ -178,7 +151,7 @@ def overhead(
         f"{times.ratio(WITHOUT, BARE):.3f}",
         f"{times.ratio(K0, BARE):.3f}",
         f"{times.ratio(CACHED, BARE):.3f}",
-        str(len(split.load(episode, 0))),
+        str(len(split.load(episode, K0))),
     ]
 
 
@@ -196,22 +169,21 @@ def workers(split: Path, rollouts: int) -> list[list[str]]:
     """Time a run with one worker and with two; return the lines."""
     seconds = []
     opened = load_split(split)
-    conditions = [f"k{k}" for k in opened.k_values]
-    families = list(opened.families)[: max(1, rollouts // len(conditions))]
+    conditions = tuple(name for name in opened.conditions if name != NO_HISTORY)
+    families = opened.families[: max(1, rollouts // len(conditions))]
     for count in (1, 2):
         clock = Clock()
         with tempfile.TemporaryDirectory() as folder:
-            run_evaluation(
+            config = RunConfig(
                 "replay",
                 split,
-                folder,
+                Path(folder),
                 conditions=conditions,
                 families=families,
                 episodes="0",
-                memory="full",
                 workers=count,
-                listener=clock,
             )
+            run_evaluation(config, listener=clock)
         # By the row of number `count`, every worker has most likely started.
         counted = clock.times[count - 1 :]
         seconds.append((counted[-1] - counted[0]) / (len(counted) - 1))

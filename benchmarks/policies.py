@@ -11,7 +11,6 @@ import asyncio
 import multiprocessing
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from http import HTTPStatus
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -25,10 +24,10 @@ from websockets.sync.client import connect
 from robomme_interference_data import load_split
 from robomme_interference_data.buffer import Buffer, Chunk
 from robomme_interference_data.constants import UNIT_FRAMES
-from robomme_interference_data.evaluate.ahead import read_ahead
 from robomme_interference_data.evaluate.policies.base import RolloutInfo
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
+from robomme_interference_data.evaluate.rollout import read_ahead
 
 CHUNK = 16
 ANSWER = pack({"reset_finished": True, "add_buffer_finished": True})
@@ -49,7 +48,7 @@ def main() -> None:
     images = draw.integers(0, 256, (frames + 1, 256, 256, 3), dtype=np.uint8)
     states = draw.normal(size=(frames + 1, 8)).astype(np.float32)
     split = load_split(options.split, threads=1)
-    buffer = split.load(options.episode, split.k_values[-1])
+    buffer = split.load(options.episode, split.conditions[-1])
     with servers() as ports:
         times, size = measure(ports, images, states, options.rounds)
         decoding = measure_decoding(ports[1], buffer, options.rounds)
@@ -74,8 +73,8 @@ def main() -> None:
     )
     print(
         table(
-            f"The k{buffer.k} buffer of {options.episode}, {len(buffer):,} frames, decoded and "
-            f"fed to the server that unpacks; medians of {options.rounds} rounds.",
+            f"The {buffer.condition} buffer of {options.episode}, {len(buffer):,} frames, decoded "
+            f"and fed to the server that unpacks; medians of {options.rounds} rounds.",
             ("<decoding and feeding", ">ms", ">ratio"),
             [
                 [
@@ -149,7 +148,7 @@ def measure_decoding(port: int, buffer: Buffer, rounds: int) -> Times:
         policy.reset(RolloutInfo(buffer.goal, len(buffer), 0))
         for chunk in chunks:
             policy.add_history(chunk.frames, chunk.states, len(buffer))
-        policy.observe({"front": buffer.query_frame()[None]}, buffer.query_state()[None])
+        policy.observe({"front": buffer.query.frame()[None]}, buffer.query.state()[None])
 
     def ahead() -> None:
         with read_ahead(buffer.stream(64, ("front",)), 4) as chunks:
@@ -179,9 +178,6 @@ def servers() -> Iterator[tuple[int, int]]:
 def run_servers(pipe: Connection) -> None:
     """Serve until the process is ended; tell the ports first."""
 
-    def health(connection: ServerConnection, request: Any) -> Any:
-        return connection.respond(HTTPStatus.OK, "OK\n") if request.path == "/healthz" else None
-
     async def answer(connection: ServerConnection, reads: bool) -> None:
         await connection.send(pack({}))
         try:
@@ -199,7 +195,6 @@ def run_servers(pipe: Connection) -> None:
                 lambda connection, reads=reads: answer(connection, reads),
                 "127.0.0.1",
                 0,
-                process_request=health,
                 **OPTIONS,
             )
             for reads in (False, True)

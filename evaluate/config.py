@@ -1,214 +1,102 @@
-"""What a run is: its settings, and which of them make it that run."""
+"""The settings of a run, each declared once: what Python gives, and the options of `evaluate`."""
 
-import json
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import InvalidOptionError, RunFolderError
-from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION
-from robomme_interference_data.retrieval.select import Rule
+from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.records import Rollout
+from robomme_interference_data.settings import setting
 
-__all__ = [
-    "IDENTITY",
-    "RunConfig",
-    "check_same_run",
-    "default_system",
-    "identity",
-]
+__all__ = ["FRONT_CAMERA", "MAX_RULE", "Run", "RunConfig"]
 
-IDENTITY = (
-    "system",
-    "simulator",
-    "revision",
-    "episode_split",
-    "model_seed",
-)
-"""Settings that are part of what a run is, as they stand. Of the policy's and the retrieval step's
-only a part can change a result: `policy_identity` and `Selector.identity` say which."""
-
-_MAX, _FRONT = "max", "front"
+MAX_RULE, FRONT_CAMERA = "max", "front"
 """The paper's rule of the retrieval step, and the camera that it looks at."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """The settings of a run.
+    """What to roll out, and how."""
+
+    policy: str = setting(
+        help="replay, replay:framesamp, replay:window, oracle, guess, hold, websocket://HOST:PORT "
+        "(several with commas), lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
+    )
+    split: Path = setting(help="Folder of the split of buffers.")
+    out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
+    simulator: str = setting("tabletop", help="tabletop, robomme or module:function of your own.")
+    conditions: tuple[str, ...] = setting(
+        (), help="no-history, k0, k1, …; by default all that apply."
+    )
+    families: tuple[str, ...] = setting((), help="Families; by default all.")
+    episodes: str | None = setting(None, help="Numbers, such as 0-49 or 0,3,10-12; default: all.")
+    episode_split: str = setting("test", help="train, val or test.")
+    shard: str = setting("1/1", help="Part of the plan to run, such as 2/8; see merge.")
+    system: str | None = setting(None, help="Name for the rows; see docs/systems.md.")
+    policy_options: tuple[str, ...] = setting(
+        (),
+        name="--policy-option",
+        whole=True,
+        metavar="NAME=VALUE…",
+        help="Options of the policy, such as device=cpu or response_s=60.",
+    )
+    model_seed: int = setting(0, help="Seed for the policy.")
+    retrieval: str | None = setting(
+        None, help="Put a retrieval step with this encoder in front of the policy."
+    )
+    retrieval_rule: str = setting(MAX_RULE, help="METHOD or METHOD/CUT, as for retrieval-score.")
+    retrieval_camera: str = setting(
+        FRONT_CAMERA, help="Camera whose frames the retrieval step compares."
+    )
+    robomme_python: str | None = setting(
+        None, help="Interpreter that has RoboMME.", env="ROBOMME_PYTHON"
+    )
+    workers: int = setting(
+        1, help="Worker processes, each with a simulator and a policy.", metavar="N"
+    )
+    videos: bool = setting(False, help="Write a video of each rollout.")
+    check_lesson: bool = setting(
+        False, help="Compare each lesson with what the simulator plays, bit for bit."
+    )
+    rollout_timeout: float = setting(3600.0, help="Seconds that a rollout may take.")
+    simulator_timeout: float = setting(
+        1800.0, help="Seconds that a reset, or 16 steps, may take before the simulator hung."
+    )
+    cache: bool = setting(False, help="Keep decoded history frames on disk: later runs are faster.")
+    history_chunk: int = setting(64, help="Frames of history handed over at a time.", metavar="N")
+    max_errors: int = setting(10, help="Errors in a row after which the run stops.", metavar="N")
+    no_resume: bool = setting(False, help="Refuse a folder that holds a run already.")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run whose settings were checked: what its workers need, and what all its rows say.
 
     Attributes:
-        system: Name under which the rows stand.
-        policy: Which policy, as `make_policy` reads it; a model on the Hub with its commit.
-        memory: Memory rule of `replay`; None for other policies.
-        simulator: Name of the simulator.
-        split: Folder of the split of buffers.
-        split_name: Label of the split in rows: `Split.name` when the run's folder was made.
+        config: Its settings; the system is named, and a model on the Hub has its commit.
+        system: Name under which its rows stand.
+        split: Label of the split in its rows.
         revision: `Split.revision`.
-        episode_split: `train`, `val` or `test`.
-        model_seed: Seed for the policy.
-        retrieval: Encoder of the retrieval step, or None.
-        retrieval_rule: How it chooses, `METHOD` or `METHOD/CUT`.
-        retrieval_camera: Camera whose frames it compares.
-        robomme_python: Interpreter of the official simulator, or None.
-        check_lesson: Whether to compare the dataset's lesson with the simulator's.
-        videos: Whether to write videos.
-        workers: Worker processes.
-        rollout_s: Seconds that a rollout may take.
-        simulator_s: Seconds that a reset, or up to 16 steps, may take.
-        cache: Whether to keep decoded history frames on disk, for later conditions and runs.
-        history_chunk: Frames of history handed over at a time.
-        max_errors: Errors in a row after which the run stops.
-        policy_options: The policy's options by name, without `memory`.
     """
 
+    config: RunConfig
     system: str
-    policy: str
-    memory: str | None
-    simulator: str
     split: str
-    split_name: str
     revision: str
-    episode_split: str = "test"
-    model_seed: int = 0
-    retrieval: str | None = None
-    retrieval_rule: str = _MAX
-    retrieval_camera: str = _FRONT
-    robomme_python: str | None = None
-    check_lesson: bool = False
-    videos: bool = False
-    workers: int = 1
-    rollout_s: float = 3600.0
-    simulator_s: float = 1800.0
-    cache: bool = False
-    history_chunk: int = 64
-    max_errors: int = 10
-    policy_options: Mapping[str, Any] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        if "memory" in self.policy_options and (self.policy == "replay" or self.memory is not None):
-            raise InvalidOptionError(
-                "the memory rule is no --policy-option, as it also names the system",
-                f"Give --memory {self.policy_options['memory']}.",
-            )
-        Rule.parse(self.retrieval_rule)  # checks itself, before a name is made of it
-        if self.retrieval is None:
-            for name, value, usual in (
-                ("rule", self.retrieval_rule, _MAX),
-                ("camera", self.retrieval_camera, _FRONT),
-            ):
-                if value != usual:
-                    raise InvalidOptionError(
-                        f"--retrieval-{name} {value} says nothing without a retrieval step",
-                        "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
-                    )
-        try:
-            json.dumps(self.policy_options)
-        except (TypeError, ValueError):
-            raise InvalidOptionError(
-                f"policy options {dict(self.policy_options)!r} cannot be written down",
-                "Expected text, numbers, True, False, None, or lists of them.",
-            ) from None
-
-    @property
-    def policy_arguments(self) -> dict[str, Any]:
-        """The options that the policy is made with."""
-        memory = {} if self.memory is None else {"memory": self.memory}
-        return memory | dict(self.policy_options)
-
-
-def default_system(
-    policy: str,
-    memory: str | None = None,
-    retrieval: str | None = None,
-    retrieval_rule: str = _MAX,
-    retrieval_camera: str = _FRONT,
-) -> str:
-    """Return the name under which rows stand if none is given.
-
-    That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
-    step behind it, such as `retrieval-replay-window-oracle`. Arguments as in `RunConfig`.
-
-    Raises:
-        InvalidOptionError: The policy does not say which system it is.
-    """
-    kind, _, target = policy.partition(":")
-    if kind == "websocket":
-        raise InvalidOptionError(
-            f"the rows of {policy} need the name of the system that it serves",
-            "Give --system, such as perceptual-framesamp-modul, or a name of your own: see "
-            "docs/systems.md.",
+    def row(self, item: WorkItem, **values: Any) -> Rollout:
+        """Return the row of a rollout: `values`, and what makes it the one that it is."""
+        return Rollout(
+            system=self.system,
+            simulator=self.config.simulator,
+            split=self.split,
+            revision=self.revision,
+            family=item.episode.family,
+            condition=item.condition,
+            episode_split=item.episode.split,
+            episode=item.episode.index,
+            model_seed=self.config.model_seed,
+            protocol_version=PROTOCOL_VERSION,
+            **values,
         )
-    if kind == "lerobot":  # folders are called alike (pretrained_model), and so are revisions
-        raise InvalidOptionError(
-            f"the rows of {policy} need a name: that of a folder or repository does not tell one "
-            "checkpoint from another",
-            f"Give one of your own: --policy {policy} --system act-20000",
-        )
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", target.rstrip("/").split("/")[-1]).strip("-")
-    if policy == "replay":
-        name = f"replay-{memory or 'full'}"
-    name = name or policy
-    if retrieval is None:
-        return name
-    rule, camera = retrieval_rule.replace("/", "-"), retrieval_camera
-    unusual = [*([rule] if rule != _MAX else []), *([camera] if camera != _FRONT else [])]
-    return "-".join(("retrieval", name, *unusual))
-
-
-def identity(
-    config: RunConfig,
-    policy: Mapping[str, Any],
-    simulator_version: str | None,
-    retrieval_index: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return what makes the run the one that it is, as plain values.
-
-    Args:
-        config: The settings.
-        policy: What can change a result of the policy; see `policies.options.policy_identity`.
-        simulator_version: Version of the suite of episodes; None where it is not known.
-        retrieval_index: What the choices of the retrieval step depend on; see
-            `Selector.identity`. None without the step.
-    """
-    return {
-        **{name: getattr(config, name) for name in IDENTITY},
-        **policy,
-        "simulator_version": simulator_version,
-        "retrieval_index": None if retrieval_index is None else dict(retrieval_index),
-        "protocol_version": PROTOCOL_VERSION,
-    }
-
-
-def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Check that a folder's run is the one that is wanted.
-
-    Raises:
-        RunFolderError: It is another; names every difference.
-    """
-    there, here = _flat(found), _flat(wanted)
-    names = sorted({*there, *here}, key=lambda name: (name not in here, name))
-    told = [
-        f"{name} is {there.get(name, _NONE)} there, {here.get(name, _NONE)} here"
-        for name in names
-        if there.get(name, _NONE) != here.get(name, _NONE)
-    ]
-    if told:
-        raise RunFolderError(
-            f"{folder} holds another run: {'; '.join(told)}",
-            "Give another --out, or the settings of the run that is there (see run.json).",
-        )
-
-
-_NONE = "not known"
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Return values as text, those of inner maps under names such as `policy_metadata.sha256`."""
-    flat: dict[str, str] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = repr(value)
-    return flat

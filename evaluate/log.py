@@ -1,317 +1,303 @@
-"""The folder of a run: rows appended as rollouts end, and the tables that others read.
+"""The folder of a run: one record, a line a rollout, and what was asked of it in `run.json`.
 
-`rollouts.jsonl` is the record: one line a rollout, on the disk before the next one is counted. A
-line that a crash cut short is dropped, and only that one. `rollouts.parquet` and `rollouts.csv`
-are made from it, whole or not at all; `run.json` says what ran. Where the record is missing, the
-table in `rollouts.parquet` stands for it.
+A line of `rollouts.jsonl` is on the disk before the next rollout is counted; one that a crash cut
+short is dropped, and only that one. The tables beside it are exported when a run ends.
 """
 
-import csv
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
+import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from robomme_interference_data.errors import FormatError, RunFolderError
-from robomme_interference_data.evaluate.config import check_same_run
-from robomme_interference_data.evaluate.rows import ROLLOUT_SCHEMA, Rollout
-from robomme_interference_data.files import atomic_path, canonical_json, read_json, write_json
-from robomme_interference_data.locks import hold
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.errors import FormatError, RunFolderError, first_line
+from robomme_interference_data.evaluate.plan import Plan, WorkItem
+from robomme_interference_data.files import atomic_path, canonical_json, hold, write_json
+from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
 __all__ = [
-    "CSV_NAME",
-    "ERRORS_NAME",
-    "LOG_NAME",
-    "LOG_VERSION",
-    "PARQUET_NAME",
-    "RUN_NAME",
+    "ERRORS_LOG",
+    "RunHeader",
     "RunLog",
-    "check_tables",
+    "Start",
+    "check_same_run",
+    "count_statuses",
+    "is_done",
     "open_log",
-    "read_header",
-    "read_log",
-    "summary",
+    "read_record",
+    "read_run",
 ]
 
-LOG_NAME = "rollouts.jsonl"
-PARQUET_NAME = "rollouts.parquet"
-CSV_NAME = "rollouts.csv"
-RUN_NAME = "run.json"
-ERRORS_NAME = "errors.log"
+ERRORS_LOG = "errors.log"
 
-LOG_VERSION = 1
-"""Version of these files; a reader refuses one that it does not know."""
 
-_PLAN = frozenset({"families", "episodes", "conditions", "shard"})
-_ANOTHER = "It was changed or damaged. Give another --out; rollouts.csv still has the rows."
+@dataclass(frozen=True)
+class Start:
+    """One start of the command.
+
+    Attributes:
+        command: The command line; empty from Python.
+        settings: All settings.
+        plan: What was asked for.
+        versions: Of Python, this package, what it used, and the simulator.
+        git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
+        machine: Kind of processor.
+        policy: What the policy said of itself.
+        started: When, UTC, `2026-01-31T12:00:00Z`.
+        ended: When; None while it runs, or if it was killed.
+        stopped: Why it ended early, or None.
+    """
+
+    command: tuple[str, ...]
+    settings: dict[str, Any]
+    plan: Plan
+    versions: dict[str, str]
+    git: str | None
+    machine: str
+    policy: dict[str, Any]
+    started: str
+    ended: str | None = None
+    stopped: str | None = None
+
+
+@dataclass(frozen=True)
+class RunHeader:
+    """`run.json`.
+
+    Attributes:
+        format_version: Of the files.
+        identity: What can change a result: it makes the run the one that it is.
+        split: Label of the split in all rows.
+        plans: What was asked for, each plan once.
+        status: `running`; or `complete` or, if something is missing or broke, `incomplete`.
+        planned: Rollouts that were asked for by all plans together.
+        counts: Rows by status.
+        starts: Each start of the command.
+        merged: Names of the folders that a joined run is made of.
+    """
+
+    format_version: int
+    identity: dict[str, Any]
+    split: str
+    plans: tuple[Plan, ...] = ()
+    status: str = "running"
+    planned: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    starts: tuple[Start, ...] = ()
+    merged: tuple[str, ...] = ()
+
+    @property
+    def items(self) -> tuple[WorkItem, ...]:
+        """All rollouts that were asked for, each once, in canonical order."""
+        return tuple(sorted({item for plan in self.plans for item in plan.items()}))
+
+    def standing(self, rows: Mapping[WorkItem, Rollout], status: str = "") -> "RunHeader":
+        """Return the header with how the folder stands, over all of its plans."""
+        items = self.items
+        whole = all(item in rows and is_done(rows[item]) for item in items)
+        status = status or ("complete" if whole else "incomplete")
+        counts = count_statuses(rows.values())
+        return replace(self, status=status, planned=len(items), counts=counts)
 
 
 class RunLog:
-    """The rows of a run; made by `open_log`.
+    """A run's folder that is written; made by `open_log`.
 
     Attributes:
-        folder: The run's folder.
+        folder: The folder.
         header: What `run.json` holds.
-        rows: The last row of each key.
+        rows: The last row of each rollout.
     """
 
-    def __init__(self, folder: Path, header: dict[str, Any], rows: dict[tuple[Any, ...], Rollout]):
-        self.folder = folder
-        self.header = header
-        self.rows = rows
+    def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
+        self.folder, self.header, self.rows = folder, header, rows
 
-    @property
-    def finished(self) -> set[tuple[Any, ...]]:
-        """Keys of the rollouts that need not be run again: all but errors."""
-        return {key for key, row in self.rows.items() if row.status != Status.ERROR}
+    def begin(self, start: Start) -> None:
+        """Note a start of the command."""
+        plans = self.header.plans
+        plans += () if start.plan in plans else (start.plan,)
+        header = replace(self.header, plans=plans, starts=(*self.header.starts, start))
+        self._write_header(header.standing(self.rows, "running"))
 
-    def append(self, row: Rollout, traceback: str | None = None) -> None:
-        """Write a row; when this returns, it is on the disk.
+    def append(self, row: Rollout, trace: str | None = None) -> None:
+        """Write a row, and where it broke; when this returns, the row is on the disk.
 
         Raises:
-            FormatError: There is a finished row of this key already.
             OSError: The file cannot be written; it is named.
         """
-        before = self.rows.get(row.key)
-        if before is not None and before.status != Status.ERROR:
-            raise FormatError(f"{self.folder} has a row of {row.key} already")
-        line = (canonical_json(row.as_dict()) + "\n").encode()
-        path = self.folder / LOG_NAME
+        item, path = WorkItem.of(row), self.folder / RUN_RECORD
         try:
             with path.open("ab") as file:
-                file.write(line)
+                file.write(_line(row))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:  # from writing, it names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
-        self.rows[row.key] = row
-        if traceback:
-            with (self.folder / ERRORS_NAME).open("a", encoding="utf-8") as file:
-                file.write(f"{row.finished_at} {row.family}/{row.episode_split}/{row.episode} ")
-                file.write(f"{row.condition}, attempt {row.attempt}\n{traceback.rstrip()}\n\n")
+        self.rows[item] = row
+        if trace:
+            log = self.folder / ERRORS_LOG
+            with log.open("a", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(f"{row.finished_at} {item}, attempt {row.attempt}\n{trace.rstrip()}\n\n")
 
-    def reread(self) -> None:
-        """Take the rows as they are on the disk."""
-        self.rows = read_log(self.folder)
-
-    def replace(self, rows: Iterable[Rollout]) -> None:
+    def write_all(self, rows: Iterable[Rollout]) -> None:
         """Write all rows anew, whole or not at all."""
-        self.rows = {row.key: row for row in rows}
-        with atomic_path(self.folder / LOG_NAME) as partial:
-            lines = [canonical_json(row.as_dict()) + "\n" for row in self.rows.values()]
-            partial.write_text("".join(lines), encoding="utf-8")
+        with atomic_path(self.folder / RUN_RECORD) as partial:
+            partial.write_bytes(b"".join(map(_line, rows)))
 
-    def write_tables(self, order: Mapping[tuple[Any, ...], int]) -> None:
-        """Write `rollouts.parquet` and `rollouts.csv`.
-
-        Args:
-            order: Place of each planned key; rows of earlier plans come after, in their order.
-        """
-        place = {key: number for number, key in enumerate(self.rows)}
-        last = len(order)
-        keys = sorted(self.rows, key=lambda key: (order.get(key, last), place[key]))
-        rows = [self.rows[key].as_dict() for key in keys]
-        table = pa.Table.from_pylist(rows, schema=ROLLOUT_SCHEMA)
-        with atomic_path(self.folder / PARQUET_NAME) as partial:
+    def end(self, header: RunHeader) -> None:
+        """Export the tables, in canonical order, and write a header with how the folder stands."""
+        # As they are on the disk: Ctrl-C may have come between a row's writing and its counting.
+        self.rows = dict(sorted(read_record(self.folder).items()))
+        table = to_table(self.rows.values(), arrow_schema(Rollout))
+        parquet, text = (self.folder / name for name in RUN_TABLES)
+        with atomic_path(parquet) as partial:
             pq.write_table(table, partial, compression="zstd")
-        with (
-            atomic_path(self.folder / CSV_NAME) as partial,
-            partial.open("w", newline="", encoding="utf-8") as file,
-        ):
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(ROLLOUT_SCHEMA.names)
-            writer.writerows([_text(value) for value in row.values()] for row in rows)
+        with atomic_path(text) as partial:
+            pa_csv.write_csv(table, partial)
+        self._write_header(header.standing(self.rows))
 
-    def write_header(self, **changes: Any) -> None:
-        """Change `run.json`."""
-        self.header |= changes
-        write_json(self.folder / RUN_NAME, self.header)
+    def _write_header(self, header: RunHeader) -> None:
+        write_json(self.folder / RUN_HEADER, to_dict(header))
+        self.header = header
 
 
 @contextmanager
-def open_log(folder: Path, identity: Mapping[str, Any], resume: bool = True) -> Iterator[RunLog]:
+def open_log(
+    folder: Path, identity: Mapping[str, Any], split: str, *, resume: bool = True
+) -> Iterator[RunLog]:
     """Open or make the folder of a run, and hold it.
 
     Args:
         folder: The folder.
-        identity: What makes the run the one that it is.
+        identity: What makes the run the one that it is, as plain values.
+        split: Label of the split in rows; a run that is there keeps its own.
         resume: Whether a run that is there may be gone on with.
 
     Raises:
         RunFolderError: The folder holds another run or something else, is being written by
             another process, or may not be resumed.
+        MissingFileError: The record is gone.
         FormatError: Its files are damaged or of another format version.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    if there and RUN_HEADER not in there:
+        raise RunFolderError(
+            f"{folder} holds other files ({', '.join(there[:3])}) and no {RUN_HEADER}",
+            "Give a new folder to --out.",
+        )
     busy = RunFolderError(
         f"another process is writing {folder}", "Wait for it to end, or give another --out."
     )
-    strangers = sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
-    if strangers and RUN_NAME not in strangers:
-        raise RunFolderError(
-            f"{folder} holds other files ({', '.join(strangers[:3])}) and no {RUN_NAME}",
-            "Give a new folder to --out.",
-        )
     with hold(folder / ".lock", busy):
-        path = folder / RUN_NAME
-        if not path.exists():
-            header: dict[str, Any] = {
-                "format_version": LOG_VERSION,
-                "identity": dict(identity),
-                "plans": [],
-            }
-            log = RunLog(folder, header, {})
-            log.write_header()
-        else:
-            if not resume:
-                raise RunFolderError(
-                    f"{folder} holds a run already", "Give another --out, or leave out --no-resume."
-                )
-            header = read_header(folder)
-            check_same_run(folder, header["identity"], identity)
-            _drop_torn_line(folder / LOG_NAME)
-            log = RunLog(folder, header, read_log(folder))
-            if log.rows and not (folder / LOG_NAME).exists():
-                log.replace(log.rows.values())
-        yield log
+        if not there:
+            (folder / RUN_RECORD).touch()
+            header = RunHeader(FORMAT_VERSION, dict(identity), split)
+            write_json(folder / RUN_HEADER, to_dict(header))
+        elif not resume:
+            raise RunFolderError(
+                f"{folder} holds a run already", "Give another --out, or leave out --no-resume."
+            )
+        header, rows = read_run(folder)
+        check_same_run(folder, header.identity, identity)
+        with (folder / RUN_RECORD).open("r+b") as file:
+            file.truncate(file.read().rfind(b"\n") + 1)
+        yield RunLog(folder, header, rows)
 
 
-def read_log(folder: Path) -> dict[tuple[Any, ...], Rollout]:
-    """Read a run's record: the last row of each key, in the order in which keys first came.
-
-    A last line without an end, which a crash can leave, is not read. Without a record the rows
-    are those of `rollouts.parquet`.
+def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
+    """Read a run: its header, standing as its record says, and its rows.
 
     Raises:
-        FormatError: A line is damaged, has unknown columns, or a finished rollout has two rows; or
-            the record is missing, and cannot be had from the table.
+        RunFolderError: The folder holds no run, or its record is gone.
+        FormatError: Its files are damaged or of another format version.
     """
-    path = folder / LOG_NAME
-    rows: dict[tuple[Any, ...], Rollout] = {}
+    for name in (RUN_HEADER, RUN_RECORD):
+        if not (folder / name).is_file():
+            raise RunFolderError(
+                f"{folder} holds no run: {name} is missing",
+                "Give a folder that robomme-interference evaluate wrote, all of it.",
+            )
+    header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
+    return header.standing(rows), rows
+
+
+def read_record(folder: Path) -> dict[WorkItem, Rollout]:
+    """Read a run's record: the last row of each rollout; empty where there is none.
+
+    A last line without an end, which a crash can leave, is not read.
+
+    Raises:
+        FormatError: A line is damaged, or a finished rollout has two rows.
+    """
+    path = folder / RUN_RECORD
+    rows: dict[WorkItem, Rollout] = {}
     if not path.exists():
-        return _read_table(folder)
-    lines = path.read_bytes().split(b"\n")[:-1]
-    for number, line in enumerate(lines, 1):
+        return rows
+    for number, line in enumerate(path.read_bytes().split(b"\n")[:-1], 1):
         try:
-            row = Rollout(**json.loads(line))
-        except (ValueError, TypeError) as error:
+            row = from_dict(Rollout, json.loads(line), "its fields", strict=True)
+            item = WorkItem.of(row)
+            if item in rows and is_done(rows[item]):
+                raise ValueError(f"it is a second one of {item}")
+        except (ValueError, RecursionError) as error:
             raise FormatError(
-                f"{path}, line {number} is not a row of a rollout: {error}",
+                f"{path}, line {number} is no row of a rollout: {first_line(error)}",
                 "Remove the line to run that rollout again.",
             ) from None
-        if row.key in rows and rows[row.key].status != Status.ERROR:
-            raise FormatError(f"{path}, line {number}: a second row of {row.key}")
-        rows[row.key] = row
+        rows[item] = row
     return rows
 
 
-def _read_table(folder: Path) -> dict[tuple[Any, ...], Rollout]:
-    """Read the rows of a folder that has lost its record; none where there is no table either."""
-    tables = [name for name in (PARQUET_NAME, CSV_NAME) if (folder / name).exists()]
-    if not tables:
-        return {}
-    try:
-        rows = _table_rows(folder)
-    except (OSError, ValueError) as error:
-        raise FormatError(
-            f"{folder} has {' and '.join(tables)}, but no {LOG_NAME}, and its rows cannot be had "
-            f"from {PARQUET_NAME}: {error}",
-            f"Bring {LOG_NAME} back, or give another --out.",
-        ) from None
-    keyed = {row.key: row for row in rows}
-    if len(keyed) < len(rows):
-        raise FormatError(
-            f"{folder / PARQUET_NAME} has several rows of one rollout, and {LOG_NAME} is missing",
-            f"Bring {LOG_NAME} back, or give another --out.",
-        )
-    return keyed
-
-
-def _table_rows(folder: Path) -> list[Rollout]:
-    found = pq.read_table(folder / PARQUET_NAME)
-    if not found.schema.equals(ROLLOUT_SCHEMA):
-        raise ValueError("its columns are not those of rollouts")
-    return [Rollout(**row) for row in found.to_pylist()]
-
-
-def check_tables(folder: Path) -> None:
-    """Check that a run's tables hold what its record does; if it was killed, they may not.
+def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Check that a folder's run is the one that is wanted, by their identities.
 
     Raises:
-        FormatError: They are behind; or the record is damaged.
+        RunFolderError: It is another; names every difference.
     """
-    if not (folder / LOG_NAME).exists():
-        return
-    try:
-        there = {row.key: row for row in _table_rows(folder)}
-    except (OSError, ValueError):
-        return  # to be told by whoever reads it
-    record = read_log(folder)
-    if there != record:
-        newer = sum(there.get(key) != row for key, row in record.items())
-        raise FormatError(
-            f"{newer} of {len(record)} rollouts in {folder / LOG_NAME} are not in the tables "
-            "beside it: the run was killed, or still goes on",
-            f"Make a folder with all of them: robomme-interference merge {folder} --out "
-            f"{folder}-merged",
+    there, here = _flat(found), _flat(wanted)
+    told = [
+        f"{name} is {there.get(name, 'unknown')} there, {here.get(name, 'unknown')} here"
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
+    ]
+    if told:
+        raise RunFolderError(
+            f"{folder} holds another run: {'; '.join(told)}",
+            f"Give another --out, or the settings of the run that is there (see {RUN_HEADER}).",
         )
 
 
-def read_header(folder: Path) -> dict[str, Any]:
-    """Read `run.json`.
-
-    Raises:
-        FileNotFoundError: There is none.
-        FormatError: It is damaged, or of another format version.
-    """
-    path = folder / RUN_NAME
-    header = read_json(path)
-    version = header.get("format_version")
-    if version != LOG_VERSION:
-        raise FormatError(
-            f"{path} has format version {version!r}; this package reads {LOG_VERSION}",
-            "Install the version of robomme-interference-data that wrote it.",
-        )
-    if not isinstance(header.get("identity"), dict):
-        raise FormatError(f"{path} lacks the identity of the run", _ANOTHER)
-    plans = header.get("plans")
-    if not isinstance(plans, list) or not all(
-        isinstance(plan, dict) and plan.keys() >= _PLAN for plan in plans
-    ):
-        raise FormatError(f"{path} lacks the plans of the run, or a part of one", _ANOTHER)
-    return header
+def is_done(row: Rollout) -> bool:
+    """Tell whether a rollout need not be run again: all but errors."""
+    return row.status != Status.ERROR
 
 
-def _drop_torn_line(path: Path) -> None:
-    if not path.exists():
-        return
-    with path.open("r+b") as file:
-        data = file.read()
-        whole = data.rfind(b"\n") + 1
-        if whole < len(data):
-            file.truncate(whole)
-            os.fsync(file.fileno())
-
-
-def _text(value: Any) -> str:
-    """Write a value as CSV has it: nothing for None, true and false, numbers in full."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return str(value)
-
-
-def summary(rows: Iterable[Rollout]) -> dict[str, int]:
+def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
     """Count rows by status."""
-    counts = {str(status): 0 for status in (Status.SUCCESS, Status.FAIL, Status.TIMEOUT)}
-    counts[str(Status.ERROR)] = 0
+    counts = dict.fromkeys(map(str, (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)), 0)
     for row in rows:
         counts[row.status] += 1
     return counts
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return values as text, those of inner maps under names such as `policy_metadata.sha256`."""
+    flat: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = repr(value)
+    return flat
+
+
+def _line(row: Rollout) -> bytes:
+    return (canonical_json(to_dict(row)) + "\n").encode()

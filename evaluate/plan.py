@@ -4,173 +4,162 @@ import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
-from robomme_interference_data.evaluate.rows import NO_HISTORY, condition_rank
-from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.conditions import in_order, parse_condition
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers
+from robomme_interference_data.records import Rollout
 
-__all__ = [
-    "WorkItem",
-    "parse_episodes",
-    "parse_shard",
-    "plan_work",
-    "select_families",
-    "shuffle_work",
-    "take_shard",
-]
+__all__ = ["Plan", "WorkItem", "plan_work", "shuffle_work"]
 
-_SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
+_SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
 
 @dataclass(frozen=True)
 class WorkItem:
-    """One rollout to run.
+    """One rollout: within a run, the key of its row.
 
     Attributes:
-        condition: `no-history`, `k0`, `k1`, …
+        condition: Name of the condition, such as `k3`.
         episode: The query episode.
+
+    Raises:
+        InvalidIdError: There is no such condition.
     """
 
     condition: str
     episode: EpisodeId
 
+    def __post_init__(self) -> None:
+        parse_condition(self.condition)
+
+    @classmethod
+    def of(cls, row: Rollout) -> Self:
+        """Return the rollout that a row is of."""
+        return cls(row.condition, row.episode_id)
+
+    def __str__(self) -> str:
+        return f"{self.episode} under {self.condition}"
+
+    def __lt__(self, other: "WorkItem") -> bool:
+        return self._place < other._place
+
     @property
-    def k(self) -> int | None:
-        """Number of distractor sessions; None without history."""
-        return None if self.condition == NO_HISTORY else condition_rank(self.condition)
+    def _place(self) -> tuple[object, ...]:
+        """Place in the canonical order: by episode and condition."""
+        return self.episode.sort_key, parse_condition(self.condition).sort_key
 
 
-def parse_episodes(text: str) -> tuple[int, ...]:
-    """Read episode indices from text such as `0-49` or `0,3,10-12`; both ends are included.
+@dataclass(frozen=True)
+class Plan:
+    """Rollouts that were asked for, as `run.json` has them.
 
-    Returns:
-        The indices, ascending, each once.
-
-    Raises:
-        InvalidOptionError: The text is something else.
-    """
-    numbers: set[int] = set()
-    for part in text.split(","):
-        match = _SPAN.fullmatch(part.strip())
-        if match is None or int(match[2] or match[1]) < int(match[1]):
-            raise InvalidOptionError(
-                f"--episodes {text}: {part.strip()!r} is not a number or a span",
-                "Expected numbers and spans with commas between them, such as 0-49 or 0,3,10-12.",
-            )
-        numbers.update(range(int(match[1]), int(match[2] or match[1]) + 1))
-    return tuple(sorted(numbers))
-
-
-def select_families(asked: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
-    """Return the families that are asked for, in the order of `known`; `all` is all of them.
+    Attributes:
+        episodes: Family and split of the query episodes, such as `MoveCube/test`, to their
+            numbers, such as `0-49`.
+        conditions: Names of the conditions.
+        shard: The part of them that is run: `2/8` is the second of eight.
 
     Raises:
-        UnknownNameError: One is not known.
+        InvalidOptionError: Numbers or shard do not read as such.
     """
-    if list(asked) == ["all"]:
-        return tuple(known)
-    for family in asked:
-        if family not in known:
-            raise UnknownNameError(
-                f"family {family!r} is not in the split", nearest(family, [*known, "all"])
+
+    episodes: dict[str, str]
+    conditions: tuple[str, ...]
+    shard: str = "1/1"
+
+    def __post_init__(self) -> None:
+        self.items()
+
+    def items(self) -> tuple[WorkItem, ...]:
+        """Return the rollouts of the shard in canonical order: by episode and condition.
+
+        An episode's conditions follow each other, so that even a run that is cut off compares
+        conditions over the same episodes. Shards take episodes in turn from the shuffled order:
+        no two have one in common, together they are the plan, and they differ by one at most.
+        """
+        shard = _SHARD.fullmatch(self.shard)
+        if shard is None or not 1 <= int(shard[1]) <= int(shard[2]):
+            raise InvalidOptionError.expected(
+                "--shard", self.shard, "NUMBER/OF, such as 2/8 for the second of eight"
             )
-    return tuple(family for family in known if family in asked)
+        number, of = int(shard[1]), int(shard[2])
+        known = [
+            EpisodeId.parse(f"{group}/{index}")
+            for group, numbers in self.episodes.items()
+            for index in parse_numbers(numbers)
+        ]
+        mine = sorted(sorted(known, key=_lot)[number - 1 :: of])
+        names = [one.name for one in in_order(self.conditions)]
+        return tuple(WorkItem(name, episode) for episode in mine for name in names)
 
 
 def plan_work(
     known: Iterable[EpisodeId],
     *,
-    episode_split: str,
-    families: Sequence[str],
-    episodes: Sequence[int],
-    conditions: Sequence[str],
-) -> tuple[WorkItem, ...]:
-    """List the rollouts of a run in canonical order: by family, episode and condition.
-
-    An episode's conditions follow each other, so that even a run that is cut off compares
-    conditions over the same episodes.
+    conditions: Iterable[str],
+    families: Sequence[str] = (),
+    episodes: str | None = None,
+    episode_split: str = "test",
+    shard: str = "1/1",
+) -> Plan:
+    """Return the plan of a run.
 
     Args:
         known: Query episodes of the split.
-        episode_split: `train`, `val` or `test`.
-        families: Which families, each once.
-        episodes: Which indices, each once.
         conditions: Which conditions.
+        families: Which families; empty for all.
+        episodes: Their numbers, such as `0-49`; None for all that are there.
+        episode_split: `train`, `val` or `test`.
+        shard: The part to run, such as `2/8`.
 
     Raises:
         InvalidIdError: A condition is none.
-        UnknownNameError: The split lacks an episode that is asked for.
+        InvalidOptionError: Numbers or shard do not read as such, or there is nothing to run.
+        UnknownNameError: The split lacks a family or episode that is asked for.
     """
-    order = sorted(set(conditions), key=condition_rank)
-    present = set(known)
-    items = []
+    there = sorted(known)
+    here: dict[str, list[int]] = {episode.family: [] for episode in there}
+    for episode in there:
+        if episode.split == episode_split:
+            here[episode.family].append(episode.index)
     for family in families:
-        asked = [EpisodeId(family, episode_split, index) for index in episodes]
-        missing = [episode for episode in asked if episode not in present]
-        if missing:
-            has = sorted(e.index for e in present if (e.family, e.split) == (family, episode_split))
+        if family not in here:
+            raise UnknownNameError.among("family", family, "the split", here)
+    asked = None if episodes is None else parse_numbers(episodes)
+    chosen = {}
+    for family in [name for name in here if not families or name in families]:
+        numbers, group = here[family], f"{family}/{episode_split}"
+        missing = sorted(set(asked or ()) - set(numbers))
+        if missing or (families and not numbers):
+            has = f"It has {format_numbers(numbers)} of {group}." if numbers else ""
             raise UnknownNameError(
-                f"the split has no query episode {missing[0]}"
+                f"the split has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"It has {_spans(has)} of {family}/{episode_split}: give those to --episodes."
-                if has
-                else f"It has no {episode_split} episode of {family}: see --episode-split and "
-                "robomme-interference list.",
+                has or f"It has no {episode_split} episode of {family}: see --episode-split.",
             )
-        items += [WorkItem(condition, episode) for episode in asked for condition in order]
-    return tuple(items)
-
-
-def parse_shard(text: str) -> tuple[int, int]:
-    """Read a shard such as `2/8`, the second of eight.
-
-    Raises:
-        InvalidOptionError: The text is something else.
-    """
-    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text.strip())
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        if numbers:
+            chosen[group] = format_numbers(asked or numbers)
+    names = tuple(one.name for one in in_order(conditions))
+    if not chosen:
+        splits = sorted({one.split for one in there})
         raise InvalidOptionError(
-            f"--shard {text} is not a shard",
-            "Expected NUMBER/OF, such as 2/8 for the second of eight.",
+            f"there is nothing to run: the split has no {episode_split} episode",
+            f"Give --episode-split; there are {', '.join(splits)}.",
         )
-    return int(match[1]), int(match[2])
+    return Plan(chosen, names, shard)
 
 
-def shuffle_work(plan: Iterable[WorkItem]) -> tuple[WorkItem, ...]:
+def shuffle_work(items: Iterable[WorkItem]) -> tuple[WorkItem, ...]:
     """Return rollouts in the order in which they are run: episodes shuffled by a fixed seed.
 
     However early a run is cut off, it has seen all families and difficulties alike. The order of
     two episodes is always the same, whatever else is planned; an episode's conditions stay
     together.
     """
-    return tuple(sorted(plan, key=lambda item: _lot(item.episode)))
-
-
-def take_shard(plan: Sequence[WorkItem], shard: tuple[int, int]) -> tuple[WorkItem, ...]:
-    """Return the rollouts of one shard, in the order of the plan.
-
-    Shards take episodes in turn from the shuffled order, with all their conditions: no two have
-    one in common, together they are the plan, and they differ by one episode at most.
-
-    Args:
-        plan: The whole plan.
-        shard: Which shard, from 1, and of how many.
-    """
-    number, of = shard
-    mine = set(sorted({item.episode for item in plan}, key=_lot)[number - 1 :: of])
-    return tuple(item for item in plan if item.episode in mine)
+    return tuple(sorted(items, key=lambda item: _lot(item.episode)))
 
 
 def _lot(episode: EpisodeId) -> bytes:
     return hashlib.sha256(str(episode).encode()).digest()
-
-
-def _spans(numbers: Sequence[int]) -> str:
-    """Write numbers as `parse_episodes` reads them."""
-    spans: list[list[int]] = []
-    for number in numbers:
-        if spans and spans[-1][1] == number - 1:
-            spans[-1][1] = number
-        else:
-            spans.append([number, number])
-    return ",".join(f"{a}-{b}" if a < b else str(a) for a, b in spans)

@@ -1,71 +1,45 @@
 """One rollout: reset, feed the history that the condition prescribes, then the live loop."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections import deque
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer, Chunk
-from robomme_interference_data.constants import MAX_STEPS
-from robomme_interference_data.draw import even_sample
-from robomme_interference_data.errors import PolicyError, RolloutError
+from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
+from robomme_interference_data.errors import InvalidOptionError, PolicyError, RolloutError
 from robomme_interference_data.evaluate.agreement import check_episode, check_lesson
-from robomme_interference_data.evaluate.ahead import read_ahead
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.clips import Clip
+from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
-from robomme_interference_data.evaluate.rows import PROTOCOL_VERSION, Rollout
 from robomme_interference_data.evaluate.systems import check_history, name_system
-from robomme_interference_data.evaluate.watchdog import Watchdog
-from robomme_interference_data.loader import Split
-from robomme_interference_data.retrieval.selector import Selection, Selector
+from robomme_interference_data.execution import Worker
+from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.sampling import lesson_frames, lesson_share
 from robomme_interference_data.simulators.base import (
-    EpisodeInfo,
     Observation,
     Simulator,
-    Status,
+    action_array,
 )
+from robomme_interference_data.split import Split
 
-__all__ = ["ACTION_CHUNK", "Watcher", "base_row", "run_rollout"]
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selection, Selector
 
-ACTION_CHUNK = 16
-"""Actions of a chunk that are executed before the policy is asked again (paper)."""
+__all__ = ["read_ahead", "run_rollout"]
 
 _FRAMES_AHEAD = 256
 """Frames of the history that are decoded ahead at most: 50 MB of a camera of 256 × 256."""
 
 
-class Watcher(Protocol):
-    """Sees a rollout as it goes, for a video. It wants the front camera at every step."""
-
-    def begin(
-        self, buffer: Buffer | None, start: int, stop: int, first: Observation, info: EpisodeInfo
-    ) -> None:
-        """Take what is known before the first step.
-
-        Args:
-            buffer: The buffer that the condition prescribes, or None.
-            start: First of its frames that the policy is given.
-            stop: Frame after the last one.
-            first: The first live observation.
-            info: The episode.
-        """
-        ...
-
-    def step(self, observation: Observation, status: Status, subgoal: str | None) -> None:
-        """Take what came of a step."""
-        ...
-
-
-@dataclass
-class _Clock:
+class _Clock(dict[str, float]):
     """Seconds by part of a rollout."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
@@ -73,40 +47,34 @@ class _Clock:
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
-
-
-def base_row(config: RunConfig, item: WorkItem) -> dict[str, Any]:
-    """Return the columns that are known before a rollout begins: its key."""
-    return {
-        "system": config.system,
-        "simulator": config.simulator,
-        "split": config.split_name,
-        "revision": config.revision,
-        "family": item.episode.family,
-        "condition": item.condition,
-        "episode_split": item.episode.split,
-        "episode": item.episode.index,
-        "model_seed": config.model_seed,
-        "protocol_version": PROTOCOL_VERSION,
-    }
+            self[name] = self.get(name, 0.0) + time.perf_counter() - began
 
 
 def run_rollout(
-    config: RunConfig,
+    run: Run,
     item: WorkItem,
     *,
     simulator: Simulator,
     policy: Policy,
     split: Split,
-    selector: Selector | None = None,
-    watcher: Watcher | None = None,
-    watchdog: Watchdog | None = None,
+    selector: "Selector | None" = None,
+    clip: Clip | None = None,
+    worker: Worker | None = None,
 ) -> Rollout:
     """Run one rollout and return its row.
 
     The policy never gets what the simulator returns of the demonstration: its history comes from
-    the dataset, and under `no-history` there is none (protocol, rules 2 and 6).
+    the dataset, and is what the condition says (protocol, rules 2 and 6).
+
+    Args:
+        run: The run.
+        item: Which rollout.
+        simulator: Plays the episode.
+        policy: Acts.
+        split: Has the history.
+        selector: The retrieval step, or None.
+        clip: Gets the pictures, or None.
+        worker: Keeps the simulator's time limit; None for none.
 
     Raises:
         RolloutError: Simulator and dataset speak of different episodes.
@@ -114,35 +82,33 @@ def run_rollout(
         PolicyError: The policy broke, or returned no actions.
         SimulatorCrashError: The simulator broke.
     """
-    clock = _Clock()
-    guard = nullcontext if watchdog is None else watchdog.guard
-    began = time.perf_counter()
-    buffer = None if item.k is None else split.load(item.episode, item.k)
-    chosen = None
-    start, stop = 0, 0 if buffer is None else len(buffer)
+    config, clock, began = run.config, _Clock(), time.perf_counter()
+    worker = worker or Worker(0)
+    buffer = split.load(item.episode, item.condition)
+    chosen: Selection | None = None
+    start, stop = 0, len(buffer)
     with ExitStack() as stack:
         history = None
         # One that computes in this process holds Python's lock: decoding beside it slows both down.
         if selector is None and getattr(simulator, "remote", False):
-            history = stack.enter_context(_history(buffer, start, stop, policy, config))
-        with clock.part("reset_s"), guard():
+            history = stack.enter_context(_decode(buffer, start, stop, policy, run))
+        with clock.part("reset_s"), worker.limit(config.simulator_timeout, "the simulator's reset"):
             demonstration, first, info = simulator.reset(
                 str(item.episode), demonstration=config.check_lesson
             )
-        recorded = split.load(item.episode, split.k_values[0]) if buffer is None else buffer
-        check_episode(recorded, demonstration, first, info)
+        check_episode(buffer.query, demonstration, first, info)
         if config.check_lesson:
-            check_lesson(recorded, demonstration, first)
+            check_lesson(buffer.query, demonstration, first)
         with clock.part("history_s"):
-            if selector is not None and buffer is not None and len(buffer):
+            if selector is not None and len(buffer):
                 chosen = selector.select(buffer, first.images[selector.camera])
                 start, stop = chosen.start, chosen.stop
-                check_history(name_system(config.system), stop - start)
-        if watcher is not None:
-            watcher.begin(buffer, start, stop, first, info)
+                check_history(name_system(run.system), {item.condition: stop - start})
+        if clip is not None:
+            clip.begin(buffer, start, stop, first, info)
         with clock.part("history_s"):
             if history is None:
-                history = stack.enter_context(_history(buffer, start, stop, policy, config))
+                history = stack.enter_context(_decode(buffer, start, stop, policy, run))
             policy.reset(
                 RolloutInfo(
                     info.goal,
@@ -153,13 +119,12 @@ def run_rollout(
             )
             for chunk in history:
                 policy.add_history(chunk.frames, chunk.states, stop - start)
-    status, steps = _live(policy, simulator, first, info.goal, clock, watcher, guard)
+    status, steps = _act(run, policy, simulator, first, info.goal, clock, clip, worker)
     if status is Status.ERROR:
         raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
-    lesson = 0 if buffer is None else _lesson_frames(buffer, start, stop)
-    times: dict[str, Any] = {name: round(value, 4) for name, value in clock.seconds.items()}
-    return Rollout(
-        **base_row(config, item),
+    times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
+    return run.row(
+        item,
         seed=info.seed,
         difficulty=info.difficulty,
         goal=info.goal,
@@ -167,32 +132,23 @@ def run_rollout(
         success=status is Status.SUCCESS,
         steps=steps,
         history_frames=stop - start,
-        lesson_frames=lesson,
-        lesson_share=None if buffer is None else _share(buffer, start, stop),
+        lesson_frames=lesson_frames(buffer.sessions, start, stop),
+        lesson_share=lesson_share(buffer.sessions, start, stop) if stop > start else None,
         **_retrieval_columns(selector, chosen),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
 
 
-def _history(
-    buffer: Buffer | None, start: int, stop: int, policy: Policy, config: RunConfig
-) -> AbstractContextManager[Iterator[Chunk]]:
-    """Begin to decode what a policy is given of a buffer; give it in chunks, in order."""
-    if buffer is None:
-        return nullcontext(iter(()))
-    chunks = buffer.stream(config.history_chunk, policy.history_cameras, start, stop)
-    return read_ahead(chunks, max(1, _FRAMES_AHEAD // config.history_chunk))
-
-
-def _live(
+def _act(
+    run: Run,
     policy: Policy,
     simulator: Simulator,
     first: Observation,
     goal: str,
     clock: _Clock,
-    watcher: Watcher | None,
-    guard: Callable[[], AbstractContextManager[None]],
+    clip: Clip | None,
+    worker: Worker,
 ) -> tuple[Status, int]:
     """Run the live loop; return how it ended and the number of executed steps."""
     seen, steps = [first], 0
@@ -202,67 +158,71 @@ def _live(
             policy.observe(frames, np.stack([one.state for one in seen]))
             actions = _checked(policy.act(seen[-1], goal))[: MAX_STEPS - steps]
         seen = []
-        with guard():
+        with worker.limit(run.config.simulator_timeout, "the simulator's steps"):
             for number, action in enumerate(actions, 1):
                 decides = number == len(actions)
                 wanted = policy.every_frame or decides
                 with clock.part("simulator_s"):
-                    observed, status = simulator.step(action, observe=wanted or watcher is not None)
+                    observed, status = simulator.step(action, observe=wanted or clip is not None)
                 steps += 1
-                if watcher is not None:
-                    watcher.step(observed, status, getattr(policy, "subgoal", None))
+                if clip is not None:
+                    clip.step(observed, status, getattr(policy, "subgoal", None))
                 if status is not Status.ONGOING:
                     return status, steps
+                if steps >= MAX_STEPS:
+                    return Status.TIMEOUT, steps
                 if wanted:
                     seen.append(observed)
-        if steps >= MAX_STEPS:
-            return Status.TIMEOUT, steps
 
 
-def _checked(actions: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the actions of a chunk that are executed."""
-    found = np.asarray(actions)
-    if found.ndim != 2 or found.shape[1] != 8 or not len(found):
-        raise PolicyError(
-            f"the policy returned actions of shape {found.shape}; expected (n, 8) with n ≥ 1",
-            "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
-        )
-    executed = found[:ACTION_CHUNK].astype(np.float32)
-    if not np.isfinite(executed).all():
-        raise PolicyError("the policy returned actions that are not finite numbers")
-    return executed
+def _checked(actions: Any) -> NDArray[np.float32]:
+    """Return the actions of a chunk that are executed, `(n, 8) float32`, n from 1 to 16."""
+    try:
+        return action_array(actions, chunk=True)[:ACTION_CHUNK]
+    except InvalidOptionError as error:
+        raise PolicyError(f"the policy's answer: {error.message}", error.hint) from None
 
 
-def _lesson_frames(buffer: Buffer, start: int, stop: int) -> int:
-    return sum(
-        max(0, min(stop, s.stop) - max(start, s.start))
-        for s in buffer.sessions
-        if s.role == "lesson"
-    )
+def _retrieval_columns(selector: "Selector | None", chosen: "Selection | None") -> dict[str, Any]:
+    columns: dict[str, Any] = {"retrieval_model": selector.name} if selector else {}
+    if chosen is not None:
+        columns |= {"retrieval_start": chosen.start, "retrieval_stop": chosen.stop}
+        for part in ("lesson", "filler", "query"):
+            columns[f"retrieval_selected_{part}_fraction"] = getattr(chosen, f"{part}_fraction")
+    return columns
 
 
-def _share(buffer: Buffer, start: int, stop: int) -> float:
-    """Return the share of lesson frames in an even sample of a span and the live observation."""
-    sample = even_sample(stop - start)
-    lesson = [s for s in buffer.sessions if s.role == "lesson"]
-    inside = _count(lesson, (start + index for index in sample[:-1]))
-    return inside / len(sample)
+def _decode(
+    buffer: Buffer, start: int, stop: int, policy: Policy, run: Run
+) -> AbstractContextManager[Iterator[Chunk]]:
+    """Begin to decode what a policy is given of a buffer; give it in chunks, in order."""
+    frames = run.config.history_chunk
+    chunks = buffer.stream(frames, tuple(policy.history_cameras), start, stop)
+    return read_ahead(chunks, max(1, _FRAMES_AHEAD // frames))
 
 
-def _count(sessions: Sequence[Any], indices: Any) -> int:
-    return sum(any(s.start <= index < s.stop for s in sessions) for index in indices)
+@contextmanager
+def read_ahead[T](items: Generator[T], depth: int) -> Iterator[Iterator[T]]:
+    """Make the first items of a stream at once, and the next ones while the others are used.
 
+    Args:
+        items: The stream; it is closed at the end, read to its end or not. No item is None.
+        depth: Items that are made ahead at most, 1 or more: so many wait in memory.
 
-def _retrieval_columns(selector: Selector | None, chosen: Selection | None) -> dict[str, Any]:
-    if selector is None:
-        return {}
-    if chosen is None:
-        return {"retrieval_model": selector.name}
-    return {
-        "retrieval_model": selector.name,
-        "retrieval_start": chosen.start,
-        "retrieval_stop": chosen.stop,
-        "retrieval_selected_lesson_fraction": chosen.lesson_fraction,
-        "retrieval_selected_filler_fraction": chosen.filler_fraction,
-        "retrieval_selected_query_fraction": chosen.query_fraction,
-    }
+    Returns:
+        A context manager; what it gives yields the items in order. An error in making one is
+        raised where that item would have come.
+    """
+    pool = ThreadPoolExecutor(1, "read-ahead")  # one thread: a stream is made in its order
+    made = deque(pool.submit(next, items, None) for _ in range(depth))
+
+    def given() -> Iterator[T]:
+        while (item := made.popleft().result()) is not None:
+            made.append(pool.submit(next, items, None))
+            yield item
+
+    try:
+        yield given()
+    finally:
+        pool.shutdown(cancel_futures=True)
+        items.close()

@@ -6,8 +6,10 @@ your own.
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import SequenceMatcher
+from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
@@ -43,7 +45,6 @@ class System:
         representation: What the memory is made of, such as `frames` or `tokens`; `none` without.
         integration: How the memory enters the policy: `modulator`, `context`, `expert`,
             `subgoals`, or None.
-        no_history: Whether `no-history` applies.
         with_history: Whether the other conditions apply.
         subgoals: What a vision-language model in front of the policy writes:
             `simple_subgoal`, `grounded_subgoal`, or None where there is none.
@@ -57,8 +58,7 @@ class System:
     name: str
     display: str
     representation: str
-    integration: str | None
-    no_history: bool = True
+    integration: str | None = None
     with_history: bool = True
     subgoals: str | None = None
     retrieval: bool = False
@@ -66,35 +66,27 @@ class System:
     paper: bool = False
     bound: bool = False
 
+    @property
+    def no_history(self) -> bool:
+        """Whether `no-history` applies: there is nothing to retrieve from."""
+        return not self.retrieval
+
 
 def _released(
-    name: str, display: str, representation: str, integration: str, *, retrieval: bool = False
+    name: str, display: str, memory: str, integration: str, *, retrieval: bool = False
 ) -> System:
     """A system whose server keeps the frames, with an embedding for each of 4096 positions."""
-    return System(
-        name,
-        display,
-        representation,
-        integration,
-        # With nothing to choose from it is the system without retrieval.
-        no_history=not retrieval,
-        retrieval=retrieval,
-        position_limit=POSITION_LIMIT,
-        paper=True,
-    )
+    own: dict[str, Any] = {"retrieval": retrieval, "position_limit": POSITION_LIMIT, "paper": True}
+    return System(name, display, memory, integration, **own)
 
 
-def _symbolic(name: str, display: str, representation: str, subgoals: str) -> System:
+def _symbolic(name: str, display: str, memory: str, subgoals: str) -> System:
     """A system whose server keeps nothing: the model in front of it reads the history."""
-    return System(name, display, representation, "subgoals", subgoals=subgoals, paper=True)
-
-
-def _control(name: str, display: str, memory: str, *, retrieval: bool = False) -> System:
-    return System(name, display, memory, None, no_history=not retrieval, retrieval=retrieval)
+    return System(name, display, memory, "subgoals", subgoals=subgoals, paper=True)
 
 
 PAPER_SYSTEMS: tuple[System, ...] = (
-    System("pi05_baseline", "π0.5 (baseline)", "none", None, with_history=False, paper=True),
+    System("pi05_baseline", "π0.5 (baseline)", "none", with_history=False, paper=True),
     _released("perceptual-framesamp-modul", "FrameSamp-Modul", "frames", "modulator"),
     _released("perceptual-tokendrop-modul", "TokenDrop-Modul", "tokens", "modulator"),
     _released("perceptual-framesamp-context", "FrameSamp-Context", "frames", "context"),
@@ -107,25 +99,21 @@ PAPER_SYSTEMS: tuple[System, ...] = (
     _symbolic("symbolic-groundsg", "GroundSG", "text with points", "grounded_subgoal"),
     _symbolic("memer", "MemER", "text with points and key frames", "grounded_subgoal"),
     _released(
-        "retrieval-framesamp-modul",
-        "Retrieval-FrameSamp-Modul",
-        "frames",
-        "modulator",
+        *("retrieval-framesamp-modul", "Retrieval-FrameSamp-Modul"),
+        *("frames", "modulator"),
         retrieval=True,
     ),
 )
 """The twelve systems of the paper's main table in its order, then the one with retrieval."""
 
+_REPLAY = {"Full": "all frames", "FrameSamp": "frames", "Window": "last frames"}
 _CONTROLS = (
-    System("oracle", "Oracle", "none", None, bound=True),
-    System("guess", "Guess", "none", None, bound=True),
-    System("hold", "Hold", "none", None, bound=True),
-    _control("replay-full", "Replay-Full", "all frames"),
-    _control("replay-framesamp", "Replay-FrameSamp", "frames"),
-    _control("replay-window", "Replay-Window", "last frames"),
-    _control("retrieval-replay-full", "Retrieval-Replay-Full", "all frames", retrieval=True),
-    _control("retrieval-replay-framesamp", "Retrieval-Replay-FrameSamp", "frames", retrieval=True),
-    _control("retrieval-replay-window", "Retrieval-Replay-Window", "last frames", retrieval=True),
+    *(System(name.lower(), name, "none", bound=True) for name in ("Oracle", "Guess", "Hold")),
+    *(System(f"replay-{n.lower()}", f"Replay-{n}", memory) for n, memory in _REPLAY.items()),
+    *(
+        System(f"retrieval-replay-{n.lower()}", f"Retrieval-Replay-{n}", memory, retrieval=True)
+        for n, memory in _REPLAY.items()
+    ),
 )
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
@@ -158,7 +146,7 @@ def name_system(name: str) -> System:
                 f"Write {system.name!r} if that is what runs, or take a name that cannot be "
                 "mistaken for it.",
             )
-    return System(name, name, "own", None)
+    return System(name, name, "own")
 
 
 def _alike(name: str, known: str) -> bool:
@@ -201,20 +189,25 @@ def check_condition(system: System, condition: str) -> None:
         )
 
 
-def check_history(system: System, frames: int) -> None:
-    """Refuse a history that, with a whole rollout after it, exceeds the system's positions.
+def check_history(system: System, frames: Mapping[str, int]) -> None:
+    """Refuse histories that, with a whole rollout after them, exceed the system's positions.
 
     Args:
         system: The system.
-        frames: Number of history frames.
+        frames: Number of history frames by condition: the most there are.
 
     Raises:
-        HistoryTooLongError: `frames` + 1300 is more than the system's `position_limit`.
+        HistoryTooLongError: With 1300 steps, some are more than `position_limit`; names them all.
     """
     limit = system.position_limit
-    if limit is not None and frames + MAX_STEPS > limit:
+    over = [
+        f"{count} frames under {name}"
+        for name, count in frames.items()
+        if limit is not None and count + MAX_STEPS > limit
+    ]
+    if over:
         raise HistoryTooLongError(
-            f"{frames} history frames and {MAX_STEPS} steps exceed the {limit} positions of "
-            f"{system.name}",
-            "Leave out that episode or condition, or run a system without such a limit.",
+            f"{system.name} numbers {limit} positions: {MAX_STEPS} steps leave no room for a "
+            f"history of {', '.join(over)}",
+            "Leave out those conditions or episodes, or run a system without such a limit.",
         )

@@ -66,7 +66,7 @@ def simulate() -> None:
 
 def evaluate() -> None:
     """Roll out the controls on a handful of episodes under all conditions, and score them."""
-    policies = {f"replay-{m}": f"replay --memory {m}" for m in ("full", "framesamp", "window")}
+    policies = {f"replay-{m}": f"replay:{m}" for m in ("full", "framesamp", "window")}
     policies |= {"guess": "guess", "oracle": "oracle"}
     runs = [DEMO / "runs" / system for system in policies]
     for out, policy in zip(runs, policies.values(), strict=True):

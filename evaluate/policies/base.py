@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ class RolloutInfo:
     simulator: Simulator | None = None
 
 
-class Policy(Protocol):
+class Policy:
     """A policy together with its memory, one rollout at a time.
 
     The calls come in this order:
@@ -41,6 +41,8 @@ class Policy(Protocol):
     `reset`; `add_history` for each chunk of the history, in order; `observe` with the first live
     observation; `act`; up to 16 of its actions are executed; `observe` with what was seen after
     each of them; `act`; and so on.
+
+    A policy of one's own need not be a subclass; one that is has what it leaves out from here.
 
     Attributes:
         cameras: Cameras whose live frames it wants, such as `("front", "wrist")`: no others are
@@ -52,15 +54,14 @@ class Policy(Protocol):
             the observation on which it acts next, and simulators need not draw the others.
     """
 
-    cameras: tuple[str, ...]
-    history_cameras: tuple[str, ...]
-    wants_history: bool
-    privileged: bool
-    every_frame: bool
+    cameras: tuple[str, ...] = ()
+    history_cameras: tuple[str, ...] = ()
+    wants_history: bool = True
+    privileged: bool = False
+    every_frame: bool = False
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget everything and prepare for a rollout."""
-        ...
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
         """Take the next chunk of the history.
@@ -70,7 +71,6 @@ class Policy(Protocol):
             states: `(T, 8) float32`.
             exec_start_idx: Number of history frames in all, the same with every chunk.
         """
-        ...
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
         """Take the live observations since the last call.
@@ -79,7 +79,6 @@ class Policy(Protocol):
             frames: `(T, H, W, 3) uint8` of each of `cameras`.
             states: `(T, 8) float32`.
         """
-        ...
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next actions, `(n, 8) float32`, n at least 1; 16 at most are executed.
@@ -88,12 +87,11 @@ class Policy(Protocol):
             observation: What is seen now; `observe` has had it.
             goal: The goal in words.
         """
-        ...
+        raise NotImplementedError
 
     def metadata(self) -> dict[str, Any]:
         """Return plain values that say which policy this is, for the record of the run."""
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
         """Release everything."""
-        ...

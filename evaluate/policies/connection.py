@@ -1,18 +1,18 @@
 """One connection to a policy server: connecting with patience, and questions with a time limit."""
 
-import http.client
+import http
 import os
 import socket
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from robomme_interference_data.errors import PolicyServerError
+from robomme_interference_data.console import MESSAGES
+from robomme_interference_data.errors import PolicyServerError, WireError
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
 
 __all__ = ["API_KEY_VARIABLE", "ServerConnection"]
@@ -20,7 +20,12 @@ __all__ = ["API_KEY_VARIABLE", "ServerConnection"]
 API_KEY_VARIABLE = "ROBOMME_POLICY_API_KEY"
 """Environment variable with the key that servers behind a gate ask for."""
 
-_LONGEST_WAIT_S = 30.0
+_QUIET_S = 2.0
+"""Seconds of waiting after which it is told."""
+
+_PAUSES_S = (0.2, 5.0)
+"""The first pause between two attempts, which doubles, and the longest."""
+
 _CLOSE_S = 2.0
 _GUIDE = "docs/systems.md says how to start one."
 
@@ -31,31 +36,18 @@ class ServerConnection:
     Args:
         host: Name or address of the server.
         port: Its port.
-        connect_s: Most seconds that one attempt to connect may take.
+        connect_s: Most seconds to wait until it can be used.
         response_s: Most seconds from a message to its answer.
-        attempts: How often a connection is tried.
-        backoff_s: Seconds between the first two attempts; they double up to 30.
 
     Attributes:
         name: `host:port`.
         metadata: What the server said of itself when it was last connected; None before.
     """
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        connect_s: float,
-        response_s: float,
-        attempts: int,
-        backoff_s: float,
-    ):
+    def __init__(self, host: str, port: int, *, connect_s: float, response_s: float):
         self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self.metadata: dict[str, Any] | None = None
-        self._host, self._port = host, port
         self._connect_s, self._response_s = connect_s, response_s
-        self._attempts, self._backoff_s = attempts, backoff_s
         self._connection: ClientConnection | None = None
         self._stack = ExitStack()
         self._sent = b""
@@ -66,37 +58,54 @@ class ServerConnection:
         return self._connection is not None
 
     def open(self) -> None:
-        """Connect anew, trying several times while nobody listens.
+        """Connect anew, again and again while nobody answers.
 
         Raises:
             PolicyServerError: The server cannot be reached, refuses, or is no policy server.
         """
         self.close()
-        for attempt in range(self._attempts):
+        told = threading.Timer(
+            _QUIET_S,
+            MESSAGES.print,
+            [f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"],
+        )
+        told.daemon = True
+        told.start()
+        try:
+            self._connect()
+        finally:
+            told.cancel()
+
+    def _connect(self) -> None:
+        until = time.monotonic() + self._connect_s
+        pause, longest = _PAUSES_S
+        while True:
             try:
-                self._check_health()
-                self._connection = self._handshake()
+                self._connection = self._handshake(max(until - time.monotonic(), pause))
                 break
-            except PolicyServerError:
-                raise
-            except (OSError, EOFError, InvalidMessage, http.client.HTTPException) as error:
-                reason = str(error) or type(error).__name__
-                # A name that nobody knows stays unknown.
-                if attempt + 1 == self._attempts or isinstance(error, socket.gaierror):
-                    raise PolicyServerError(
-                        f"policy server {self.name} cannot be reached: {reason} "
-                        f"(attempts: {attempt + 1})",
-                        f"Start it, or check host and port; {_GUIDE}",
-                    ) from error
-                time.sleep(min(self._backoff_s * 2**attempt, _LONGEST_WAIT_S))
             except InvalidStatus as error:
-                raise self._refusal(error.response.status_code) from error
+                status = error.response.status_code
+                reason = f"it answers {status}"
+                if status < http.HTTPStatus.INTERNAL_SERVER_ERROR:
+                    raise self._refusal(status) from error
+            except (OSError, EOFError, InvalidMessage) as error:
+                reason = str(error) or type(error).__name__
+                if isinstance(error, TimeoutError):
+                    reason = "it does not answer"
+                if isinstance(error, socket.gaierror):  # a name that nobody knows stays unknown
+                    until = 0.0
             except InvalidHandshake as error:
+                raise self._refusal(error) from error
+            if time.monotonic() + pause > until:
                 raise PolicyServerError(
-                    f"what listens at {self.name} does not speak websocket: {error}", _GUIDE
-                ) from error
+                    f"policy server {self.name} cannot be reached: {reason}"
+                    + (f" (for {self._connect_s:g} s)" if until else ""),
+                    f"Start it, or check host and port; {_GUIDE}",
+                )
+            time.sleep(pause)
+            pause = min(2 * pause, longest)
         # The server speaks first.
-        self.metadata = self._read(self._exchange(None, self._connect_s))
+        self.metadata = self._read(self._exchange(None, max(until - time.monotonic(), pause)))
 
     def request(self, message: dict[str, Any], expected: str) -> dict[str, Any]:
         """Send a message and return its answer, a map with `expected` in it, and that not false.
@@ -127,24 +136,12 @@ class ServerConnection:
         self._connection = None
         self._stack.close()
 
-    def _check_health(self) -> None:
-        """Ask `GET /healthz`, which tells a wrong port from a server that is still loading."""
-        client = http.client.HTTPConnection(self._host, self._port, timeout=self._connect_s)
-        try:
-            client.request("GET", "/healthz", headers=_headers())
-            status = client.getresponse().status
-        finally:
-            client.close()
-        if status >= http.HTTPStatus.INTERNAL_SERVER_ERROR:
-            raise http.client.HTTPException(f"GET /healthz answers {status}")
-        if status != http.HTTPStatus.OK:
-            raise self._refusal(status)
-
-    def _handshake(self) -> ClientConnection:
+    def _handshake(self, seconds: float) -> ClientConnection:
+        key = os.environ.get(API_KEY_VARIABLE)
         connecting = connect(
             f"ws://{self.name}",
-            additional_headers=_headers(),
-            open_timeout=self._connect_s,
+            additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
+            open_timeout=seconds,
             close_timeout=_CLOSE_S,
             compression=None,
             max_size=None,
@@ -154,48 +151,20 @@ class ServerConnection:
         )
         return self._stack.enter_context(connecting)
 
-    def _refusal(self, status: int) -> PolicyServerError:
-        if status in (http.HTTPStatus.UNAUTHORIZED, http.HTTPStatus.FORBIDDEN):
+    def _refusal(self, reason: object) -> PolicyServerError:
+        if reason in (http.HTTPStatus.UNAUTHORIZED, http.HTTPStatus.FORBIDDEN):
             return PolicyServerError(
-                f"policy server {self.name} refuses with {status}: it asks for another key",
+                f"policy server {self.name} refuses with {reason}: it asks for another key",
                 f"Set {API_KEY_VARIABLE} to its API key.",
             )
         return PolicyServerError(
-            f"what listens at {self.name} is no policy server: it answers {status}",
+            f"what listens at {self.name} is no policy server, which speaks websocket: it answers "
+            f"{reason}",
             f"Check host and port; {_GUIDE}",
         )
 
     def _exchange(self, data: bytes | None, seconds: float) -> str | bytes:
-        """Send, unless there is nothing to send, and receive."""
-        with self._within(seconds) as connection:
-            if data is not None:
-                connection.send(data)
-            return connection.recv()
-
-    def _read(self, data: str | bytes) -> dict[str, Any]:
-        if isinstance(data, str):
-            # A traceback, sent as text; the server closes with 1011 after it.
-            self.close()
-            lines = [line for line in data.splitlines() if line.strip()] or ["an empty text"]
-            raise PolicyServerError(
-                f"policy server {self.name} reports: {lines[-1].strip()}",
-                "The whole traceback is in the server's log.",
-            )
-        try:
-            answer = unpack(data)
-        except ValueError as error:
-            self.close()
-            raise PolicyServerError(f"policy server {self.name}: {error}") from error
-        if not isinstance(answer, dict):
-            self.close()
-            raise PolicyServerError(
-                f"policy server {self.name} answers with a {type(answer).__name__}, not a map"
-            )
-        return answer
-
-    @contextmanager
-    def _within(self, seconds: float) -> Iterator[ClientConnection]:
-        """Lend the connection for a time. If anything breaks meanwhile, it is gone."""
+        """Send, unless there is nothing to send, and receive. If anything breaks, all is gone."""
         connection = self._connection
         if connection is None:
             raise PolicyServerError(
@@ -214,14 +183,15 @@ class ServerConnection:
         timer.daemon = True
         timer.start()
         try:
-            yield connection
+            if data is not None:
+                connection.send(data)
+            return connection.recv()
         except (ConnectionClosed, OSError) as error:
             self.close()
-            late = f"did not answer within {seconds:g} s"
+            late = f"did not answer within {seconds:.3g} s"
+            why = late if expired.is_set() else f"closed the connection: {error}"
             raise PolicyServerError(
-                f"policy server {self.name} "
-                + (late if expired.is_set() else f"closed the connection: {error}"),
-                "Its log may say why.",
+                f"policy server {self.name} {why}", "Its log may say why."
             ) from error
         except BaseException:
             # An answer that nobody read would be taken for that of the next message.
@@ -230,7 +200,18 @@ class ServerConnection:
         finally:
             timer.cancel()
 
-
-def _headers() -> dict[str, str]:
-    key = os.environ.get(API_KEY_VARIABLE)
-    return {"Authorization": f"Api-Key {key}"} if key else {}
+    def _read(self, data: str | bytes) -> dict[str, Any]:
+        if isinstance(data, str):
+            # A traceback, sent as text; the server closes with 1011 after it.
+            lines = [line for line in data.splitlines() if line.strip()] or ["an empty text"]
+            what, hint = f" reports: {lines[-1].strip()}", "The traceback is in the server's log."
+        else:
+            try:
+                answer = unpack(data)
+                if isinstance(answer, dict):
+                    return answer
+                what, hint = f" answers with a {type(answer).__name__}, not a map", None
+            except WireError as error:
+                what, hint = f": {error.message}", None
+        self.close()
+        raise PolicyServerError(f"policy server {self.name}{what}", hint)

@@ -4,40 +4,54 @@ What can be seen from the configuration is checked when the policy is made; the 
 loaded at the first rollout.
 """
 
+import hashlib
+import sys
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, FRONT, STATE, WRIST
-from robomme_interference_data.evaluate.policies.base import Frames, RolloutInfo
-from robomme_interference_data.evaluate.policies.checks import (
-    ACTION_SIZE,
-    check_actions,
-    check_frames,
+from robomme_interference_data.constants import (
+    ACTION,
+    ACTION_CHUNK,
+    CAMERA_PREFIX,
+    FRONT,
+    STATE,
+    WRIST,
 )
-from robomme_interference_data.evaluate.policies.lerobot_files import (
-    check_features,
-    choose_device,
-    digest_files,
-    explained,
-    feature_names,
-    find_policy,
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    MissingFileError,
+    PolicyError,
 )
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
+from robomme_interference_data.files import LocalFiles, format_sums
+from robomme_interference_data.hub import locate
+from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
-__all__ = ["LeRobotPolicy"]
+__all__ = ["LeRobotPolicy", "find_policy"]
 
-_MOST_ACTIONS = 16  # more are never executed
+_IMAGE_SHAPE = (3, 256, 256)
+"""Shape of an image of the simulators, channels first."""
+
+_FILES = ("*.json", "*.safetensors", "*.model")
+"""What a policy is loaded from: configuration, weights, tokenizers."""
+
+_NEEDED = (
+    *("config.json", "model.safetensors"),
+    *("policy_preprocessor.json", "policy_postprocessor.json"),
+)
 
 
-class LeRobotPolicy:
+class LeRobotPolicy(Policy):
     """A policy trained with LeRobot, such as one of its ACT, diffusion or VLA models.
 
     A policy that acts on one observation takes no history and runs `no-history` only. One that
@@ -57,12 +71,10 @@ class LeRobotPolicy:
         PolicyError: It wants what the simulators do not give, or gives other actions.
     """
 
-    privileged = False
-
     def __init__(self, path: str, *, device: str | None = None):
-        self._device = choose_device(device)
+        self._device = _choose_device(device)
         self._folder, self._source = find_policy(path)
-        with explained(path):
+        with _explained(path):
             self._config = PreTrainedConfig.from_pretrained(self._folder)
             self._config.device = self._device
             self._config.pretrained_path = self._folder
@@ -71,8 +83,8 @@ class LeRobotPolicy:
                 pretrained_path=str(self._folder),
                 preprocessor_overrides={"device_processor": {"device": self._device}},
             )
-        names = feature_names(self._before)
-        check_features(path, self._config, names)
+        names = _feature_names(self._before)
+        _check_features(path, self._config, names)
         wanted = [name for name in (FRONT, WRIST) if names[name] in self._config.input_features]
         self.cameras = tuple(name.removeprefix(CAMERA_PREFIX) for name in wanted)
         self._steps = int(self._config.n_obs_steps or 1)
@@ -90,7 +102,7 @@ class LeRobotPolicy:
             PolicyError: The weights cannot be loaded.
         """
         if self._model is None:
-            with explained(str(self._folder)):
+            with _explained(str(self._folder)):
                 kind = get_policy_class(self._config.type)
                 self._model = kind.from_pretrained(self._folder, config=self._config, strict=True)
         self._model.reset()
@@ -109,43 +121,25 @@ class LeRobotPolicy:
         self._keep(frames, states)
 
     def _keep(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        images = {camera: check_frames(frames, states, camera) for camera in self.cameras}
+        """Keep observations as LeRobot's processors take them: batches of one, images 0 to 1."""
         for index in range(max(0, len(states) - self._steps), len(states)):
-            shown = {camera: part[index].copy() for camera, part in images.items()}
-            self._recent.append(self._prepared(shown, states[index]))
-
-    def _prepared(
-        self, images: dict[str, NDArray[np.uint8]], state: NDArray[np.float32]
-    ) -> dict[str, Any]:
-        """Return an observation as LeRobot's processors take it: batches of one, images 0 to 1."""
-        prepared: dict[str, Any] = {}
-        for camera, image in images.items():
-            pixels = torch.from_numpy(image).permute(2, 0, 1).to(torch.float32) / 255
-            prepared[CAMERA_PREFIX + camera] = pixels.contiguous()[None]
-        prepared[STATE] = torch.from_numpy(np.array(state, np.float32))[None]
-        return prepared
+            state = torch.from_numpy(np.array(states[index], np.float32))
+            one: dict[str, Any] = {STATE: state[None]}
+            for camera in self.cameras:
+                pixels = torch.from_numpy(frames[camera][index].copy()).permute(2, 0, 1)
+                one[CAMERA_PREFIX + camera] = (pixels.to(torch.float32) / 255).contiguous()[None]
+            self._recent.append(one)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return a chunk of actions, `(n, 8) float32`, n at most 16.
-
-        Raises:
-            PolicyError: The policy gives none that can be executed.
-        """
-        if not self._recent:  # asked again without a new observation
-            shown = {camera: observation.images[camera] for camera in self.cameras}
-            self._recent.append(self._prepared(shown, observation.state))
+        """Return a chunk of actions, `(n, 8) float32`, n at most 16."""
         *earlier, last = [self._before(one | {"task": [goal]}) for one in self._recent]
         self._recent.clear()
         with torch.inference_mode(), self._seeded():
-            if self._has_queue:
-                for one in earlier:
-                    self._enqueue(one)
-                chunk = self._ask(last)
-            else:
-                chunk = self._predict(last)
+            chunk = self._ask(earlier, last) if self._has_queue else self._predict(last)
             # One at a time: a step may refer to the one observation that was processed.
-            actions = [self._after(action) for action in chunk[:_MOST_ACTIONS]]
-        return check_actions(torch.cat(actions).to("cpu", torch.float32).numpy())
+            actions = [self._after(action) for action in chunk[:ACTION_CHUNK]]
+        found: NDArray[np.float32] = torch.cat(actions).to("cpu", torch.float32).numpy()
+        return found
 
     @property
     def _has_queue(self) -> bool:
@@ -153,18 +147,16 @@ class LeRobotPolicy:
         queues = getattr(self._model, "_queues", None) or {}
         return ACTION in queues and len(queues) > 1
 
-    def _enqueue(self, one: dict[str, Any]) -> None:
-        """Put an observation into the policy's queue without having it predict anything."""
-        actions = self._model._queues[ACTION]
-        actions.clear()
-        # It predicts only when no action is left: this one it hands back.
-        actions.append(torch.zeros(1, ACTION_SIZE))
-        self._model.select_action(one)
-
-    def _ask(self, one: dict[str, Any]) -> list[torch.Tensor]:
-        """Return all actions, `(1, 8)` each, that the policy queues for an observation."""
-        self._model._queues[ACTION].clear()
-        first = self._model.select_action(one)
+    def _ask(self, earlier: list[dict[str, Any]], last: dict[str, Any]) -> list[torch.Tensor]:
+        """Return all actions, `(1, 8)` each, that the policy queues for its last observations."""
+        queue = self._model._queues[ACTION]
+        for one in earlier:
+            queue.clear()
+            # It predicts only when no action is left: this one it hands back.
+            queue.append(torch.zeros(1, ACTION_SIZE))
+            self._model.select_action(one)
+        queue.clear()
+        first = self._model.select_action(last)
         rest = list(self._model._queues[ACTION])
         self._model._queues[ACTION].clear()
         return [first, *rest]
@@ -193,7 +185,7 @@ class LeRobotPolicy:
         return {
             "policy": "lerobot",
             "source": self._source,
-            "sha256": digest_files(self._folder),
+            "sha256": _digest_files(self._folder),
             "type": self._config.type,
             "n_obs_steps": self._steps,
             "device": self._device,
@@ -202,3 +194,98 @@ class LeRobotPolicy:
     def close(self) -> None:
         """Let go of the weights."""
         self._model = None
+
+
+def _choose_device(device: str | None) -> str:
+    """Return the device, or for None the first GPU, if there is one, else `cpu`."""
+    gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
+    known = ["cpu", *gpus, *(["cuda"] if gpus else [])]
+    if device is not None and device not in known:
+        raise InvalidOptionError.one_of("device", device, known)
+    return device or known[-1]
+
+
+def find_policy(path: str) -> tuple[Path, str]:
+    """Return the folder with a policy's files, and what names it: with its commit, on the Hub.
+
+    Args:
+        path: A folder, or a model on the Hub: `namespace/name` or `namespace/name@revision`.
+
+    Raises:
+        InvalidOptionError: It is neither.
+        MissingFileError: A file is missing in it.
+        HubError: The Hub does not know the model, or cannot be reached.
+    """
+    files = locate(path, "model")
+    if isinstance(files, LocalFiles):
+        folder, name = files.root, path
+    else:
+        folder, name = files.snapshot(*_FILES), f"{files.repo_id}@{files.commit}"
+    missing = [one for one in _NEEDED if not (folder / one).is_file()]
+    if missing:
+        raise MissingFileError(
+            f"{', '.join(missing)} missing in {name}",
+            "Expected what LeRobot 0.6 saves, such as …/checkpoints/last/pretrained_model.",
+        )
+    return folder, name
+
+
+def _digest_files(folder: Path) -> str:
+    """Return the SHA-256 over the names and bytes of a policy's weights and configuration."""
+    found = {path for pattern in _FILES for path in folder.rglob(pattern) if path.is_file()}
+    names = (path.relative_to(folder).as_posix() for path in found)
+    return hashlib.sha256(format_sums(folder, names).encode()).hexdigest()
+
+
+@contextmanager
+def _explained(path: str) -> Iterator[None]:
+    """Turn what LeRobot raises while loading into errors of this package."""
+    try:
+        with redirect_stdout(sys.stderr):  # it prints
+            yield
+    except ImportError as error:
+        raise MissingExtraError(
+            f"the policy {path} needs more of LeRobot: {error}", "Install what it names."
+        ) from error
+    except Exception as error:
+        raise PolicyError(
+            f"LeRobot cannot load the policy {path}: {type(error).__name__}: {error}",
+            "Was it saved by lerobot 0.6? Older ones are migrated with "
+            "python -m lerobot.processor.migrate_policy_normalization.",
+        ) from error
+
+
+def _feature_names(before: Any) -> dict[str, str]:
+    """Return under which name each observation reaches the policy."""
+    names = {name: name for name in (FRONT, WRIST, STATE)}
+    for step in before.steps:
+        renames = getattr(step, "rename_map", None) or {}
+        names = {name: renames.get(known, known) for name, known in names.items()}
+    return names
+
+
+def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
+    """Compare the policy's features with what the simulators give and take."""
+    given = {names[FRONT]: _IMAGE_SHAPE, names[WRIST]: _IMAGE_SHAPE, names[STATE]: (ACTION_SIZE,)}
+    wrong = []
+    for name, feature in (config.input_features or {}).items():
+        shape = tuple(feature.shape)
+        if name not in given:
+            wrong.append(f"wants {name} {shape}, which the simulators do not give")
+        elif shape != given[name]:
+            wrong.append(f"wants {name} of shape {shape}; the simulators give {given[name]}")
+    actions = {
+        name: tuple(feature.shape)
+        for name, feature in (config.output_features or {}).items()
+        if feature.type is FeatureType.ACTION
+    }
+    if actions != {ACTION: (ACTION_SIZE,)}:
+        wrong.append(f"gives actions {actions}; the simulators take {ACTION} ({ACTION_SIZE},)")
+    if config.use_peft:
+        wrong.append("is an adapter (PEFT), which must be merged into its model first")
+    if wrong:
+        raise PolicyError(
+            f"the policy {path} does not fit: it {'; it '.join(wrong)}",
+            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a split's demonstrations; "
+            "docs/systems.md says how.",
+        )

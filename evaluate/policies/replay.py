@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import SAMPLE_FRAMES
-from robomme_interference_data.draw import even_sample
-from robomme_interference_data.errors import PolicyError, UnknownNameError, nearest
-from robomme_interference_data.evaluate.policies.base import Frames, RolloutInfo
+from robomme_interference_data.constants import ACTION_CHUNK, SAMPLE_FRAMES
+from robomme_interference_data.errors import PolicyError, UnknownNameError
+from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
+from robomme_interference_data.sampling import even_sample
 from robomme_interference_data.simulators.base import Observation
 
 __all__ = ["MEMORIES", "ReplayPolicy", "follow"]
@@ -31,7 +31,6 @@ MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
 the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last 32.
 """
 
-CHUNK = 16
 THUMBNAIL = 16
 """Side of the small image by which frames are compared."""
 
@@ -45,7 +44,7 @@ GRIP_STEPS = 5
 """Steps to wait for the gripper where frames between two kept ones are missing."""
 
 
-class ReplayPolicy:
+class ReplayPolicy(Policy):
     """See the module. The trajectory is taken up once, at the first action; at its end, it holds.
 
     Args:
@@ -55,18 +54,12 @@ class ReplayPolicy:
         UnknownNameError: There is no such memory rule.
     """
 
-    cameras: tuple[str, ...] = ("front",)
-    history_cameras: tuple[str, ...] = ("front",)
-    wants_history = True
-    privileged = False
-    every_frame = False
+    cameras = ("front",)
+    history_cameras = ("front",)
 
     def __init__(self, memory: str = "full"):
         if memory not in MEMORIES:
-            raise UnknownNameError(
-                f"replay has no memory {memory!r}; expected one of {', '.join(MEMORIES)}",
-                nearest(memory, MEMORIES),
-            )
+            raise UnknownNameError.among("memory", memory, "replay", MEMORIES)
         self.memory = memory
         self._ready = False
 
@@ -83,9 +76,6 @@ class ReplayPolicy:
         self._views.append(thumbnails(frames["front"]))
         self._states.append(np.array(states, np.float32))
 
-    def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Look: the trajectory depends on the first live view only."""
-
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next 16 targets of the trajectory, `(16, 8) float32`.
 
@@ -96,18 +86,15 @@ class ReplayPolicy:
             raise PolicyError("replay was not reset")
         if self._plan is None:
             self._plan = self._take_up(observation)
-        start, self._done = self._done, self._done + CHUNK
+        start, self._done = self._done, self._done + ACTION_CHUNK
         if start >= len(self._plan):
-            return np.tile(self._plan[-1], (CHUNK, 1))
-        chunk = self._plan[start : start + CHUNK]
-        return np.concatenate([chunk, np.tile(chunk[-1], (CHUNK - len(chunk), 1))])
+            return np.tile(self._plan[-1], (ACTION_CHUNK, 1))
+        chunk = self._plan[start : start + ACTION_CHUNK]
+        return np.concatenate([chunk, np.tile(chunk[-1], (ACTION_CHUNK - len(chunk), 1))])
 
     def metadata(self) -> dict[str, Any]:
         """Return name and memory rule."""
         return {"policy": "replay", "memory": self.memory}
-
-    def close(self) -> None:
-        """There is nothing to release."""
 
     def _take_up(self, observation: Observation) -> NDArray[np.float32]:
         live = sum(len(states) for states in self._states)

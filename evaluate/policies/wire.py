@@ -5,7 +5,6 @@ An array is a map with four keys of bytes: `__ndarray__` true, `data` its bytes 
 number, and `dtype`. Everything else is plain msgpack.
 """
 
-import math
 from typing import Any
 
 import msgpack
@@ -16,8 +15,9 @@ from robomme_interference_data.errors import WireError
 
 __all__ = ["pack", "unpack"]
 
-_SCALARS: dict[str, Any] = {"b": bool, "i": int, "u": int, "f": (int, float)}
-_KINDS = "".join(_SCALARS) + "SU"  # the last two, texts of fixed length, in arrays only
+_KINDS = "biufSU"
+"""Of NumPy data in messages: booleans, numbers, and texts of fixed length."""
+
 _NOTHING_ELSE = (
     "Messages hold maps, lists, texts, bytes, numbers and arrays of these, nothing else."
 )
@@ -35,9 +35,9 @@ def pack(message: Any) -> bytes:
     """
     try:
         return msgpack.packb(message, default=_pack_numpy)
+    except WireError:
+        raise
     except (TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, WireError):
-            raise
         raise WireError(f"a message cannot be sent: {error}", _NOTHING_ELSE) from error
 
 
@@ -51,9 +51,16 @@ def unpack(data: bytes) -> Any:
     """
     try:
         return msgpack.unpackb(data, object_hook=_unpack_numpy, ext_hook=_refuse_extension)
-    except (TypeError, ValueError, OverflowError, msgpack.UnpackException) as error:
-        if isinstance(error, WireError):
-            raise
+    except WireError:
+        raise
+    except (
+        KeyError,
+        OverflowError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+        msgpack.UnpackException,
+    ) as error:
         reason = str(error) or type(error).__name__
         raise WireError(f"{len(data)} bytes are not a message: {reason}") from error
 
@@ -62,7 +69,7 @@ def _pack_numpy(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, np.ndarray | np.generic):
         kind = type(value).__name__
         raise WireError(f"a message cannot hold a {kind}: {value!r:.80}", _NOTHING_ELSE)
-    _check_dtype(value.dtype)
+    _checked(value.dtype)
     if isinstance(value, np.generic):
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
     # A view of the bytes: images are not copied before msgpack does.
@@ -77,48 +84,23 @@ def _pack_numpy(value: Any) -> dict[bytes, Any]:
 
 def _unpack_numpy(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
-        return _array(value.get(b"data"), _dtype(value), value.get(b"shape"))
+        data, shape = value.get(b"data"), value.get(b"shape")
+        dtype = _checked(np.dtype(value[b"dtype"]))
+        if not isinstance(data, bytes) or not isinstance(shape, list):
+            raise TypeError("an array without bytes and shape")
+        array: NDArray[Any] = np.ndarray(tuple(shape), dtype, buffer=data)
+        if array.nbytes != len(data):
+            raise ValueError(f"an array of {array.nbytes} bytes with {len(data)} bytes of data")
+        return array
     if b"__npgeneric__" in value:
-        return _scalar(value.get(b"data"), _dtype(value))
+        return _checked(np.dtype(value[b"dtype"])).type(value[b"data"])
     return value
 
 
-def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
-    text = value.get(b"dtype")
-    if not isinstance(text, str):
-        raise WireError(f"an array has the dtype {text!r}; expected a text such as '<f4'")
-    try:
-        dtype = np.dtype(text)
-    except (TypeError, ValueError, SyntaxError) as error:
-        raise WireError(f"an array has the unknown dtype {text!r}") from error
-    _check_dtype(dtype)
-    return dtype
-
-
-def _check_dtype(dtype: np.dtype[Any]) -> None:
+def _checked(dtype: np.dtype[Any]) -> np.dtype[Any]:
     if dtype.kind not in _KINDS or dtype.shape or (dtype.kind == "f" and dtype.itemsize > 8):
         raise WireError(f"a message cannot hold NumPy data of dtype {dtype}", _NOTHING_ELSE)
-
-
-def _array(data: Any, dtype: np.dtype[Any], shape: Any) -> NDArray[Any]:
-    if not isinstance(data, bytes):
-        raise WireError(f"an array has data of type {type(data).__name__}; expected bytes")
-    if not isinstance(shape, list) or not all(type(n) is int and n >= 0 for n in shape):
-        raise WireError(f"an array has the shape {shape!r}; expected a list of lengths")
-    expected = math.prod(shape) * dtype.itemsize
-    if len(data) != expected:
-        raise WireError(
-            f"an array of shape {tuple(shape)} and dtype {dtype} has {len(data)} bytes; "
-            f"expected {expected}"
-        )
-    return np.ndarray(tuple(shape), dtype, buffer=data)
-
-
-def _scalar(data: Any, dtype: np.dtype[Any]) -> Any:
-    expected = _SCALARS.get(dtype.kind, ())
-    if not isinstance(data, expected) or (type(data) is bool and dtype.kind != "b"):
-        raise WireError(f"a NumPy number of dtype {dtype} has the value {data!r}")
-    return dtype.type(data)
+    return dtype
 
 
 def _refuse_extension(code: int, data: bytes) -> Any:

@@ -1,0 +1,222 @@
+"""Clips of rollouts: what was in the history, what the robot sees, how it went, side by side."""
+
+import textwrap
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.constants import FPS, MAX_STEPS
+from robomme_interference_data.encode import CLIP, VideoEncoder
+from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.files import atomic_path
+from robomme_interference_data.records import Status
+from robomme_interference_data.sampling import spread
+from robomme_interference_data.simulators.base import EpisodeInfo, Observation
+from robomme_interference_data.strip import session_colors
+
+__all__ = ["Clip", "check_drawing", "clip_name", "history_picture"]
+
+_VIEW = 256  # side of a camera's picture
+_WIDTH = 4 * _VIEW  # history to the left, then front and wrist, then the facts
+_HEAD = 24
+_HEIGHT = _VIEW + _HEAD
+_COLUMNS = 8
+_THUMB = _VIEW // _COLUMNS
+_SMALL = _THUMB - 4  # of a frame; its session's line is under it
+_COLORS = {
+    Status.ONGOING: "#555555",
+    Status.SUCCESS: "#009E73",
+    Status.FAIL: "#D55E00",
+    Status.TIMEOUT: "#E69F00",
+    Status.ERROR: "#000000",
+}
+_LAST = 10
+"""Frames for which the end stays."""
+
+_LETTERS = 34
+"""Letters in a line of the facts."""
+
+_LINES = 14
+"""Lines of the facts."""
+
+
+def clip_name(item: WorkItem) -> str:
+    """Return the path of a rollout's clip inside the run's folder."""
+    return f"videos/{str(item.episode).replace('/', '_')}_{item.condition}.mp4"
+
+
+def check_drawing() -> None:
+    """Check that clips can be drawn.
+
+    Raises:
+        MissingExtraError: pillow, which draws the words, is not installed.
+    """
+    try:
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError.needs("--videos", "pillow", "retrieval") from error
+
+
+def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
+    """Keep what goes wrong in a method of a clip as its `problem`, and remove what was written."""
+
+    @wraps(method)
+    def attempt(*arguments: P.args, **named: P.kwargs) -> None:
+        clip: Any = arguments[0]
+        if clip.problem is None:
+            try:
+                method(*arguments, **named)
+            except Exception as error:
+                clip.problem = f"the clip failed:\n{traceback.format_exc()}"
+                with suppress(Exception):  # a full disk fails once more
+                    clip._file.__exit__(type(error), error, error.__traceback__)
+
+    return attempt
+
+
+class Clip:
+    """Draws a rollout as it goes, 10 pictures a second, and has them encoded at once.
+
+    What goes wrong with the clip never reaches the rollout: it is kept as `problem`, and there is
+    no clip.
+
+    Args:
+        folder: The run's folder; a clip of an earlier attempt is removed from it.
+        item: The rollout.
+        system: Name of the system.
+
+    Attributes:
+        problem: Traceback of what went wrong, or None.
+    """
+
+    def __init__(self, folder: Path, item: WorkItem, system: str):
+        self.problem: str | None = None
+        self._path = folder / clip_name(item)
+        names = (system, str(item.episode), f"condition {item.condition}")
+        self._heading = [line for name in names for line in textwrap.wrap(name, _LETTERS)]
+        self._goal = self._given = ""
+        self._history: NDArray[np.uint8] = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
+        self._images: Mapping[str, NDArray[np.uint8]] = {}
+        self._steps = 0
+        self._file = ExitStack()
+        self._encoder: VideoEncoder | None = None
+        for left in [self._path, *self._path.parent.glob(f".{self._path.name}.*.partial")]:
+            left.unlink(missing_ok=True)
+
+    @_harmless
+    def begin(
+        self, buffer: Buffer, start: int, stop: int, first: Observation, info: EpisodeInfo
+    ) -> None:
+        """Take what is known before the first step.
+
+        Args:
+            buffer: The buffer that the condition prescribes.
+            start: First of its frames that the policy is given.
+            stop: Frame after the last one.
+            first: The first live observation.
+            info: The episode.
+        """
+        self._goal = info.goal
+        self._given = f"history given: {stop - start} frames" if stop > start else "no history"
+        self._history = history_picture(buffer, start, stop)
+        self._images = first.images
+        partial = self._file.enter_context(atomic_path(self._path))
+        self._encoder = VideoEncoder(partial, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
+        self._encoder.add(self._picture(Status.ONGOING))
+
+    @_harmless
+    def step(self, observation: Observation, status: Status, subgoal: str | None) -> None:
+        """Take what came of a step, with the images of both cameras."""
+        if self._encoder is not None:
+            self._steps += 1
+            self._images = observation.images
+            self._encoder.add(self._picture(status, subgoal=subgoal))
+
+    @_harmless
+    def close(self, status: Status, error: str | None = None) -> None:
+        """Hold the end for a second, and give the clip its name.
+
+        There is none of a rollout that broke before its first observation.
+
+        Args:
+            status: How the rollout ended.
+            error: What broke, or None.
+        """
+        if self._encoder is not None:
+            picture = self._picture(status, error=error)
+            for _ in range(_LAST):
+                self._encoder.add(picture)
+            self._encoder.close()
+            self._file.close()
+
+    def _picture(
+        self, status: Status, *, subgoal: str | None = None, error: str | None = None
+    ) -> NDArray[np.uint8]:
+        """Return the clip's present picture, `(280, 1024, 3) uint8`."""
+        canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+        canvas[_HEAD:, :_VIEW] = self._history
+        for place, name in enumerate(("front", "wrist"), 1):
+            if name in self._images:
+                view = self._images[name][:_VIEW, :_VIEW]
+                x = place * _VIEW
+                canvas[_HEAD : _HEAD + view.shape[0], x : x + view.shape[1]] = view
+        lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
+        for head, text in (("subgoal:", subgoal), ("what broke:", error)):
+            if text:
+                lines += ["", head, *textwrap.wrap(text, _LETTERS)]
+        # The last two lines always have their place, however long the words before them are.
+        lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
+        return _lettered(canvas, (self._given, "front", "wrist"), lines, _COLORS[status])
+
+
+def history_picture(buffer: Buffer, start: int, stop: int) -> NDArray[np.uint8]:
+    """Return 64 frames of a span of a history, evenly spread, as `(256, 256, 3) uint8`.
+
+    Each has a line under it in the colour of its session, the lesson's as in the film strip.
+
+    Args:
+        buffer: The history.
+        start: First frame.
+        stop: Frame after the last one; `start` for a white picture.
+    """
+    picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
+    if stop == start:
+        return picture
+    colors, sessions = session_colors(buffer.sessions), buffer.session_index
+    for place, index in enumerate(spread(start, stop, _COLUMNS * _COLUMNS)):
+        y, x = (_THUMB * part for part in divmod(place, _COLUMNS))
+        frame = buffer.frame(index, "front")
+        step = max(1, frame.shape[0] // _SMALL)
+        small = frame[step // 2 :: step, step // 2 :: step][:_SMALL, :_SMALL]
+        picture[y : y + small.shape[0], x : x + small.shape[1]] = small
+        color = bytes.fromhex(colors[sessions[index]][1:])
+        picture[y + _SMALL : y + _THUMB - 1, x : x + _THUMB - 2] = tuple(color)
+    return picture
+
+
+def _lettered(
+    canvas: NDArray[np.uint8], heads: Sequence[str], lines: Sequence[str], color: str
+) -> NDArray[np.uint8]:
+    """Write the lines beside the views, and what the parts are above them."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(13)
+    for place, head in enumerate(heads):
+        draw.text((place * _VIEW + 4, 4), head, fill="#333333", font=font)
+    y = _HEAD + 4
+    for line in lines[:-1]:
+        draw.text((3 * _VIEW + 10, y), line, fill="black", font=font)
+        y += 17
+    draw.rectangle((3 * _VIEW + 8, y + 2, 4 * _VIEW - 8, y + 24), fill=color)
+    draw.text((3 * _VIEW + 14, y + 5), lines[-1], fill="white", font=font)
+    return np.asarray(image)

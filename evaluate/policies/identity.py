@@ -1,0 +1,141 @@
+"""What a policy says of itself, and what of it can change a result."""
+
+import json
+import math
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout, suppress
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.console import MESSAGES
+from robomme_interference_data.errors import PolicyError, PolicyServerError
+from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.registry import (
+    BUILTINS,
+    check_workers,
+    make_policy,
+    parse_policy,
+    policy_options,
+)
+
+__all__ = ["describe_policy", "plain", "policy_identity"]
+
+_WITHOUT_EFFECT = {"websocket": ("connect_s", "response_s"), "lerobot": ("device",)}
+"""Options that no result depends on, by the kind of policy."""
+
+_PLACES = {"websocket": ("server",), "lerobot": ("source", "device")}
+"""What policies say of themselves that tells only where they run, or lie, by their kind."""
+
+
+def describe_policy(
+    text: str, options: Sequence[str] = (), *, workers: int = 1
+) -> tuple[Policy, dict[str, Any]]:
+    """Make a policy once, ask what it is, and release it; of several servers ask each.
+
+    Args:
+        text: As for `make_policy`.
+        options: As for `make_policy`.
+        workers: Worker processes that will use it.
+
+    Returns:
+        The policy, closed, for its attributes; and what it says of itself, as plain values.
+
+    Raises:
+        InterferenceError: It cannot be made, a server cannot be reached, servers say different
+            things of themselves, or it does not say what it is.
+    """
+    spec = parse_policy(text)
+    check_workers(spec, workers)
+    with redirect_stdout(sys.stderr):  # stdout is for the rows
+        policies = [
+            make_policy(text, options, worker=worker) for worker in range(len(spec.servers) or 1)
+        ]
+        said = [_metadata(text, policy) for policy in policies]
+    policy, metadata = policies[0], dict(said[0])
+    if spec.kind == "websocket":
+        for other in said:
+            if other["server_metadata"] != metadata["server_metadata"]:
+                raise PolicyServerError(
+                    f"the policy servers {metadata['server']} and {other['server']} serve "
+                    f"different models: one says {metadata['server_metadata']}, the other "
+                    f"{other['server_metadata']}",
+                    "Start all of them with the same checkpoint and seed.",
+                )
+        metadata["server"] = ", ".join(one["server"] for one in said)
+    if policy.privileged:
+        metadata["privileged"] = True
+        if spec.kind not in BUILTINS:
+            MESSAGES.print(
+                f"The policy {text} is privileged: it gets the simulator itself, under every "
+                f"condition, {NO_HISTORY} too; run.json says so."
+            )
+    return policy, metadata
+
+
+def _metadata(text: str, policy: Policy) -> dict[str, Any]:
+    try:
+        said = policy.metadata()
+    finally:
+        policy.close()
+    try:
+        if isinstance(said, Mapping):
+            return dict(plain(said))
+        why = f"returned a {type(said).__name__}"
+    except ValueError as error:
+        why = f"holds {error}, a number that JSON, and so run.json, does not have"
+    raise PolicyError(
+        f"policy {text!r}: metadata() {why}",
+        'Expected a dict that says which policy this is, such as {"policy": "mine"}.',
+    )
+
+
+def policy_identity(text: str, options: Sequence[str], said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a policy can change a result, as plain values.
+
+    Where a server listens or a checkpoint lies is no part of it, nor is the device: what a
+    server says of itself, and the digest of a checkpoint's files, are.
+
+    Args:
+        text: The policy, as `pin_policy` returns it.
+        options: As for `make_policy`; objects of the policy's own among the defaults are left out.
+        said: What it says of itself.
+    """
+    kind = parse_policy(text).kind
+    places, without = _PLACES.get(kind, ()), _WITHOUT_EFFECT.get(kind, ())
+    taken = {}
+    for name, value in sorted(policy_options(text, options).items()):
+        if name not in without:
+            with suppress(TypeError, ValueError):
+                json.dumps(value)
+                taken[name] = plain(value)
+    return {
+        "policy": kind if kind in _PLACES else text,
+        "policy_options": taken,
+        "policy_metadata": {name: value for name, value in said.items() if name not in places},
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: long arrays become a word on their shape.
+
+    Raises:
+        ValueError: It holds NaN or an infinity.
+    """
+    if isinstance(value, Mapping):
+        return {plain(str(key)): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist()) if value.size <= 32 else f"{value.dtype} array {value.shape}"
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(str(value))
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else repr(value)
+    return str(text).encode("utf-8", "backslashreplace").decode()

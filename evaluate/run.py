@@ -1,0 +1,296 @@
+"""Run an evaluation: check everything, then roll out what is not done yet, and never lose a row."""
+
+import dataclasses
+import datetime
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol
+
+from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.errors import InterferenceError, SimulatorCrashError
+from robomme_interference_data.evaluate.checks import (
+    applicable,
+    check_plan,
+    check_settings,
+    check_simulator,
+    default_system,
+)
+from robomme_interference_data.evaluate.clips import clip_name
+from robomme_interference_data.evaluate.config import Run, RunConfig
+from robomme_interference_data.evaluate.log import (
+    RunLog,
+    Start,
+    count_statuses,
+    is_done,
+    open_log,
+    read_record,
+)
+from robomme_interference_data.evaluate.plan import Plan, WorkItem, plan_work, shuffle_work
+from robomme_interference_data.evaluate.policies.identity import (
+    describe_policy,
+    plain,
+    policy_identity,
+)
+from robomme_interference_data.evaluate.policies.registry import pin_policy
+from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.evaluate.worker import RolloutTask, make_selector
+from robomme_interference_data.execution import Executor, Outcome, Processes, end_if_starting
+from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.simulators.registry import simulator_versions
+from robomme_interference_data.split import Split, load_split
+
+__all__ = ["Listener", "RunResult", "run_evaluation"]
+
+_PACKAGES = ("robomme-interference-data", "numpy", "av", "mani-skill", "sapien", "torch")
+
+_ERROR_LETTERS = 2000
+"""Most letters of what broke that a row has."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to.
+
+    Attributes:
+        folder: The run's folder.
+        rows: Rows of all rollouts that were asked for and have ended, in canonical order.
+        planned: Rollouts that were asked for.
+        counts: Rows by status.
+        stopped: Why the run ended early, or None.
+    """
+
+    folder: Path
+    rows: tuple[Rollout, ...]
+    planned: int
+    counts: dict[str, int]
+    stopped: str | None
+
+
+class Listener(Protocol):
+    """Hears how a run goes, to show it."""
+
+    def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
+        """Take what was asked for, and the rows that an earlier run finished."""
+        ...
+
+    def row(self, row: Rollout) -> None:
+        """Take a row that has just been written."""
+        ...
+
+
+def run_evaluation(
+    config: RunConfig,
+    *,
+    executor: Executor | None = None,
+    listener: Listener | None = None,
+    command: Sequence[str] = (),
+) -> RunResult:
+    """Roll out a policy under the benchmark's protocol and write one row per rollout.
+
+    Rows are on the disk as rollouts end. Run again with the same `out`, it skips finished
+    rollouts, repeats errors, and adds what is newly asked for.
+
+    Worker processes import the script that runs: call it under `if __name__ == "__main__":`.
+
+    Args:
+        config: What to roll out, and how.
+        executor: Who runs the rollouts; `config.workers` processes by default.
+        listener: Hears how the run goes.
+        command: The command line, for the record.
+
+    Raises:
+        UnknownNameError, InvalidOptionError, InvalidIdError: A setting is not what it may be.
+        HistoryTooLongError: A buffer exceeds the system's position limit.
+        MissingFileError: The split is not there.
+        RunFolderError: `out` holds another run, or something else.
+        PolicyError: The policy cannot be made.
+        PolicyServerError: A policy server cannot be reached, or no longer any of them.
+        WorkerError: The worker processes cannot start.
+        HubError: The Hub does not know the policy's model, or cannot be reached.
+        FormatError: Files of a run in `out` are damaged.
+    """
+    end_if_starting()
+    split, folder = load_split(config.split), Path(config.out)
+    name = config.system or default_system(config)
+    config = dataclasses.replace(config, policy=pin_policy(config.policy))
+    policy, said = describe_policy(config.policy, config.policy_options, workers=config.workers)
+    check_settings(config, name, split, policy)
+    system = name_system(name)
+    plan = plan_work(
+        split.episode_ids,
+        conditions=config.conditions or applicable(system, split, policy),
+        families=config.families,
+        episodes=config.episodes,
+        episode_split=config.episode_split,
+        shard=config.shard,
+    )
+    items = plan.items()
+    check_plan(config, system, split, policy, items)
+    executor = executor or Processes(config.workers)
+    there = read_record(folder)
+    if any(item not in there or not is_done(there[item]) for item in items):
+        check_simulator(config, policy.cameras, executor)
+    versions = simulator_versions(config.simulator, config.robomme_python)
+    identity = _identity(config, name, split, said, versions)
+    with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
+        # The same split may be in another folder by now: rows keep one label for it.
+        run = Run(config, name, log.header.split, split.revision)
+        log.begin(_start(config, plan, said, versions, command))
+        return _roll_out(run, items, split, log, executor, listener)
+
+
+def _roll_out(
+    run: Run,
+    items: Sequence[WorkItem],
+    split: Split,
+    log: RunLog,
+    executor: Executor,
+    listener: Listener | None,
+) -> RunResult:
+    done = [log.rows[item] for item in items if item in log.rows and is_done(log.rows[item])]
+    finished = set(map(WorkItem.of, done))
+    if listener is not None:
+        listener.start(items, done)
+    outcomes = executor.run(
+        RolloutTask(run, log.folder),
+        shuffle_work(item for item in items if item not in finished),
+        time_limit=run.config.rollout_timeout,
+        again=(SimulatorCrashError,),
+    )
+    stopped: str | None = "interrupted"
+    errors, full = 0, False
+    try:
+        for outcome in outcomes:
+            row, trace = _row(run, outcome, split, log)
+            log.append(row, trace)
+            if listener is not None:
+                listener.row(row)
+            errors = 0 if is_done(row) else errors + 1
+            if errors >= run.config.max_errors:
+                stopped = f"{errors} rollouts in a row broke; the last: {row.error}"
+                break
+        else:
+            stopped = None
+    except InterferenceError as error:  # no worker is left
+        stopped = error.message
+        raise
+    except OSError:  # what cannot take a row cannot take tables
+        full = True
+        raise
+    finally:
+        outcomes.close()
+        *earlier, last = log.header.starts
+        last = dataclasses.replace(last, ended=_now(), stopped=stopped)
+        if not full:
+            log.end(dataclasses.replace(log.header, starts=(*earlier, last)))
+    rows = tuple(log.rows[item] for item in items if item in log.rows)
+    return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
+
+
+def _row(run: Run, outcome: Outcome, split: Split, log: RunLog) -> tuple[Rollout, str | None]:
+    """Return the row of an outcome, with its attempt and time, and the traceback of what broke."""
+    item: WorkItem = outcome.task
+    if outcome.error is None:
+        row, trace = outcome.value
+    else:
+        trace = outcome.trace
+        query, clip = split.query(item.episode), clip_name(item)
+        row = run.row(
+            item,
+            seed=query.seed,
+            difficulty=query.difficulty,
+            goal=None,
+            status=str(Status.ERROR),
+            success=None,
+            steps=0,
+            history_frames=0,
+            lesson_frames=0,
+            lesson_share=None,
+            error=_told(outcome.error),
+            video=clip if run.config.videos and (log.folder / clip).exists() else None,
+        )
+    before = log.rows[item].attempt if item in log.rows else 0
+    row = dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=_now())
+    return row, trace
+
+
+def _told(error: BaseException) -> str:
+    """Return what an error says in one line, with its hint, as text that any file can hold."""
+    text = str(error)
+    if isinstance(error, InterferenceError):
+        hint = f" ({error.hint})" if error.hint else ""
+        text = f"{type(error).__name__}: {error.message}{hint}"
+    return str(plain(" ".join(text.split())[:_ERROR_LETTERS]))
+
+
+def _identity(
+    config: RunConfig,
+    system: str,
+    split: Split,
+    said: Mapping[str, Any],
+    versions: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return what makes the run the one that it is, as plain values."""
+    selector = make_selector(config)
+    buffer = split.load(split.episode_ids[0], split.conditions[0])
+    return {
+        "system": system,
+        "simulator": config.simulator,
+        "simulator_version": versions.get(config.simulator),
+        "revision": split.revision,
+        "episode_split": config.episode_split,
+        "model_seed": config.model_seed,
+        "retrieval_index": None if selector is None else plain(selector.identity(buffer)),
+        "protocol_version": PROTOCOL_VERSION,
+        **policy_identity(config.policy, config.policy_options, said),
+    }
+
+
+def _start(
+    config: RunConfig,
+    plan: Plan,
+    said: Mapping[str, Any],
+    versions: Mapping[str, str],
+    command: Sequence[str],
+) -> Start:
+    names = [*_PACKAGES]
+    names += ["lerobot"] if config.policy.startswith("lerobot:") else []
+    names += ["transformers"] if config.retrieval is not None else []
+    installed = {"python": platform.python_version()}
+    for name in names:
+        try:
+            installed[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return Start(
+        command=tuple(map(plain, command)),
+        settings=plain(dataclasses.asdict(config)),
+        plan=plan,
+        versions=installed | dict(versions),
+        git=_git(),
+        machine=platform.machine(),
+        policy=dict(said),
+        started=_now(),
+    )
+
+
+def _now() -> str:
+    """Return the time, UTC, `2026-01-31T12:00:00Z`."""
+    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _git() -> str | None:
+    """Return the commit of the source tree that runs, with `-dirty` if it was changed."""
+    root = Path(__file__).resolve().parent.parent
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty"]
+    try:
+        done = subprocess.run(
+            [*command, "--exclude=*"], check=True, capture_output=True, text=True, timeout=20
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() if (root / ".git").exists() else None

@@ -1,0 +1,30 @@
+"""The world of the tests of rollouts: a simulator without physics over the tiny split."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support import worlds
+from support.policy_server import PolicyServer
+
+
+@pytest.fixture
+def world(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the simulator `support.worlds:World` find the split, in other processes too."""
+    monkeypatch.setenv(worlds.SPLIT, str(tiny_split))
+
+
+@pytest.fixture
+def trouble(world: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder whose files make episodes break; see `World`."""
+    folder = tmp_path / "trouble"
+    folder.mkdir()
+    monkeypatch.setenv(worlds.TROUBLE, str(folder))
+    return folder
+
+
+@pytest.fixture
+def server() -> Iterator[PolicyServer]:
+    """A policy server in a thread of this process."""
+    with PolicyServer().running() as running:
+        yield running

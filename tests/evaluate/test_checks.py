@@ -1,0 +1,255 @@
+"""What is found out before a run: what cannot work, the simulator, the names of rows."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.runs import CHEAT, config, run, run_one
+
+from robomme_interference_data import load_split
+from robomme_interference_data.errors import (
+    HistoryTooLongError,
+    InterferenceError,
+    InvalidIdError,
+    InvalidOptionError,
+    MissingExtraError,
+    MissingFileError,
+    MissingIndexError,
+    NoRendererError,
+    PolicyError,
+    UnknownNameError,
+)
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.evaluate.checks import (
+    check_settings,
+    check_simulator,
+    default_system,
+)
+from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.execution import Serial
+from robomme_interference_data.simulators.registry import SIMULATORS
+
+pytestmark = pytest.mark.usefixtures("world")
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"policy": "orakel"}, UnknownNameError, "no policy 'orakel'"),
+        ({"policy": "websocket://a:1", "system": None}, InvalidOptionError, "need a name"),
+        ({"policy": "lerobot:out/last", "system": None}, InvalidOptionError, "need a name"),
+        ({"policy_options": ("speed=2",)}, InvalidOptionError, "unexpected keyword argument"),
+        ({"policy": "python:__main__:make"}, InvalidOptionError, "run another program"),
+        ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
+        ({"simulator": "nosuch:thing"}, UnknownNameError, "no simulator 'nosuch:thing'"),
+        ({"simulator": "tabletop"}, InvalidOptionError, "recorded on the simulator 'sample'"),
+        ({"families": ("MoveCub",)}, UnknownNameError, "'MoveCub' is not in the split"),
+        ({"episodes": "0-9"}, UnknownNameError, "no query episode"),
+        ({"episode_split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
+        ({"episode_split": "train"}, UnknownNameError, "no query episode"),
+        ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
+        ({"conditions": ("k",)}, InvalidIdError, "'k' is not a condition"),
+        ({"workers": 0}, InvalidOptionError, "--workers 0; expected more than 0"),
+        ({"rollout_timeout": float("nan")}, InvalidOptionError, "--rollout-timeout nan"),
+        ({"simulator_timeout": float("inf")}, InvalidOptionError, "--simulator-timeout inf"),
+        ({"shard": "4/3"}, InvalidOptionError, "--shard '4/3'"),
+        ({"system": "pi05_baseline"}, InvalidOptionError, "k0 does not apply"),
+        ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "and none is given"),
+        ({"system": "perceptual-framesamp-modull"}, UnknownNameError, "reads like the system"),
+        ({"system": "replay-full"}, InvalidOptionError, "is not the control replay-full"),
+        ({"retrieval_rule": "oracle"}, InvalidOptionError, "--retrieval-rule says nothing"),
+        ({"retrieval_camera": "wrist"}, InvalidOptionError, "--retrieval-camera says nothing"),
+        ({"retrieval": "thumbnail", "retrieval_rule": "best!"}, UnknownNameError, "best!"),
+        ({"retrieval": "thumbnail", "retrieval_rule": "top32"}, InvalidOptionError, "top32"),
+        ({"retrieval": "thumbnail"}, MissingIndexError, "'thumbnail'"),
+        ({"policy": "python:support.own_policies:with_text"}, PolicyError, "returned a str"),
+        ({"policy": "python:support.own_policies:with_nan"}, PolicyError, "holds nan"),
+        ({"policy": "python:support.own_policies:wants_top"}, PolicyError, "'top'"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_written(
+    tmp_path: Path, changes: dict[str, Any], error: type[InterferenceError], words: str
+) -> None:
+    with pytest.raises(error) as raised:
+        run(tmp_path / "run", **changes)
+    assert words in raised.value.message
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_split_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match="is not a split"):
+        run_evaluation(RunConfig("hold", tmp_path / "none", tmp_path / "run"))
+
+
+def test_videos_without_pillow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(MissingExtraError, match="--videos needs pillow") as raised:
+        run_one(tmp_path / "run", videos=True)
+    assert "pip install" in str(raised.value.hint)
+    assert not (tmp_path / "run").exists()
+
+
+def test_conditions_beyond_a_systems_positions_are_refused_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 4096 positions, of which 3952 are for the rollout here: 144 frames are left.
+    from robomme_interference_data.evaluate import systems
+
+    monkeypatch.setattr(systems, "MAX_STEPS", 3952)
+    limited = {"system": "perceptual-framesamp-modul"}
+    run(tmp_path / "run", conditions=("k0", "k3"), **limited)  # 48 + 3 · 32
+    with pytest.raises(HistoryTooLongError, match="a history of 272 frames under k7\n"):
+        run(tmp_path / "run", conditions=("k3", "k7"), **limited)
+    with pytest.raises(HistoryTooLongError, match="272 frames under k7"):
+        run(tmp_path / "run", conditions=(), **limited)
+
+
+def test_by_default_all_conditions_that_apply_are_run(tmp_path: Path) -> None:
+    def conditions(name: str, **changes: Any) -> list[str]:
+        result = run_one(tmp_path / name, conditions=(), **changes)
+        return [row.condition for row in result.rows]
+
+    assert conditions("all") == ["no-history", "k0", "k1", "k3", "k7"]
+    assert conditions("baseline", system="pi05_baseline") == ["no-history"]
+    still = "python:support.own_policies:Still"  # takes no history
+    assert conditions("still", policy=still) == ["no-history"]
+    with pytest.raises(InvalidOptionError, match="takes no history, so k0 says nothing"):
+        run_one(tmp_path / "k0", policy=still, conditions=("k0",))
+
+
+# --- the simulator -----------------------------------------------------------------------------
+
+
+def test_the_simulator_is_made_before_the_folder_and_only_for_rollouts_that_are_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from support.worlds import World
+
+    made: list[dict[str, Any]] = []
+
+    def make(**options: Any) -> Any:
+        made.append(options)
+        if len(made) > working:
+            raise NoRendererError("no driver", "Install one.")
+        return World()
+
+    working = 2  # once to see, once to run
+    monkeypatch.setitem(SIMULATORS, "sample", make)
+    sample = {"simulator": "sample"}
+    whole = run_one(tmp_path / "whole", **sample)
+    assert (len(whole.rows), len(made)) == (1, 2)
+    with pytest.raises(NoRendererError):
+        run_one(tmp_path / "run", **sample)
+    assert not (tmp_path / "run").exists()
+    assert run_one(tmp_path / "whole", **sample).rows == whole.rows
+    assert len(made) == 3
+    with pytest.raises(NoRendererError):
+        run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
+
+
+def test_only_what_somebody_looks_at_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def make(**options: Any) -> Any:
+        asked.append(options)
+        raise NoRendererError("no driver")
+
+    def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
+        with pytest.raises(NoRendererError):
+            check_simulator(config(simulator=name, **changes), watched, Serial())
+        return asked[-1]
+
+    for name in ("tabletop", "robomme"):
+        monkeypatch.setitem(SIMULATORS, name, make)
+    assert options("tabletop") == {"cameras": (), "render": False}
+    assert options("tabletop", "wrist") == {"cameras": ("wrist",), "render": True}
+    step = {"retrieval": "thumbnail", "retrieval_camera": "wrist"}
+    assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
+    assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")
+    assert options("robomme", "front", robomme_python="./py", simulator_timeout=100.0) == {
+        "python": "./py",
+        "cameras": ("front",),
+        "answer_s": 90.0,
+    }
+
+
+# --- names -------------------------------------------------------------------------------------
+
+
+def check_name(tiny_split: Path, system: str, **changes: Any) -> None:
+    settings = config(**{"simulator": "tabletop"} | changes)
+    check_settings(settings, system, load_split(tiny_split), make_policy("hold"))
+
+
+@pytest.mark.parametrize(
+    ("policy", "system", "words"),
+    [
+        ("oracle", "perceptual-framesamp-modul", "is not the paper's system"),
+        ("lerobot:x/y", "pi05_baseline", "is not the paper's system"),
+        ("replay:window", "replay-full", "replay:window is not the control"),
+        ("replay", "replay-window", "replay is not the control replay-window"),
+        ("guess", "oracle", "guess is not the control oracle"),
+        (CHEAT, "oracle", "is not the control oracle"),
+        ("replay", "retrieval-replay-full", "replay is not the control"),
+        ("websocket://h:1", "memer", "sends the server none"),
+        ("websocket://h:1", "symbolic-simplesg", "sends the server none"),
+    ],
+)
+def test_a_name_of_the_table_is_refused_to_another_policy(
+    tiny_split: Path, policy: str, system: str, words: str
+) -> None:
+    with pytest.raises(InvalidOptionError) as raised:
+        check_name(tiny_split, system, policy=policy)
+    assert words in raised.value.message
+    assert raised.value.hint is not None and "name of your own" in raised.value.hint
+
+
+@pytest.mark.parametrize(
+    ("policy", "system"),
+    [
+        ("oracle", "oracle"),
+        ("oracle", "my-upper-end"),
+        ("replay", "replay-full"),
+        ("replay:full", "replay-full"),
+        ("replay:window", "replay-window"),
+        ("websocket://h:1", "perceptual-framesamp-modul"),
+        ("websocket://h:1", "without-subgoals"),
+        (CHEAT, "memer"),
+    ],
+)
+def test_a_name_is_given_to_the_policy_that_it_stands_for(
+    tiny_split: Path, policy: str, system: str
+) -> None:
+    check_name(tiny_split, system, policy=policy)
+
+
+@pytest.mark.parametrize(
+    ("step", "name"),
+    [
+        ({}, "replay-window"),
+        ({"retrieval": "siglip"}, "retrieval-replay-window"),
+        (
+            {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
+            "retrieval-replay-window-max-0.9-wrist",
+        ),
+    ],
+)
+def test_rows_are_named_after_policy_and_retrieval_step(
+    tiny_split: Path, step: dict[str, str], name: str
+) -> None:
+    assert default_system(config(policy="replay:window", **step)) == name
+    check_name(tiny_split, name, policy="replay:window", **step)
+    if "retrieval_rule" in step:
+        with pytest.raises(InvalidOptionError, match="not the control"):
+            check_name(tiny_split, "retrieval-replay-window", policy="replay:window", **step)
+    assert default_system(config(policy="python:my.module:make")) == "my.module-make"
+
+
+def test_the_papers_retrieval_system_chooses_by_max(tiny_split: Path) -> None:
+    served = {"policy": "websocket://h:1", "retrieval": "siglip"}
+    check_name(tiny_split, "retrieval-framesamp-modul", **served)
+    with pytest.raises(InvalidOptionError, match="chooses by max, not by last"):
+        check_name(tiny_split, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
+    with pytest.raises(InvalidOptionError, match="has no retrieval step, and one is given"):
+        check_name(tiny_split, "perceptual-framesamp-modul", **served)

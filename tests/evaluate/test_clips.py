@@ -1,0 +1,182 @@
+"""Clips of rollouts: what they show is what was given, and what fails in them harms no rollout."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from support.runs import EPISODE, config, roll
+from support.worlds import Cheat, World
+
+from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data.encode import VideoEncoder
+from robomme_interference_data.evaluate.clips import Clip, clip_name, history_picture
+from robomme_interference_data.evaluate.config import Run
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.worker import RolloutTask
+from robomme_interference_data.execution import Outcome, Serial
+from robomme_interference_data.records import Status
+from robomme_interference_data.simulators.base import EpisodeInfo, Observation
+from robomme_interference_data.strip import session_colors
+
+pytestmark = pytest.mark.usefixtures("trouble")
+
+K1 = WorkItem("k1", EPISODE)
+INFO = EpisodeInfo("do as shown", ("do as shown",), "easy", 1, "world")
+VIEW = Observation({"front": np.full((256, 256, 3), 90, np.uint8)}, np.zeros(8, np.float32))
+
+
+@pytest.fixture
+def buffer(tiny_split: Path) -> Buffer:
+    return load_buffer(EPISODE, "k1", split=tiny_split)
+
+
+def rolled(out: Path, item: WorkItem = K1, policy: str = "hold") -> Outcome:
+    """What a worker makes of a rollout with a clip."""
+    settings = config(videos=True, policy=policy)
+    split = load_split(settings.split)
+    task = RolloutTask(Run(settings, "my-memory", split.name, split.revision), out)
+    (outcome,) = Serial().run(task, [item])
+    return outcome
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def banner(picture: np.ndarray) -> list[float]:
+    """Mean colour of the right part of the line that names the status."""
+    rows = [y for y in range(30, 275) if (picture[y, 990:1010].mean(axis=0) < 240).any()]
+    return picture[rows[4] : rows[-4], 990:1010].reshape(-1, 3).mean(axis=0).tolist()
+
+
+def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
+    row, problem = rolled(tmp_path).value
+    assert (row.status, row.steps, row.video, problem) == ("fail", 40, clip_name(K1), None)
+    assert clip_name(K1) == "videos/MoveCube_test_0_k1.mp4"
+    shown = frames(tmp_path / row.video)
+    assert len(shown) == 1 + 40 + 10  # the first view, one a step, the end held
+    assert shown[0].shape == (280, 1024, 3)
+    assert banner(shown[0]) == pytest.approx([0x55] * 3, abs=12)
+    assert banner(shown[-1]) == pytest.approx([0xD5, 0x5E, 0x00], abs=12)
+    picture = history_picture(buffer, 0, 80)
+    assert np.abs(shown[0][24:, :256].astype(int) - picture).mean() < 10
+    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["MoveCube_test_0_k1.mp4"]
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0, 48), (48, 80), (40, 57), (3, 3)])
+def test_the_history_is_what_was_given(start: int, stop: int, buffer: Buffer) -> None:
+    """In the colours of the sessions under each frame, and nowhere else."""
+    picture = history_picture(buffer, start, stop)
+    colors = [bytes.fromhex(color[1:]) for color in session_colors(buffer.sessions)]
+    found = []
+    for place in range(64):
+        y, x = (32 * part for part in divmod(place, 8))
+        line = bytes(picture[y + 28, x])
+        found.append(colors.index(line) if line in colors else None)
+        if found[-1] is not None:
+            # Fewer than 64 frames: each is shown, in order; 28 × 28 of its 32 × 32 pixels.
+            small = buffer.frame(start + place)[:28, :28]
+            np.testing.assert_array_equal(picture[y : y + 28, x : x + 28], small)
+    sessions = [0] * 48 + [1] * 32
+    assert found == sessions[start:stop] + [None] * (64 - (stop - start))
+
+
+@pytest.mark.parametrize(
+    ("condition", "selector", "begun"),
+    [
+        ("no-history", None, (0, 0, 0)),
+        ("k1", None, (80, 0, 80)),
+        ("k3", (48, 80), (144, 48, 80)),
+    ],
+)
+def test_a_clip_is_told_what_the_policy_is_given(
+    condition: str, selector: Any, begun: tuple[int, int, int]
+) -> None:
+    notes: list[tuple[int, int, int]] = []
+    clip = SimpleNamespace(
+        begin=lambda buffer, start, stop, *_: notes.append((len(buffer), start, stop)),
+        step=lambda *_: None,
+    )
+    if selector is not None:
+        shares = dict.fromkeys(("lesson_fraction", "filler_fraction", "query_fraction"), 0.0)
+        chosen = SimpleNamespace(start=selector[0], stop=selector[1], **shares)
+        selector = SimpleNamespace(name="one", camera="front", select=lambda *_: chosen)
+    policy = Cheat()
+    roll(condition, policy, clip=clip, selector=selector)
+    assert notes == [begun]
+    assert len(policy.states) == begun[2] - begun[1]
+
+
+def test_names_goal_and_length_of_the_history_are_on_the_picture(
+    tmp_path: Path, buffer: Buffer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from PIL import ImageDraw
+
+    said: list[str] = []
+    write = ImageDraw.ImageDraw.text
+    monkeypatch.setattr(
+        ImageDraw.ImageDraw,
+        "text",
+        lambda self, place, text, **how: (said.append(text), write(self, place, text, **how)),
+    )
+    clip = Clip(tmp_path, K1, "my-memory")
+    clip.begin(buffer, 0, 80, VIEW, INFO)
+    assert said == [
+        *("history given: 80 frames", "front", "wrist"),
+        *("my-memory", "MoveCube/test/0", "condition k1", "", "do as shown", ""),
+        *("step 0 of 1300", "ongoing"),
+    ]
+    clip.step(VIEW, Status.ONGOING, "lift the cube")
+    assert said[-5:] == ["subgoal:", "lift the cube", "", "step 1 of 1300", "ongoing"]
+    clip.close(Status.ERROR, "it fell " * 100)
+    assert said[-2:] == ["step 1 of 1300", "error"]
+
+
+def test_a_rollout_that_breaks_leaves_its_clip_too(tmp_path: Path, trouble: Path) -> None:
+    (trouble / "MoveCube-0").write_text("raise")
+    outcome = rolled(tmp_path)
+    assert "the world fell apart" in str(outcome.error)
+    shown = frames(tmp_path / clip_name(K1))
+    assert len(shown) == 1 + 4 + 10  # it broke in its fifth step
+    assert banner(shown[-1]) == pytest.approx([0, 0, 0], abs=12)
+
+
+def test_a_rollout_that_breaks_before_it_begins_has_none_and_an_old_one_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rolled(tmp_path)
+    left = tmp_path / "videos" / ".MoveCube_test_0_k1.mp4.abc.partial"
+    other = tmp_path / "videos" / ".MoveCube_test_0_k3.mp4.abc.partial"
+    for path in (left, other):
+        path.write_bytes(b"x")  # of a process that was killed
+
+    def fall(*_: Any, **__: Any) -> Any:
+        raise OSError("no world")
+
+    monkeypatch.setattr(World, "reset", fall)
+    assert str(rolled(tmp_path).error) == "OSError: no world"
+    assert list((tmp_path / "videos").iterdir()) == [other]
+
+
+@pytest.mark.parametrize("when", [0, 7, 45])
+def test_a_clip_that_fails_leaves_the_row_as_it_is(
+    when: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk: at the first picture, in the middle, while the end is held."""
+    add, count = VideoEncoder.add, iter(range(100))
+
+    def fail(self: VideoEncoder, picture: Any) -> None:
+        if next(count) == when:
+            raise OSError(28, "No space left on device")
+        add(self, picture)
+
+    monkeypatch.setattr(VideoEncoder, "add", fail)
+    row, problem = rolled(tmp_path).value
+    assert (row.status, row.steps, row.video) == ("fail", 40, None)
+    assert problem.startswith("the clip failed:\n")
+    assert problem.rstrip().endswith("No space left on device")
+    assert not list((tmp_path / "videos").iterdir())

@@ -1,0 +1,122 @@
+"""The commands `evaluate` and `merge`: what is typed, what is printed, and how one goes on."""
+
+import json
+import re
+import resource
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from support.runs import run_one
+from typer.testing import CliRunner
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate import commands
+from robomme_interference_data.evaluate import run as run_module
+from robomme_interference_data.execution import Serial
+from robomme_interference_data.settings import spread_values
+
+pytestmark = pytest.mark.usefixtures("trouble", "_serial")
+
+APP = typer.Typer(rich_markup_mode="markdown", pretty_exceptions_enable=False)
+APP.command()(commands.evaluate)
+APP.command()(commands.merge)
+SEVERAL = ("--families", "--conditions", "--policy-option")
+USUAL = "--simulator support.worlds:World --system mine --episodes 0"
+
+
+@pytest.fixture
+def _serial(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_module, "Processes", lambda workers: Serial())
+
+
+def type_in(line: str, **options: Any) -> Any:
+    words = spread_values(line.split(), SEVERAL)
+    return CliRunner().invoke(APP, words, **options)
+
+
+@pytest.mark.parametrize("families", ["MoveCube VideoRepick", "MoveCube,VideoRepick"])
+def test_evaluate_writes_the_rows_as_json(tmp_path: Path, tiny_split: Path, families: str) -> None:
+    line = f"evaluate --policy hold {USUAL} --families {families} --conditions no-history k1 --json"
+    done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'}")
+    assert done.exit_code == 0, done.output
+    assert [
+        (row["family"], row["condition"], row["status"]) for row in json.loads(done.stdout)
+    ] == [
+        ("VideoRepick", "no-history", "fail"),
+        ("VideoRepick", "k1", "fail"),
+        ("MoveCube", "no-history", "fail"),
+        ("MoveCube", "k1", "fail"),
+    ]
+
+
+def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_split: Path) -> None:
+    line = f"evaluate --policy python:support.own_policies:Still {USUAL} --families MoveCube"
+    line += f" --split {tiny_split} --out {tmp_path / 'run'} --policy-option gripper=-1"
+    done = type_in(line)
+    assert done.exit_code == 0, done.output
+    assert "1 of 1 rollouts in" in done.stdout and "0/1 0%" in done.stdout
+    header = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert header["identity"]["policy_options"] == {"gripper": -1}
+    with pytest.raises(InvalidOptionError, match="speed") as raised:
+        type_in(f"{line} speed=1", catch_exceptions=False)
+    assert raised.value.hint == "Its options: gripper."
+
+
+def test_what_broke_is_told_with_the_command_to_go_on(
+    tmp_path: Path, trouble: Path, tiny_split: Path
+) -> None:
+    (trouble / "MoveCube-0").write_text("raise")
+    line = f"evaluate --policy hold {USUAL} --families MoveCube --conditions no-history"
+    done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'} --max-errors 1")
+    assert done.exit_code == 1
+    assert "1 rollouts broke (see" in done.stderr
+    assert "Stopped: 1 rollouts in a row broke" in done.stderr
+    assert done.stderr.rstrip().splitlines()[-1].startswith("robomme-interference")
+
+
+def test_a_full_disk_names_the_file_and_the_command_to_go_on(
+    tmp_path: Path, tiny_split: Path
+) -> None:
+    line = f"evaluate --policy python:support.own_policies:Filler {USUAL} --families MoveCube"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert isinstance(done.exception, OSError)
+    assert done.exception.filename == str(tmp_path / "run" / "rollouts.jsonl")
+    told = f"Finished rollouts are in {tmp_path / 'run'}; once mended, go on with:\nrobomme-inter"
+    assert told in done.stderr
+
+
+@pytest.mark.parametrize("command", ["evaluate", "merge"])
+def test_help_is_whole_at_80_columns_and_has_examples(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = CliRunner().invoke(APP, [command, "--help"]).stdout
+    options = text[text.index("Options") :]
+    assert "--out " in options and not re.search(r"--[a-z-]+…", options)
+    # The examples are as they can be typed: a command begins a line, and goes on in the next.
+    lines = [line.strip() for line in text.splitlines()]
+    examples = [line for line in lines if line.startswith(f"robomme-interference {command} ")]
+    assert len(examples) == {"evaluate": 6, "merge": 1}[command]
+    assert all(line.endswith("\\") or "--out" in line for line in examples)
+
+
+def test_merge_tells_what_is_missing_and_double(tmp_path: Path) -> None:
+    run_one(tmp_path / "a", shard="1/1", conditions=("no-history", "k0"))
+    log = tmp_path / "a" / "rollouts.jsonl"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:1]))
+    line = f"merge {tmp_path / 'a'} {tmp_path / 'a'} --out"
+    done = type_in(f"{line} {tmp_path / 'merged'}")
+    assert done.exit_code == 0, done.output
+    assert "1 missing: MoveCube/test/0 under" in done.stderr
+    assert "1 in more than one run, the first one kept: MoveCube/test/0" in done.stderr
+    assert "1 of 2 rollouts in " in done.stdout
+    told = json.loads(type_in(f"{line} {tmp_path / 'again'} --json").stdout)
+    assert (told["planned"], told["rows"], len(told["missing"])) == (2, 1, 1)
+    assert told["missing"][0]["episode"] == "MoveCube/test/0"
+    assert told["differing"] == told["broken"] == []

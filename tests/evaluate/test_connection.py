@@ -1,0 +1,235 @@
+"""Servers that are not there, slow, restarted, or something else."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from support.policy_calls import client, info, observation, rollout, section
+from support.policy_server import PolicyServer
+from websockets.sync.client import ClientConnection, connect
+from websockets.sync.server import serve
+
+from robomme_interference_data.errors import PolicyServerError
+from robomme_interference_data.evaluate.policies import connection
+from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIABLE
+from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
+
+
+@contextmanager
+def listening(backlog: int = 1) -> Iterator[int]:
+    """A port that accepts connections and never answers; not even that with a backlog of -1."""
+    with socket.socket() as mute:
+        mute.bind(("127.0.0.1", 0))
+        if backlog >= 0:
+            mute.listen(backlog)
+        yield mute.getsockname()[1]
+
+
+@contextmanager
+def handling(handle: Callable[[Any], Any], **options: Any) -> Iterator[int]:
+    """A websocket server of another kind."""
+    with serve(handle, "127.0.0.1", 0, **options) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        yield other.socket.getsockname()[1]
+        other.shutdown()
+
+
+# --- connecting --------------------------------------------------------------------------------
+
+
+def test_nobody_listens() -> None:
+    with listening(-1) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
+        with pytest.raises(PolicyServerError) as raised:
+            policy.reset(info(0))
+    assert f"policy server 127.0.0.1:{port} cannot be reached: " in raised.value.message
+    assert raised.value.message.endswith("refused (for 0.5 s)")
+    assert "docs/systems.md" in (raised.value.hint or "")
+
+
+def test_a_port_that_never_answers_is_told_soon_and_given_up(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with listening() as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=3.0)
+        began = time.monotonic()
+        with pytest.raises(PolicyServerError, match="it does not answer"):
+            policy.metadata()
+        assert 2.5 < time.monotonic() - began < 10
+    told = f"Waiting for policy server 127.0.0.1:{port}, for 3 s at most …\n"
+    assert capsys.readouterr().err == told
+
+
+def test_a_server_that_never_speaks_is_given_up() -> None:
+    with handling(lambda connection: connection.recv()) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
+        with pytest.raises(PolicyServerError, match="did not answer within"):
+            policy.metadata()
+
+
+def test_a_server_that_starts_late_is_waited_for(capsys: pytest.CaptureFixture[str]) -> None:
+    with listening(-1) as port:
+        server = PolicyServer(port=port)
+
+    def begin() -> None:
+        time.sleep(0.3)
+        running.__enter__()
+
+    running = server.running()
+    thread = threading.Thread(target=begin)
+    thread.start()
+    with client(server) as policy:
+        rollout(policy, 0, [], [])
+    thread.join()
+    running.__exit__(None, None, None)
+    assert len(server.calls) == 3
+    assert capsys.readouterr().err == ""  # that was no time
+
+
+def test_a_server_that_is_not_ready_is_asked_again(server: PolicyServer) -> None:
+    server.status = HTTPStatus.SERVICE_UNAVAILABLE
+    with client(server, connect_s=0.5) as policy:
+        with pytest.raises(PolicyServerError, match=r"it answers 503 \(for 0\.5 s\)"):
+            policy.reset(info(0))
+        server.status = None
+        rollout(policy, 0, [], [])
+
+
+def test_something_else_listens(server: PolicyServer) -> None:
+    server.status = HTTPStatus.NOT_FOUND
+    with (
+        client(server) as policy,
+        pytest.raises(PolicyServerError, match=r"is no policy server.* websocket.* 404"),
+    ):
+        policy.reset(info(0))
+    assert server.connections == 0
+
+
+def test_the_key_is_sent(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    server.api_key = "abc"
+    monkeypatch.delenv(API_KEY_VARIABLE, raising=False)
+    with client(server) as policy:
+        with pytest.raises(PolicyServerError, match="refuses with 401") as raised:
+            policy.reset(info(0))
+        assert API_KEY_VARIABLE in (raised.value.hint or "")
+        monkeypatch.setenv(API_KEY_VARIABLE, "abc")
+        rollout(policy, 0, [], [])
+
+
+# --- connections that break --------------------------------------------------------------------
+
+
+def test_a_server_that_was_restarted_is_connected_again_at_the_next_reset() -> None:
+    server = PolicyServer()
+    with server.running():
+        policy = WebsocketPolicy("127.0.0.1", server.port)
+        rollout(policy, 2, [2], [16])
+        policy.observe(*section(0, 4))
+    with pytest.raises(PolicyServerError, match="closed the connection"):
+        policy.act(observation(3), "pick")  # never in the middle of a rollout
+    with server.running():
+        rollout(policy, 2, [2], [])
+        policy.close()
+    assert server.connections == 2
+
+
+def test_a_connection_that_broke_between_rollouts_costs_none(server: PolicyServer) -> None:
+    answers = iter([PolicyServer.CLOSE])
+    with client(server) as policy:
+        rollout(policy, 0, [], [])
+        server.before = lambda message: next(answers, None)
+        rollout(policy, 4, [4], [])
+    assert server.memory.count == 5
+
+
+@pytest.mark.parametrize("call", ["prompt", "reset"])
+def test_a_server_that_hangs_is_given_up(server: PolicyServer, call: str) -> None:
+    go_on = threading.Event()
+    server.before = lambda message: go_on.wait(30) and None if call in message else None
+    with client(server, response_s=0.3) as policy:
+        with pytest.raises(PolicyServerError, match=r"did not answer within 0\.3 s"):
+            rollout(policy, 0, [], [])
+        go_on.set()
+
+
+def test_a_server_that_does_not_even_read_is_given_up() -> None:
+    """A message larger than the socket's buffers: it is the sending that hangs."""
+    gone = threading.Event()
+
+    def handle(connection: Any) -> None:
+        connection.send(msgpack.packb({}))
+        connection.recv()
+        connection.send(msgpack.packb({"reset_finished": True}))
+        gone.wait(30)
+
+    with handling(handle, max_queue=1, max_size=None) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, response_s=0.5, chunk_frames=4000)
+        policy.reset(info(2000))
+        frames = {"front": np.zeros((2000, 64, 64, 3), np.uint8)}
+        policy.add_history(frames, np.zeros((2000, 8), np.float32), 2000)
+        with pytest.raises(PolicyServerError, match=r"did not answer within 0\.5 s"):
+            policy.observe({"front": frames["front"][:1]}, np.zeros((1, 8), np.float32))
+        gone.set()
+        policy.close()
+
+
+def test_a_close_with_1011_alone_is_told() -> None:
+    def handle(connection: Any) -> None:
+        connection.send(msgpack.packb({}))
+        connection.recv()
+        connection.close(1011, "out of memory")
+
+    with handling(handle) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=1.0)
+        with pytest.raises(PolicyServerError, match=r"received 1011 .* out of memory"):
+            policy.reset(info(0))
+
+
+def test_a_server_that_computes_for_long_is_not_dropped(
+    server: PolicyServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # It answers no pings meanwhile: with keepalive's defaults, 20 s made shorter, it were lost.
+    def impatient(*arguments: Any, **options: Any) -> Any:
+        return connect(*arguments, **{"ping_interval": 0.05, "ping_timeout": 0.1, **options})
+
+    monkeypatch.setattr(connection, "connect", impatient)
+    server.before = lambda message: time.sleep(0.5) if "prompt" in message else None
+    with client(server) as policy:
+        rollout(policy, 0, [], [16])
+    assert server.connections == 1
+
+
+def test_pings_of_the_server_are_answered_while_the_simulator_runs() -> None:
+    server = PolicyServer()
+    server.options |= {"ping_interval": 0.05, "ping_timeout": 0.4}
+    with server.running(), client(server, response_s=0.5) as policy:
+        rollout(policy, 0, [], [])
+        time.sleep(1)  # nor does the time limit of a message that was answered end it
+        policy.observe(*section(1, 2))
+    assert server.connections == 1
+
+
+def test_an_interrupt_leaves_no_answer_behind(
+    server: PolicyServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receive = ClientConnection.recv
+
+    def interrupted(opened: ClientConnection) -> Any:
+        receive(opened)
+        raise KeyboardInterrupt
+
+    with client(server) as policy:
+        rollout(policy, 0, [], [])
+        with monkeypatch.context() as patch:
+            patch.setattr(ClientConnection, "recv", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                policy.act(observation(0), "pick")
+        rollout(policy, 1, [1], [])  # a fresh connection, or the order would be wrong
+    assert server.connections == 2

@@ -1,0 +1,110 @@
+"""docs/systems.md and docs/evaluate.md against the code: table, commands, policy, settings."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from support import worlds
+from support.policy_server import PolicyServer
+from support.runs import run
+
+from robomme_interference_data import evaluate
+from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIABLE
+from robomme_interference_data.evaluate.policies.registry import policy_options
+from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS, System
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "systems.md").read_text(encoding="utf-8")
+GUARD = 'if __name__ == "__main__":'
+
+
+def row(system: System) -> list[str]:
+    conditions = {
+        (True, True): "all",
+        (True, False): "`no-history`",
+        (False, True): "with history",
+    }[system.no_history, system.with_history]
+    return [
+        f"`{system.name}`",
+        system.display,
+        system.representation,
+        system.integration or "–",
+        conditions,
+        str(system.position_limit or "–"),
+    ]
+
+
+def test_the_table_is_that_of_the_code() -> None:
+    section = PAGE.split("\n## ")[1]
+    lines = [line for line in section.splitlines() if line.startswith("| `")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert cells == [row(system) for system in SYSTEMS.values()]
+
+
+def test_it_says_how_to_start_the_server_of_every_system_of_the_paper() -> None:
+    section = PAGE.split("\n## Released servers")[1].split("\n## ")[0]
+    lines = re.findall(r"^\| `(\S+)` \| `(\S+)/79999` \| `(\S+)` \|$", section, flags=re.M)
+    subgoals = {"simple_subgoal": "simple-subgoal", "grounded_subgoal": "grounded-subgoal"}
+    expected = []
+    for system in PAPER_SYSTEMS:
+        config = "mme_vla_suite" if system.with_history else "pi05_baseline"
+        folder = system.name.replace("retrieval-", "perceptual-")
+        if system.subgoals is not None:
+            folder = f"symbolic-{subgoals[system.subgoals]}"
+        expected.append((system.name, f"{config}/{folder}", config))
+    assert lines == expected
+    # The example is a line of that table.
+    example = re.search(r"--policy\.dir=runs/ckpts/(\S+)/79999 \\\n +--policy\.config=(\S+)", PAGE)
+    assert example is not None
+    assert example.groups() in [line[1:] for line in lines]
+
+
+def test_the_names_that_it_gives_are_the_codes() -> None:
+    assert API_KEY_VARIABLE in PAGE
+    section = PAGE.split("\n## Options")[1].split("\n## ")[0]
+    named = re.findall(r"`(\w+_\w+)`", section)
+    assert set(policy_options("websocket://a:1")) == set(named) - {
+        "run_evaluation",
+        "policy_options",
+    }
+
+
+def test_the_policy_of_the_page_runs(
+    tmp_path: Path, world: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = re.search(r"<!-- example: policy -->\n```python\n(.*?)```", PAGE, flags=re.S)
+    assert found is not None
+    (tmp_path / "retrace.py").write_text(found[1], encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "retrace", raising=False)
+    result = run(tmp_path / "run", policy="python:retrace:make", families=("MoveCube",))
+    # The world asks for the lesson's pose 3: the fourth action of the first chunk.
+    assert [(row.condition, row.status, row.steps) for row in result.rows] == [
+        ("no-history", "fail", worlds.STEPS),
+        ("k0", "success", 4),
+    ]
+
+
+def test_a_run_over_a_server_keeps_its_account(tmp_path: Path, world: None) -> None:
+    """With history and without: the server checks the order of its calls."""
+    with PolicyServer().running() as server:
+        system = "perceptual-framesamp-modul"
+        names = ("no-history", "k1")
+        result = run(tmp_path / "run", policy=server.url, system=system, conditions=names)
+        calls = server.calls
+    # The policy holds still, so every episode ends after 40 steps.
+    assert [(row.status, row.error) for row in result.rows] == [("fail", None)] * 4
+    assert {call["exec_start_idx"] for call in calls if "exec_start_idx" in call} == {0, 80}
+    # 40 steps in chunks of 16: asked three times a rollout.
+    kinds = [call["call"] for call in calls]
+    assert (kinds.count("reset"), kinds.count("infer")) == (4, 4 * 3)
+
+
+def test_examples_in_python_have_the_guard_and_are_the_code() -> None:
+    page = (DOCS / "evaluate.md").read_text(encoding="utf-8")
+    for text in (page, evaluate.__doc__ or ""):
+        snippet = text.split("```python\n")[1].split("```")[0]
+        assert snippet.index(GUARD) < snippet.index("run_evaluation(")
+        compile(snippet, "example", "exec")
+        assert "RunConfig(" in snippet

@@ -1,0 +1,122 @@
+"""The files of a run, held against golden ones, and what is no record."""
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data.errors import FormatError, RunFolderError
+from robomme_interference_data.evaluate.log import check_same_run, open_log, read_record, read_run
+from robomme_interference_data.evaluate.plan import Plan, WorkItem
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.rows import to_dict
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "run"
+
+HEADER, KNOWN = read_run(GOLDEN)
+ROWS = list(KNOWN.values())
+"""One of the lesson behind seven units, one with a retrieval step, and one that broke."""
+
+
+def test_golden_files(tmp_path: Path) -> None:
+    with open_log(tmp_path / "run", HEADER.identity, HEADER.split) as log:
+        log.begin(HEADER.starts[0])
+        for row in ROWS:
+            log.append(row, trace="Traceback\n…" if row.error else None)
+        log.end(log.header)
+    for name in ("rollouts.jsonl", "rollouts.csv", "run.json", "errors.log"):
+        assert (tmp_path / "run" / name).read_text() == (GOLDEN / name).read_text(), name
+    table = pq.read_table(tmp_path / "run" / "rollouts.parquet")
+    assert table.to_pylist() == [to_dict(row) for row in ROWS[::-1]]  # in canonical order
+
+
+def test_golden_files_are_read() -> None:
+    assert [(row.condition, row.status, row.steps) for row in ROWS] == [
+        ("k7", "success", 151),
+        ("k0", "timeout", 1300),
+        ("no-history", "error", 0),
+    ]
+    assert [row.retrieval_stop for row in ROWS] == [None, 186, None]
+    assert HEADER.plans == (Plan({"MoveCube/test": "3"}, ("no-history", "k0", "k7"), "1/1"),)
+    assert (HEADER.status, HEADER.planned, HEADER.counts["error"]) == ("incomplete", 3, 1)
+
+
+def test_a_killed_run_stands_as_its_record_says(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with open_log(out, HEADER.identity, "my-split") as log:
+        log.begin(HEADER.starts[0])
+        for row in ROWS[:2]:
+            log.append(row)
+    assert json.loads((out / "run.json").read_text())["status"] == "running"
+    header, _ = read_run(out)
+    assert (header.status, header.planned) == ("incomplete", 3)
+    assert header.counts == {"success": 1, "fail": 0, "timeout": 1, "error": 0}
+
+
+@given(cut=st.integers(0, 2000))
+def test_a_line_that_was_cut_short_is_dropped_and_only_that_one(
+    tmp_path_factory: pytest.TempPathFactory, cut: int
+) -> None:
+    out = tmp_path_factory.mktemp("torn")
+    whole = (GOLDEN / "rollouts.jsonl").read_bytes()
+    text = whole[: max(0, len(whole) - cut)]
+    (out / "run.json").write_bytes((GOLDEN / "run.json").read_bytes())
+    (out / "rollouts.jsonl").write_bytes(text)
+    kept = text.count(b"\n")
+    assert list(read_record(out).values()) == ROWS[:kept]
+    with open_log(out, HEADER.identity, "my-split") as log:
+        assert list(log.rows.values()) == ROWS[:kept]
+    assert (out / "rollouts.jsonl").read_bytes() == b"".join(whole.splitlines(True)[:kept])
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (b"{}", "system is missing"),
+        (b"not json", "Expecting value"),
+        (b"[" * 20_000, "recursion"),
+        (json.dumps(to_dict(ROWS[0]) | {"unknown": 1}).encode(), "unknown unknown"),
+        (json.dumps(to_dict(ROWS[0]) | {"steps": "many"}).encode(), "steps: 'many'"),
+        (json.dumps(to_dict(ROWS[0]) | {"condition": "k"}).encode(), "'k' is not a condition"),
+        (json.dumps(to_dict(ROWS[0]) | {"status": "fail"}).encode(), "contradicts status"),
+        (json.dumps(to_dict(ROWS[0])).encode(), "a second one of MoveCube/test/3 under k7"),
+    ],
+)
+def test_a_damaged_line_is_named(tmp_path: Path, line: bytes, words: str) -> None:
+    first = (GOLDEN / "rollouts.jsonl").read_bytes().splitlines(True)[0]
+    (tmp_path / "rollouts.jsonl").write_bytes(first + line + b"\n")
+    with pytest.raises(FormatError, match=r"rollouts\.jsonl, line 2 is no row of a rollout") as e:
+        read_record(tmp_path)
+    assert words in e.value.message
+
+
+def test_an_error_may_come_again(tmp_path: Path) -> None:
+    lines = (GOLDEN / "rollouts.jsonl").read_bytes().splitlines(True)
+    (tmp_path / "rollouts.jsonl").write_bytes(lines[2] + lines[2])
+    assert list(read_record(tmp_path)) == [WorkItem("no-history", EpisodeId("MoveCube", "test", 3))]
+    assert read_record(tmp_path / "nowhere") == {}
+
+
+def test_a_full_disk_names_the_file(tmp_path: Path) -> None:
+    with open_log(tmp_path / "run", HEADER.identity, "my-split") as log:
+        (tmp_path / "run" / "rollouts.jsonl").unlink()
+        (tmp_path / "run" / "rollouts.jsonl").symlink_to("/dev/full")
+        with pytest.raises(OSError, match="No space left") as raised:
+            log.append(ROWS[0])
+        assert raised.value.filename == str(tmp_path / "run" / "rollouts.jsonl")
+        assert log.rows == {}
+
+
+def test_every_difference_of_two_runs_is_told(tmp_path: Path) -> None:
+    found = {"system": "a", "policy_metadata": {"sha256": "x", "type": "act"}, "model_seed": 0}
+    check_same_run(tmp_path, found, dict(found))
+    wanted = {"system": "b", "policy_metadata": {"sha256": "y", "type": "act"}, "new": None}
+    with pytest.raises(RunFolderError) as raised:
+        check_same_run(tmp_path, found, wanted)
+    assert raised.value.message.partition(": ")[2] == (
+        "model_seed is 0 there, unknown here; new is unknown there, None here; "
+        "policy_metadata.sha256 is 'x' there, 'y' here; system is 'a' there, 'b' here"
+    )

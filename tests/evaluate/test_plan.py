@@ -1,0 +1,103 @@
+"""The work of a run: what is asked for, in canonical order, in shards, and shuffled."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.evaluate.plan import Plan, WorkItem, plan_work, shuffle_work
+from robomme_interference_data.ids import EpisodeId
+
+KNOWN = [EpisodeId(f, "test", i) for f in ("MoveCube", "RouteStick") for i in (0, 1, 2, 5)]
+KNOWN += [EpisodeId("RouteStick", "val", 7)]
+
+
+def test_a_plan_is_in_canonical_order_and_keeps_an_episodes_conditions_together() -> None:
+    plan = plan_work(
+        KNOWN, families=["MoveCube"], episodes="5,0", conditions=("k7", "no-history", "k0")
+    )
+    assert plan == Plan({"MoveCube/test": "0,5"}, ("no-history", "k0", "k7"), "1/1")
+    episodes = EpisodeId("MoveCube", "test", 0), EpisodeId("MoveCube", "test", 5)
+    assert plan.items() == tuple(
+        WorkItem(condition, episode)
+        for episode in episodes
+        for condition in ("no-history", "k0", "k7")
+    )
+    assert str(plan.items()[2]) == "MoveCube/test/0 under k7"
+
+
+def test_without_families_and_episodes_all_that_are_there_are_planned() -> None:
+    plan = plan_work(KNOWN, conditions=["k0"])
+    assert plan.episodes == {"MoveCube/test": "0-2,5", "RouteStick/test": "0-2,5"}
+    assert plan_work(KNOWN, conditions=["k0"], episode_split="val").episodes == {
+        "RouteStick/val": "7"
+    }
+
+
+@given(st.permutations(KNOWN), st.permutations(["k0", "k3", "no-history"]))
+def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[str]) -> None:
+    assert plan_work(known, conditions=names, episodes="0,2") == plan_work(
+        KNOWN, conditions=["no-history", "k0", "k3"], episodes="0,2"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"episodes": "0,3-4"}, UnknownNameError, "MoveCube/test/3 and 1 more\nIt has 0-2,5 of"),
+        ({"episodes": "6"}, UnknownNameError, "MoveCube/test/6\nIt has 0-2,5"),
+        (
+            {"episode_split": "val", "families": ["MoveCube"]},
+            UnknownNameError,
+            "has no val episode",
+        ),
+        ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
+        ({"episode_split": "train"}, InvalidOptionError, "no train episode\nGive --episode-split"),
+        ({"episodes": "3-1"}, InvalidOptionError, "not a list of episode numbers"),
+        ({"conditions": ["k0", "k64"]}, InvalidIdError, "'k64' is not a condition"),
+        ({"conditions": ["k0", "k0"]}, InvalidOptionError, "each once"),
+        ({"shard": "9/8"}, InvalidOptionError, "--shard '9/8'"),
+    ],
+)
+def test_what_cannot_be_planned(
+    changes: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error) as raised:
+        plan_work(KNOWN, **{"conditions": ["k0"]} | changes)
+    assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("text", ["", "0/8", "2", "2/", "/8", "-1/8", "2/8/1", "a/b"])
+def test_what_is_no_shard(text: str) -> None:
+    with pytest.raises(InvalidOptionError, match="NUMBER/OF"):
+        Plan({"MoveCube/test": "0"}, ("k0",), text)
+
+
+def whole(episodes: int, shard: str = "1/1") -> Plan:
+    names = ("no-history", "k0", "k7")
+    return Plan({"MoveCube/test": f"0-{episodes - 1}"}, names, shard)
+
+
+@given(episodes=st.integers(1, 50), of=st.integers(1, 12))
+def test_shards_are_even_and_together_the_plan(episodes: int, of: int) -> None:
+    plan = whole(episodes).items()
+    shards = [whole(episodes, f"{number}/{of}").items() for number in range(1, of + 1)]
+    assert sorted((item for shard in shards for item in shard), key=plan.index) == list(plan)
+    sizes = [len({item.episode for item in shard}) for shard in shards]
+    assert max(sizes) - min(sizes) <= 1
+    # An episode's conditions are never apart, and a shard is in the order of the plan.
+    assert all(len(shard) == 3 * size for shard, size in zip(shards, sizes, strict=True))
+    assert all(list(shard) == sorted(shard) for shard in shards)
+
+
+@given(st.permutations(range(12)))
+def test_the_shuffle_depends_on_nothing_but_the_episodes(order: list[int]) -> None:
+    plan = Plan({"MoveCube/test": "0-11"}, ("k0",)).items()
+    shuffled = shuffle_work([plan[index] for index in order])
+    assert shuffled == shuffle_work(plan)
+    # By the sha256 of "MoveCube/test/0" and so on, worked out apart.
+    assert [item.episode.index for item in shuffled] == [1, 9, 5, 0, 8, 10, 6, 3, 2, 7, 11, 4]
+    kept = [item for item in shuffled if item.episode.index % 3]
+    assert list(shuffle_work(kept)) == kept  # the order of two never depends on a third

@@ -1,0 +1,222 @@
+"""Policies from text: what is read, what is refused before any episode, and what is made."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import own_policies
+
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    PolicyError,
+    UnknownNameError,
+)
+from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.options import bind_options, split_options
+from robomme_interference_data.evaluate.policies.registry import (
+    PolicySpec,
+    check_workers,
+    make_policy,
+    parse_policy,
+    policy_options,
+)
+
+OWN = "python:support.own_policies:"
+MEMBERS = {name for name in vars(Policy) if not name.startswith("_")}
+
+
+@pytest.mark.parametrize(
+    ("text", "spec", "servers"),
+    [
+        ("oracle", PolicySpec("oracle"), ()),
+        ("replay:window", PolicySpec("replay", "window"), ()),
+        ("lerobot:me/act", PolicySpec("lerobot", "me/act"), ()),
+        ("lerobot:out/last:1", PolicySpec("lerobot", "out/last:1"), ()),
+        ("python:my.policies:make", PolicySpec("python", "my.policies:make"), ()),
+        (
+            "websocket://gpu-1.lab:8013,10.0.0.2:1,[::1]:65535",
+            PolicySpec("websocket", "//gpu-1.lab:8013,10.0.0.2:1,[::1]:65535"),
+            (("gpu-1.lab", 8013), ("10.0.0.2", 1), ("::1", 65535)),
+        ),
+    ],
+)
+def test_what_is_read(text: str, spec: PolicySpec, servers: tuple[tuple[str, int], ...]) -> None:
+    assert parse_policy(text) == spec
+    assert str(spec) == text
+    assert spec.servers == servers
+    assert str(parse_policy("replay")) == "replay:full"
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("orcale", UnknownNameError, "Did you mean 'oracle'?"),
+        ("websockets://a:1", UnknownNameError, "Did you mean 'websocket'?"),
+        ("zzz", UnknownNameError, "expected replay, replay:framesamp or replay:window, oracle,"),
+        ("", UnknownNameError, "there is no policy ''"),
+        *(
+            (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")
+            for text in (
+                *("oracle:x", "hold:", "replay:", "websocket", "websocket:a:1", "websocket://"),
+                *("websocket://a", "websocket://a:0", "websocket://a:65536", "websocket://a:1/x"),
+                *("websocket://a:1,", "websocket://a:1,websocket://b:1", "websocket://a:1,a:1"),
+                *("lerobot", "lerobot:", "python:module", "python::make", "python:a b:make"),
+            )
+        ),
+    ],
+)
+def test_what_is_refused(text: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error) as raised:
+        parse_policy(text)
+    assert words in str(raised.value)
+    with pytest.raises(error):
+        make_policy(text)
+
+
+@given(st.text(max_size=20) | st.from_regex(r"(websocket:/?/?|python:|lerobot:)[a-z:,1.\[\]]*"))
+def test_any_text_is_a_policy_or_a_clear_error(text: str) -> None:
+    try:
+        spec = parse_policy(text)
+    except (UnknownNameError, InvalidOptionError):
+        return
+    assert str(spec) == text
+    assert len(spec.servers) == (text.count(",") + 1 if spec.kind == "websocket" else 0)
+
+
+def test_each_worker_has_a_server() -> None:
+    spec = parse_policy("websocket://a:1,b:2")
+    check_workers(spec, 2)
+    with pytest.raises(InvalidOptionError, match="3 workers need 3 policy servers") as raised:
+        check_workers(spec, 3)
+    assert "--workers 2" in str(raised.value)
+    check_workers(parse_policy("replay"), 50)
+    make_policy(str(spec), worker=1)
+    with pytest.raises(InvalidOptionError, match="3 workers need"):
+        make_policy(str(spec), worker=2)
+
+
+# --- options -----------------------------------------------------------------------------------
+
+
+def test_options_reach_the_policy_with_the_declared_type() -> None:
+    policy: Any = make_policy(f"{OWN}still", ["gripper=-1"])
+    assert policy.action[0, 7] == -1
+    assert policy_options("websocket://a:1", ["response_s=5"]) == {
+        "chunk_frames": 16,
+        "connect_s": 60.0,
+        "response_s": 5.0,
+    }
+
+    def make(a: str, b: str | None, c: int | None, d: bool, e, f: list[int]) -> None: ...  # type: ignore[no-untyped-def]
+
+    typed = ["a=7", "b=null", "c=null", "d=true", "e=x=y", "f=[1]"]
+    assert bind_options("mine", make, {}, typed) == {
+        **{"a": "7", "b": "null", "c": None, "d": True, "e": "x=y", "f": [1]},
+    }
+
+
+@pytest.mark.parametrize("texts", [["gripper"], ["=1"], ["two words=1"], ["a=1", "b=1", "a=2"]])
+def test_what_is_no_option(texts: list[str]) -> None:
+    with pytest.raises(InvalidOptionError, match="--policy-option"):
+        split_options(texts)
+
+
+@pytest.mark.parametrize(
+    ("text", "option", "words"),
+    [
+        ("websocket://a:1", "chunk_frames=2.5", "chunk_frames is 2.5; expected a whole number"),
+        ("websocket://a:1", "chunk_frames=true", "is True; expected a whole number"),
+        ("websocket://a:1", "connect_s=soon", "connect_s is 'soon'; expected a number"),
+        ("websocket://a:1", "memory=full", "Its options: chunk_frames, connect_s, response_s."),
+        ("websocket://a:1", "port=2", "port"),
+        ("websocket://a:1", "connect_s=-1", "expected positive numbers"),
+        (f"{OWN}still", "gripper=null", "gripper is None; expected a number"),
+        ("hold", "speed=1", "Its options: none."),
+    ],
+)
+def test_options_that_do_not_fit(text: str, option: str, words: str) -> None:
+    with pytest.raises(InvalidOptionError) as raised:
+        make_policy(text, [option])
+    assert words in str(raised.value)
+    with pytest.raises(InvalidOptionError, match="missing a required argument: 'gripper'"):
+        make_policy(f"{OWN}still")
+
+
+# --- policies of one's own ---------------------------------------------------------------------
+
+
+def test_a_factory_that_asks_is_told_its_worker() -> None:
+    policy: Any = make_policy(f"{OWN}Still", worker=3)
+    assert isinstance(policy, own_policies.Still)
+    assert policy.worker == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("python:no_such_module:make", PolicyError, "PYTHONPATH"),
+        (f"{OWN}stil", UnknownNameError, "Did you mean 'still'"),
+        (f"{OWN}NUMBER", UnknownNameError, "function 'NUMBER'"),
+        (f"{OWN}nothing", PolicyError, "object has cameras None; expected a tuple of 'front'"),
+        (f"{OWN}nothing", PolicyError, "no method reset(); no method add_history()"),
+        ("python:builtins:dict", PolicyError, "dict has cameras None"),
+    ],
+)
+def test_a_factory_that_is_none(text: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error) as raised:
+        make_policy(text)
+    assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("name", sorted(MEMBERS))
+def test_every_member_of_the_protocol_is_asked_for(name: str) -> None:
+    with pytest.raises(PolicyError, match=rf"Lacking has (no method )?{name}\b") as raised:
+        make_policy(f"{OWN}lacking", [f"name={name}"])
+    assert "docs/systems.md has one" in str(raised.value)
+    assert len(MEMBERS) == 11
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("history_cameras", "null", "history_cameras None"),
+        ("history_cameras", '["top"]', "a tuple of 'front' and 'wrist'"),
+        ("cameras", '"front"', "cameras 'front'"),
+        ("wants_history", "no", "wants_history 'no'; expected True or False"),
+        ("every_frame", "1", "every_frame 1"),
+        ("act", "3", r"no method act()"),
+    ],
+)
+def test_a_member_of_another_kind(name: str, value: str, words: str) -> None:
+    with pytest.raises(PolicyError) as raised:
+        make_policy(f"{OWN}changed", [f"name={name}", f"value={value}"])
+    assert words in str(raised.value)
+
+
+def test_a_list_of_cameras_will_do() -> None:
+    assert make_policy(f"{OWN}changed", ["name=cameras", 'value=["wrist"]']).cameras == ["wrist"]
+
+
+def test_a_module_that_does_not_import_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_policy.py").write_text("import not_installed_here\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(PolicyError, match="No module named 'not_installed_here'"):
+        make_policy("python:broken_policy:make")
+
+
+@pytest.mark.parametrize("library", ["websockets", "msgpack"])
+def test_a_missing_library_names_the_extra(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = "robomme_interference_data.evaluate.policies"
+    for name in list(sys.modules):
+        if name.startswith((f"{package}.w", f"{package}.connection", library)):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(MissingExtraError, match=f"needs {library}") as raised:
+        make_policy("websocket://a:1")
+    assert "robomme-interference-data[evaluate]" in str(raised.value.hint)

@@ -1,0 +1,138 @@
+"""The memory policy without weights: what it keeps, where it takes up, what it follows."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import PolicyError, UnknownNameError
+from robomme_interference_data.evaluate.policies.base import RolloutInfo
+from robomme_interference_data.evaluate.policies.replay import (
+    MEMORIES,
+    ReplayPolicy,
+    follow,
+    thumbnails,
+)
+from robomme_interference_data.simulators.base import Observation
+
+Vector = NDArray[np.float32]
+
+
+def state(joint: float, opening: float = 0.04) -> Vector:
+    """All joints alike."""
+    return np.array([joint] * 7 + [opening], np.float32)
+
+
+def seen(shade: int, joint: float, opening: float = 0.04) -> Observation:
+    return Observation({"front": np.full((32, 32, 3), shade, np.uint8)}, state(joint, opening))
+
+
+def test_what_memories_keep() -> None:
+    assert list(MEMORIES["full"](5)) == [0, 1, 2, 3, 4]
+    assert list(MEMORIES["window"](100)) == list(range(69, 100))  # 32 with the live one
+    assert list(MEMORIES["framesamp"](30)) == list(range(30))
+    # numpy truncates linspace(0, 310, 32) to 0, 10, …, 310; the last one is the live frame.
+    assert list(MEMORIES["framesamp"](310)) == list(range(0, 310, 10))
+    with pytest.raises(UnknownNameError, match="Did you mean 'window'"):
+        ReplayPolicy("windw")
+
+
+@given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 5000))
+def test_a_memory_keeps_frames_that_were_there(name: str, live: int) -> None:
+    kept = list(MEMORIES[name](live))
+    assert kept == sorted(set(kept))
+    assert all(0 <= index < live for index in kept)
+    assert len(kept) == min(live, 31) or name == "full"
+
+
+# --- the trajectory ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kept", "joints", "plan"),
+    [
+        ([0, 1, 2], [0.0, 0.02, 0.05], [0.0, 0.02, 0.05]),  # one a step
+        ([0, 4], [0.0, 0.08], [0.0, 0.02, 0.04, 0.06, 0.08]),  # what is missing, between
+        # 0.24 rad to the first frame: three steps of 0.08.
+        ([7], [0.24], [0.08, 0.16, 0.24]),
+    ],
+)
+def test_kept_frames_are_followed(kept: list[int], joints: list[float], plan: list[float]) -> None:
+    found = follow(state(0.0), np.array(kept), np.stack([state(joint) for joint in joints]))
+    np.testing.assert_allclose(found[:, 0], plan, atol=1e-6)
+    assert (found[:, 7] == 1).all()
+
+
+def test_the_gripper_closes_and_opens_when_it_was_seen_to() -> None:
+    openings = [0.04, 0.04, 0.03, 0.02, 0.02, 0.03, 0.03]
+    states = np.stack([state(0.0, opening) for opening in openings])
+    plan = follow(states[0], np.arange(7), states)
+    assert plan[:, 7].tolist() == [1, 1, -1, -1, -1, 1, 1]
+    # Between missing frames after the arm: one step to the first frame, two to the second, five
+    # to close, two to the third.
+    states = np.stack([state(0.0, 0.04), state(0.02, 0.02), state(0.04, 0.02)])
+    plan = follow(states[0], np.array([0, 2, 4]), states)
+    np.testing.assert_allclose(plan[:, 0], [0, 0.01, *[0.02] * 6, 0.03, 0.04], atol=1e-7)
+    assert plan[:, 7].tolist() == [1, 1, 1, -1, -1, -1, -1, -1, -1, -1]
+
+
+@given(
+    st.lists(st.floats(-2, 2, width=32), min_size=1, max_size=8),
+    st.lists(st.integers(1, 30), min_size=8, max_size=8),
+)
+def test_it_ends_where_it_should_and_never_jumps(joints: list[float], gaps: list[int]) -> None:
+    states = np.stack([state(joint) for joint in joints])
+    kept = np.cumsum(gaps)[: len(joints)]
+    plan = follow(state(0.0), kept, states)
+    moves = np.abs(np.diff(np.concatenate([state(0.0)[None], plan])[:, :7], axis=0))
+    assert moves.max() <= 0.08 + 1e-5
+    np.testing.assert_allclose(plan[-1, :7], states[-1, :7], atol=1e-6)
+    assert len(plan) >= kept[-1] - kept[0] + 1
+
+
+# --- the policy -------------------------------------------------------------------------------
+
+
+def fed(memory: str, shades: list[int], joints: list[float]) -> ReplayPolicy:
+    policy = ReplayPolicy(memory)
+    policy.reset(RolloutInfo("goal", len(shades), 0))
+    frames = np.stack([np.full((32, 32, 3), shade, np.uint8) for shade in shades])
+    states = np.stack([state(joint) for joint in joints])
+    for start in range(0, len(shades), 7):  # chunks do not matter
+        part = slice(start, start + 7)
+        policy.add_history({"front": frames[part]}, states[part], len(shades))
+    return policy
+
+
+def test_it_takes_up_where_the_view_is_nearest_the_first_of_equals() -> None:
+    policy = fed("full", [10, 90, 50, 200], [0.0, 0.01, 0.02, 0.03])
+    actions = policy.act(seen(88, 0.01), "goal")
+    assert actions.shape == (16, 8) and actions.dtype == np.float32
+    np.testing.assert_allclose(actions[:4, 0], [0.01, 0.02, 0.03, 0.03], atol=1e-6)
+    actions = fed("full", [10, 50, 10], [0.0, 0.02, 0.05]).act(seen(10, 0.0), "goal")
+    np.testing.assert_allclose(actions[:3, 0], [0.0, 0.02, 0.05], atol=1e-6)
+    # A window has lost what came before.
+    policy = fed("window", [200] + [0] * 40, [0.5] + [0.0] * 40)
+    assert (policy.act(seen(200, 0.0), "goal")[:, 0] == 0).all()
+
+
+def test_it_goes_on_from_call_to_call_then_holds_and_a_reset_forgets() -> None:
+    joints = [0.01 * step for step in range(20)]
+    policy = fed("full", [0] * 20, joints)
+    got = np.concatenate([policy.act(seen(0, 0.0), "goal") for _ in range(3)])[:, 0]
+    np.testing.assert_allclose(got, joints + [0.19] * 28, atol=1e-6)
+    policy.reset(RolloutInfo("goal", 0, 0))
+    held = policy.act(seen(0, 0.2, 0.0), "goal")  # without history
+    np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, -1], (16, 1)))
+    with pytest.raises(PolicyError, match="not reset"):
+        ReplayPolicy().act(seen(0, 0.0), "goal")
+
+
+def test_thumbnails_are_mean_colours_of_tiles() -> None:
+    frame = np.zeros((35, 32, 3), np.uint8)  # the last 3 rows fill no tile
+    frame[0, 0] = (40, 80, 120)
+    small = thumbnails(frame[None])
+    assert small.shape == (1, 16, 16, 3)
+    assert small[0, 0, 0].tolist() == [10, 20, 30]  # one of four pixels
+    assert small.sum() == 60

@@ -1,0 +1,242 @@
+"""One rollout: what the policy gets, when, and what is written of it."""
+
+import threading
+import time
+import warnings
+from collections.abc import Generator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.runs import EPISODE, roll, run
+from support.worlds import Cheat, World
+
+from robomme_interference_data import load_split
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.errors import (
+    HistoryTooLongError,
+    PolicyError,
+    RolloutError,
+    SimulatorCrashError,
+)
+from robomme_interference_data.evaluate.policies.builtin import Hold, Privileged
+from robomme_interference_data.evaluate.rollout import read_ahead
+
+pytestmark = pytest.mark.usefixtures("world")
+
+
+# --- what the policy gets ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [1, 10, 64, 500])
+def test_the_history_is_the_buffer_in_chunks(chunk: int, tiny_split: Path) -> None:
+    policy = Cheat()
+    roll("k3", policy, history_chunk=chunk)
+    buffer = load_split(tiny_split).load(EPISODE, "k3")
+    assert len(buffer) == 48 + 3 * 32
+    np.testing.assert_array_equal(np.stack(policy.states), buffer.states)
+    sizes = [size for size, _ in policy.chunks]
+    assert sum(sizes) == 144 and set(sizes[:-1]) <= {chunk} and sizes[-1] <= chunk
+    assert {total for _, total in policy.chunks} == {144}
+
+
+def test_live_observations_come_once_each_in_chunks_of_16() -> None:
+    policy = Cheat()
+    row = roll("no-history", policy)
+    # The first one, then 16 and 16; the episode ends with the 40th step, in the third chunk.
+    assert (row.steps, policy.live) == (40, [1, 16, 16])
+
+
+def test_a_policy_may_ask_for_the_deciding_observations_only() -> None:
+    policy, world = Cheat(), World()
+    policy.every_frame = False
+    roll("no-history", policy, simulator=world)
+    assert policy.live == [1, 1, 1]
+    assert world.drawn == 2  # after 16 and 32 steps; the 40th ends it
+
+
+def test_more_than_16_actions_are_cut() -> None:
+    policy = Cheat()
+    hold = policy.act
+    policy.act = lambda o, g: np.tile(hold(o, g), (3, 1))  # type: ignore[method-assign]
+    roll("no-history", policy)
+    assert policy.live == [1, 16, 16]
+
+
+def test_history_is_decoded_while_an_episode_in_another_process_begins(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    decoding, stream = threading.Event(), Buffer.stream
+
+    class Patient(World):
+        remote = True
+
+        def reset(self, episode_id: str, demonstration: bool = True) -> Any:
+            assert decoding.wait(20)
+            return super().reset(episode_id, demonstration)
+
+    def noted(*options: Any) -> Any:
+        decoding.set()
+        yield from stream(*options)
+
+    monkeypatch.setattr(Buffer, "stream", noted)
+    policy = Cheat()
+    assert roll("k1", policy, simulator=Patient(), history_chunk=50).success
+    assert policy.chunks == [(50, 80), (30, 80)]
+
+
+def test_a_cache_that_cannot_be_written_costs_no_rollout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocked = tmp_path / "cache"
+    blocked.write_text("a file where the folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        result = run(tmp_path / "run", conditions=("k0", "k1"), cache=True)
+    assert result.counts["success"] == 4
+    assert [str(blocked) in str(one.message) for one in told] == [True]  # once
+
+
+# --- retrieval ---------------------------------------------------------------------------------
+
+
+class Chooses:
+    """A retrieval step that takes a span, whatever it is shown."""
+
+    name, camera = "chooses", "front"
+
+    def __init__(self, start: int, stop: int):
+        shares = {"lesson_fraction": 0.25, "filler_fraction": 0.5, "query_fraction": 0.25}
+        self.chosen = SimpleNamespace(start=start, stop=stop, **shares)
+
+    def select(self, buffer: Buffer, image: np.ndarray) -> Any:
+        return self.chosen
+
+
+def test_retrieval_hands_over_the_span_that_it_chose() -> None:
+    policy = Cheat()
+    row = roll("k3", policy, selector=Chooses(40, 60))
+    assert policy.chunks == [(20, 20)]
+    assert (row.retrieval_model, row.retrieval_start, row.retrieval_stop) == ("chooses", 40, 60)
+    # 20 frames and the live one are all in the sample; 8 of them are of the 48 frames' lesson.
+    assert (row.history_frames, row.lesson_frames, row.lesson_share) == (20, 8, 8 / 21)
+    assert row.retrieval_selected_filler_fraction == 0.5
+    empty = roll("no-history", Cheat(), selector=Chooses(0, 0))
+    assert (empty.retrieval_model, empty.retrieval_start) == ("chooses", None)
+
+
+def test_what_retrieval_chose_keeps_the_position_limit() -> None:
+    system = "retrieval-framesamp-modul"  # 4096 positions less 1300 steps
+    long = SimpleNamespace(name="all", camera="front")
+    long.select = lambda *_: SimpleNamespace(start=0, stop=2797)
+    with pytest.raises(HistoryTooLongError, match="2797 frames under k7"):
+        roll("k7", Cheat(), selector=long, system=system)
+
+
+# --- the row -----------------------------------------------------------------------------------
+
+
+def test_the_row_says_what_was_given(tiny_split: Path) -> None:
+    row, split = roll("k3", Cheat()), load_split(tiny_split)
+    manifest = split.manifest(EPISODE, "k3")
+    assert row.key == (
+        *("mine", "support.worlds:World", "split", split.revision),
+        *("MoveCube", "k3", "test", 0, 0, 1),
+    )
+    assert (row.seed, row.difficulty, row.goal) == (
+        manifest.seed,
+        manifest.difficulty,
+        manifest.goal,
+    )
+    assert (row.history_frames, row.lesson_frames) == (144, 48)
+    # An even 32-sample of 0 … 144 has index j·144 // 31: those under 48 are j = 0 … 10.
+    assert row.lesson_share == 11 / 32 == manifest.lesson_share
+    assert row.wall_s is not None and row.wall_s >= (row.reset_s or 0) + (row.policy_s or 0) - 0.01
+
+
+def test_a_rollout_times_out_after_1300_steps(trouble: Path) -> None:
+    (trouble / "MoveCube-0").write_text("endless")
+    row = roll("no-history", Cheat())
+    assert (row.status, row.success, row.steps) == ("timeout", False, 1300)
+
+
+def test_the_oracle_gets_the_simulator_and_others_do_not() -> None:
+    oracle = Privileged("oracle")
+    assert roll("k1", oracle).status == "success"
+    oracle.privileged = False
+    with pytest.raises(PolicyError, match="needs the simulator itself"):
+        roll("k1", oracle)
+    assert roll("k0", Hold()).status == "fail"
+
+
+# --- policies and simulators that break --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [np.zeros((0, 8)), np.zeros(8), np.zeros((16, 7)), np.full((16, 8), np.nan), "up", [[1], []]],
+)
+def test_bad_actions_are_refused(actions: Any) -> None:
+    policy = Cheat()
+    policy.act = lambda observation, goal: actions  # type: ignore[method-assign]
+    with pytest.raises(PolicyError, match=r"(?s)the policy's answer: .*\(n, 8\)"):
+        roll("k0", policy)
+
+
+@pytest.mark.parametrize(
+    ("kind", "raised"), [("raise", SimulatorCrashError), ("error", RolloutError)]
+)
+def test_a_broken_simulator_is_an_error(kind: str, raised: type[Exception], trouble: Path) -> None:
+    (trouble / "MoveCube-0").write_text(kind)
+    with pytest.raises(raised):
+        roll("no-history", Cheat())
+
+
+# --- reading ahead -----------------------------------------------------------------------------
+
+
+def counting(stop: int, made: list[Any], breaks_at: int | None = None) -> Generator[int]:
+    """Count to a number, and note how far one came, in which thread, and that it was closed."""
+    try:
+        for number in range(stop):
+            if number == breaks_at:
+                raise OSError("the disk is gone")
+            made.append((number, threading.get_ident()))
+            yield number
+    finally:
+        made.append("closed")
+
+
+@given(stop=st.integers(0, 12), depth=st.integers(1, 5))
+def test_all_items_in_order(stop: int, depth: int) -> None:
+    made: list[Any] = []
+    with read_ahead(counting(stop, made), depth) as items:
+        assert list(items) == list(range(stop))
+    assert made[-1] == "closed" and len(made) == stop + 1
+
+
+def test_first_items_are_made_in_a_thread_before_they_are_asked_for_and_no_more() -> None:
+    made: list[Any] = []
+    with pytest.raises(KeyboardInterrupt), read_ahead(counting(10, made), 3) as items:
+        for count in (3, 4):
+            until = time.monotonic() + 20
+            while len(made) < count and time.monotonic() < until:
+                time.sleep(0.001)
+            time.sleep(0.05)  # one more would be made by now
+            assert [number for number, _ in made] == list(range(count))
+            assert next(items) == count - 3
+        raise KeyboardInterrupt
+    assert made[-1] == "closed" and len(made) <= 6  # a stream that is left is closed
+    assert len({thread for _, thread in made[:4]} - {threading.get_ident()}) == 1
+
+
+def test_an_error_comes_where_its_item_would_have_come() -> None:
+    with read_ahead(counting(5, [], breaks_at=2), 4) as items:
+        assert [next(items), next(items)] == [0, 1]
+        with pytest.raises(OSError, match="the disk is gone"):
+            next(items)

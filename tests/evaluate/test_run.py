@@ -1,0 +1,308 @@
+"""A whole run in this process: rows, resume, what breaks, and when it stops."""
+
+import fcntl
+import json
+import shutil
+from collections.abc import Generator, Iterable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from support.runs import run, run_one, untimed
+from support.worlds import World
+
+from robomme_interference_data.errors import FormatError, RunFolderError, SimulatorCrashError
+from robomme_interference_data.evaluate.log import read_record
+from robomme_interference_data.execution import Outcome, Serial
+from robomme_interference_data.records import Rollout
+from robomme_interference_data.rows import arrow_schema, to_dict
+
+pytestmark = pytest.mark.usefixtures("trouble")
+
+
+def header(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "run.json").read_text())
+
+
+# --- rows --------------------------------------------------------------------------------------
+
+
+def test_a_run_writes_a_row_for_every_rollout(tmp_path: Path) -> None:
+    result = run(tmp_path / "run", conditions=("k7", "no-history", "k0"))
+    assert result.counts == {"success": 4, "fail": 2, "timeout": 0, "error": 0}
+    assert (result.planned, result.stopped, result.folder) == (6, None, tmp_path / "run")
+    assert [(row.family, row.condition) for row in result.rows] == [
+        (family, condition)
+        for family in ("VideoRepick", "MoveCube")
+        for condition in ("no-history", "k0", "k7")
+    ]
+    found = header(tmp_path / "run")
+    assert (found["status"], found["planned"], found["counts"]) == ("complete", 6, result.counts)
+    assert found["plans"] == [
+        {
+            "episodes": {"VideoRepick/test": "0", "MoveCube/test": "0"},
+            "conditions": ["no-history", "k0", "k7"],
+            "shard": "1/1",
+        }
+    ]
+    (start,) = found["starts"]
+    assert start["policy"] == {"policy": "cheat"} and start["started"] <= start["ended"]
+    assert {"numpy", "python", "robomme-interference-data"} <= set(start["versions"])
+    assert start["settings"]["conditions"] == ["k7", "no-history", "k0"]
+
+
+def test_tables_are_exported_from_the_record(tmp_path: Path) -> None:
+    result = run(tmp_path / "run")
+    table = pq.read_table(tmp_path / "run" / "rollouts.parquet")
+    assert table.schema.equals(arrow_schema(Rollout))
+    assert table.to_pylist() == [to_dict(row) for row in result.rows]
+    lines = [json.loads(line) for line in (tmp_path / "run" / "rollouts.jsonl").open()]
+    assert sorted(lines, key=table.to_pylist().index) == table.to_pylist()  # as they ended
+
+
+class Backwards(Serial):
+    """Runs tasks from the last to the first, as workers side by side may."""
+
+    def run(self, function: Any, tasks: Iterable[Any], **options: Any) -> Generator[Outcome]:
+        return super().run(function, list(tasks)[::-1], **options)
+
+
+def test_who_runs_the_rollouts_makes_no_difference(tmp_path: Path) -> None:
+    one, other = (run(tmp_path / e.__name__, executor=e()) for e in (Serial, Backwards))
+    assert untimed(one.rows) == untimed(other.rows)
+
+
+def test_only_the_workers_number_reaches_a_factory_that_asks(tmp_path: Path) -> None:
+    options = ("gripper=-1",)
+    still = "python:support.own_policies:Still"
+    run_one(tmp_path / "run", policy=still, policy_options=options)
+    assert header(tmp_path / "run")["identity"]["policy_options"] == {"gripper": -1.0}
+
+
+# --- resume ------------------------------------------------------------------------------------
+
+
+def test_finished_rollouts_are_not_run_again(tmp_path: Path) -> None:
+    first = run(tmp_path / "run")
+    text = (tmp_path / "run" / "rollouts.jsonl").read_text()
+    again = run(tmp_path / "run", workers=2)
+    assert again.rows == first.rows
+    assert (tmp_path / "run" / "rollouts.jsonl").read_text() == text
+    assert len(header(tmp_path / "run")["starts"]) == 2
+
+
+def test_a_run_may_grow_and_stands_for_all_its_plans(tmp_path: Path) -> None:
+    out, one = tmp_path / "run", {"families": ("MoveCube",), "conditions": ("k0",)}
+    run(out, **one)
+    grown = run(out, conditions=("no-history", "k0"))
+    assert len(grown.rows) == 4
+    assert pq.read_table(out / "rollouts.parquet")["condition"].to_pylist() == [
+        *("no-history", "k0", "no-history", "k0")
+    ]
+    # A smaller plan keeps the rows of the larger one.
+    assert run(out, **one).planned == 1
+    found = header(out)
+    assert (found["planned"], len(found["plans"]), found["status"]) == (4, 2, "complete")
+
+
+def test_after_a_torn_line_the_run_goes_on(tmp_path: Path) -> None:
+    first = run(tmp_path / "run")
+    log = tmp_path / "run" / "rollouts.jsonl"
+    log.write_bytes(log.read_bytes()[:-20])
+    again = run(tmp_path / "run")
+    assert untimed(again.rows) == untimed(first.rows)
+    assert len(log.read_bytes().splitlines()) == 4
+
+
+class Impatient:
+    """A listener that presses Ctrl-C at the first row."""
+
+    def start(self, items: Any, done: Any) -> None: ...
+
+    def row(self, row: Any) -> None:
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_leaves_tables_and_a_header_that_say_how_the_folder_stands(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        run(out, listener=Impatient())
+    found = header(out)
+    assert (found["status"], found["planned"], sum(found["counts"].values())) == (
+        "incomplete",
+        4,
+        1,
+    )
+    assert found["starts"][0]["stopped"] == "interrupted"
+    assert pq.read_metadata(out / "rollouts.parquet").num_rows == 1
+    assert len((out / "rollouts.csv").read_text().splitlines()) == 2
+    run(out)
+    assert [one["stopped"] for one in header(out)["starts"]] == ["interrupted", None]
+
+
+def test_a_header_counts_from_the_first_moment_on(tmp_path: Path) -> None:
+    seen: list[dict[str, Any]] = []
+
+    class Looks:
+        def start(self, items: Any, done: Any) -> None:
+            seen.append(header(tmp_path / "run"))
+
+        def row(self, row: Any) -> None: ...
+
+    run(tmp_path / "run", listener=Looks())
+    assert (seen[0]["status"], seen[0]["planned"]) == ("running", 4)
+    assert seen[0]["counts"] == {"success": 0, "fail": 0, "timeout": 0, "error": 0}
+    assert seen[0]["starts"][0]["ended"] is None
+
+
+# --- what breaks -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "attempts"),
+    [
+        # A simulator that broke may do better in the next attempt; what it says itself stands.
+        ("raise", "SimulatorCrashError: the world fell apart (Pick it up.)", 2),
+        ("error", "RolloutError: the support.worlds:World simulator reported an error at step", 1),
+    ],
+)
+def test_a_rollout_that_breaks_is_an_error_and_run_again(
+    tmp_path: Path, trouble: Path, kind: str, error: str, attempts: int
+) -> None:
+    (trouble / "MoveCube-0").write_text(kind)
+    result = run(tmp_path / "run")
+    # The cheat succeeds at its first step with the lesson: only no-history gets to the trouble.
+    (broken,) = [row for row in result.rows if row.status == "error"]
+    assert (broken.family, broken.condition) == ("MoveCube", "no-history")
+    assert broken.error is not None and broken.error.startswith(error)
+    assert (broken.success, broken.attempt, broken.difficulty) == (None, attempts, "easy")
+    assert broken.seed == result.rows[-1].seed
+    assert header(tmp_path / "run")["status"] == "incomplete"
+    log = (tmp_path / "run" / "errors.log").read_text()
+    assert f"MoveCube/test/0 under no-history, attempt {attempts}\nTraceback" in log
+
+    (trouble / "MoveCube-0").unlink()
+    again = run(tmp_path / "run")
+    assert again.counts == {"success": 2, "fail": 2, "timeout": 0, "error": 0}
+    assert [row.attempt for row in again.rows] == [1, 1, attempts + 1, 1]
+
+
+def test_a_simulator_that_breaks_once_costs_no_rollout(tmp_path: Path, trouble: Path) -> None:
+    (trouble / "MoveCube-0").write_text("raise once")
+    (row,) = run_one(tmp_path / "run").rows
+    assert (row.status, row.attempt) == ("fail", 2)
+    assert not (tmp_path / "run" / "errors.log").exists()
+
+
+def test_what_broke_is_not_used_again(
+    tmp_path: Path, trouble: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[World] = []
+
+    def close(self: World) -> None:
+        closed.append(self)
+
+    monkeypatch.setattr(World, "close", close)
+    (trouble / "VideoRepick-0").write_text("raise")
+    run(tmp_path / "run", conditions=("no-history",))
+    # Two attempts of the one that broke, and the end of the run.
+    assert len(closed) == len(set(map(id, closed))) == 3
+
+
+def test_words_that_no_file_can_hold_end_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BREAKS", "surrogate")
+    result = run(
+        tmp_path / "run", policy="python:support.own_policies:Broken", conditions=("no-history",)
+    )
+    assert [row.error for row in result.rows] == [
+        r"ValueError: no such file: caf\udce9 in two lines"
+    ] * 2
+    assert r"caf\udce9" in (tmp_path / "run" / "errors.log").read_text()
+    assert pq.read_table(tmp_path / "run" / "rollouts.parquet")["error"][0].as_py()
+    run_one(tmp_path / "said", policy="python:support.own_policies:with_surrogate")
+    assert header(tmp_path / "said")["identity"]["policy_metadata"]["checkpoint"] == r"caf\udce9"
+
+
+def test_a_run_in_which_everything_breaks_stops(tmp_path: Path, trouble: Path) -> None:
+    for family in ("VideoRepick", "MoveCube"):
+        (trouble / f"{family}-0").write_text("raise")
+    result = run(tmp_path / "run", conditions=("no-history",), max_errors=1)
+    assert result.stopped is not None
+    assert result.stopped.startswith("1 rollouts in a row broke; the last: SimulatorCrashError")
+    assert (len(result.rows), result.planned) == (1, 2)
+
+
+def test_without_any_worker_the_run_stops_with_why(tmp_path: Path) -> None:
+    class Lost(Serial):
+        def run(self, *_: Any, **__: Any) -> Generator[Outcome]:
+            yield from ()
+            raise SimulatorCrashError("nobody is left")
+
+    with pytest.raises(SimulatorCrashError):
+        run(tmp_path / "run", executor=Lost())
+    assert header(tmp_path / "run")["starts"][0]["stopped"] == "nobody is left"
+
+
+# --- folders -----------------------------------------------------------------------------------
+
+
+def test_a_run_may_be_refused_if_one_is_there(tmp_path: Path) -> None:
+    run_one(tmp_path / "run")
+    with pytest.raises(RunFolderError, match="holds a run already"):
+        run_one(tmp_path / "run", no_resume=True)
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("…")
+    with pytest.raises(RunFolderError, match=r"holds other files \(thesis\.tex\)"):
+        run_one(tmp_path / "run")
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["thesis.tex"]
+
+
+def test_a_folder_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    run_one(tmp_path / "run")
+    with (tmp_path / "run" / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(RunFolderError, match="another process is writing"):
+            run_one(tmp_path / "run")
+
+
+def test_a_folder_that_has_lost_its_record_is_refused(tmp_path: Path) -> None:
+    run_one(tmp_path / "run")
+    (tmp_path / "run" / "rollouts.jsonl").unlink()
+    with pytest.raises(RunFolderError, match=r"rollouts\.jsonl is missing"):
+        run_one(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format_version": 2}, "format version 2"),
+        ({"plans": None}, "plans: None"),
+        ({"plans": [{"conditions": ["k0"]}]}, "episodes is missing"),
+        ({"notes": "mine"}, "unknown notes"),
+    ],
+)
+def test_a_damaged_header_is_one_clear_error(
+    tmp_path: Path, change: dict[str, Any], words: str
+) -> None:
+    run_one(tmp_path / "run")
+    changed = json.dumps(header(tmp_path / "run") | change)
+    (tmp_path / "run" / "run.json").write_text(changed)
+    with pytest.raises(FormatError, match=r"run\.json.*" + words):
+        run_one(tmp_path / "run")
+
+
+def test_the_split_may_lie_elsewhere_and_keeps_its_label(tmp_path: Path, tiny_split: Path) -> None:
+    run_one(tmp_path / "run")
+    moved = shutil.copytree(tiny_split, tmp_path / "moved")
+    both = run(tmp_path / "run", split=moved, conditions=("no-history",))
+    assert [(row.family, row.split) for row in both.rows] == [
+        ("VideoRepick", "split"),
+        ("MoveCube", "split"),
+    ]
+    assert len(read_record(tmp_path / "run")) == 2

@@ -1,0 +1,118 @@
+"""The table of systems: the paper's grid, its conditions, and names that do not pretend."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data.errors import (
+    HistoryTooLongError,
+    InvalidIdError,
+    InvalidOptionError,
+    UnknownNameError,
+)
+from robomme_interference_data.evaluate.systems import (
+    PAPER_SYSTEMS,
+    SYSTEMS,
+    check_condition,
+    check_history,
+    display_name,
+    name_system,
+)
+
+CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
+
+
+def test_names_are_unique_and_the_papers_come_first() -> None:
+    assert list(SYSTEMS)[:13] == [system.name for system in PAPER_SYSTEMS]
+    assert len(SYSTEMS) == 13 + 3 + 3 + 3
+    assert [name for name in SYSTEMS if SYSTEMS[name].paper] == list(SYSTEMS)[:13]
+    assert len({system.display for system in SYSTEMS.values()}) == len(SYSTEMS)
+
+
+def applies(name: str) -> list[str]:
+    found = []
+    for condition in CONDITIONS:
+        try:
+            check_condition(name_system(name), condition)
+        except InvalidOptionError:
+            continue
+        found.append(condition)
+    return found
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_conditions(name: str) -> None:
+    expected = {"pi05_baseline": ["no-history"]}.get(name, list(CONDITIONS))
+    if name.startswith("retrieval-"):
+        expected = ["k0", "k1", "k3", "k7"]
+    assert applies(name) == expected
+
+
+def test_a_refused_condition_says_what_to_do() -> None:
+    with pytest.raises(InvalidOptionError, match="pi05_baseline has no memory"):
+        check_condition(name_system("pi05_baseline"), "k3")
+    for name, plain in [
+        ("retrieval-framesamp-modul", "perceptual-framesamp-modul"),
+        ("retrieval-replay-window", "replay-window"),
+    ]:
+        with pytest.raises(InvalidOptionError, match=f"Run {plain} under no-history"):
+            check_condition(name_system(name), "no-history")
+        assert plain in SYSTEMS
+
+
+def test_position_limits_are_told_condition_by_condition() -> None:
+    limited = {name for name, system in SYSTEMS.items() if system.position_limit is not None}
+    assert limited == {
+        name for name in SYSTEMS if name.startswith(("perceptual-", "recurrent-"))
+    } | {"retrieval-framesamp-modul"}
+    for name, system in SYSTEMS.items():
+        check_history(system, {"k7": 2796})  # 2796 + 1300 = 4096
+        longest = {"k7": 2796, "k31": 2797, "k63": 100_000}
+        if name in limited:
+            with pytest.raises(HistoryTooLongError, match="under k31, 100000 frames under k63"):
+                check_history(system, longest)
+        else:
+            check_history(system, longest)
+
+
+def test_own_names() -> None:
+    own = name_system("my-memory.v2")
+    assert (own.name, own.display, own.paper) == ("my-memory.v2", "my-memory.v2", False)
+    for condition in CONDITIONS:
+        check_condition(own, condition)
+    assert name_system("memer") is SYSTEMS["memer"]
+    assert name_system("holdout").display == "holdout"  # near hold, but no slip of it
+
+
+@pytest.mark.parametrize(
+    ("name", "system"),
+    [
+        ("FrameSamp-Modul", "perceptual-framesamp-modul"),  # a display name
+        ("perceptual_framesamp_modul", "perceptual-framesamp-modul"),
+        ("Perceptual-FrameSamp-Modul", "perceptual-framesamp-modul"),
+        ("perceptual-framesamp-modu", "perceptual-framesamp-modul"),  # a slip
+        ("perceptual-framesamp-modul-v2", "perceptual-framesamp-modul"),  # a variant
+        ("pi05-baseline", "pi05_baseline"),
+        ("Oracle", "oracle"),
+        ("replayfull", "replay-full"),
+    ],
+)
+def test_own_names_do_not_pretend(name: str, system: str) -> None:
+    with pytest.raises(UnknownNameError, match=f"{name!r} reads like the system {system!r}"):
+        name_system(name)
+
+
+@pytest.mark.parametrize("name", ["", " ", "-x", "a b", "a/b", "x" * 65, "π"])
+def test_what_is_no_name(name: str) -> None:
+    with pytest.raises(InvalidIdError, match="is not the name of a system"):
+        name_system(name)
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_a_system_or_a_clear_error(name: str) -> None:
+    try:
+        system = name_system(name)
+    except (InvalidIdError, UnknownNameError):
+        return
+    assert system.name == name
+    assert display_name(name) == system.display

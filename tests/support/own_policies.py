@@ -1,0 +1,150 @@
+"""Policies as users write them, for `python:own_policies:…`."""
+
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.errors import PolicyServerError
+from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
+
+
+class Still:
+    """Holds every joint at zero."""
+
+    cameras: Any = ("front",)
+    history_cameras: Any = ()
+    wants_history = False
+    privileged = False
+    every_frame = False
+
+    def __init__(self, gripper: float = 1.0, worker: int = 0):
+        self.action = np.array([[0.0] * 7 + [gripper]], np.float32)
+        self.worker = worker
+
+    def reset(self, info: Any) -> None: ...
+
+    def add_history(self, frames: Any, states: Any, exec_start_idx: int) -> None: ...
+
+    def observe(self, frames: Any, states: Any) -> None: ...
+
+    def act(self, observation: Any, goal: str) -> Any:
+        return self.action
+
+    def metadata(self) -> dict[str, Any]:
+        return {"policy": "still"}
+
+    def close(self) -> None: ...
+
+
+def still(gripper: float) -> Still:
+    return Still(gripper)
+
+
+def nothing() -> object:
+    return object()
+
+
+def lacking(name: str) -> object:
+    """Return a policy without one of its attributes or methods."""
+    members = {key: value for key, value in vars(Still).items() if key != name}
+    return type("Lacking", (), members)()
+
+
+def changed(name: str, value: Any) -> Still:
+    """Return a policy with another attribute or method."""
+    policy = Still()
+    setattr(policy, name, value)
+    return policy
+
+
+NUMBER = 3
+
+
+def with_array() -> Still:
+    return changed("metadata", lambda: {"policy": "still", "sizes": np.arange(3), 4: np.float32(5)})
+
+
+def with_text() -> Still:
+    return changed("metadata", lambda: "still")
+
+
+def with_nan() -> Still:
+    return changed("metadata", lambda: {"policy": "still", "scales": [1.0, np.float32("nan")]})
+
+
+def with_surrogate() -> Still:
+    return changed("metadata", lambda: {"policy": "still", "checkpoint": "caf\udce9"})
+
+
+def wants_top() -> Still:
+    return changed("history_cameras", ("top",))
+
+
+class Broken(Still):
+    """Breaks in the way that BREAKS names."""
+
+    def act(self, observation: Any, goal: str) -> Any:
+        kind = os.environ["BREAKS"]
+        if kind == "surrogate":
+            raise ValueError("no such file: caf\udce9\nin two lines")
+        if kind == "server":
+            raise PolicyServerError("the server is gone", "Start it.")
+        return super().act(observation, goal)
+
+
+class Filler(Still):
+    """Lets no file of this process grow any more, as on a full disk."""
+
+    def reset(self, info: Any) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+
+
+class Talker(Still):
+    """Writes to stdout wherever it can, and a line to the file of CLOSED when it is closed."""
+
+    def reset(self, info: Any) -> None:
+        sys.stdout.write("reset\n")
+
+    def close(self) -> None:
+        sys.stdout.write("closed\n")
+        with Path(os.environ["CLOSED"]).open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+
+def talker() -> Talker:
+    sys.stdout.write("made\n")
+    return Talker()
+
+
+def with_object(name: str = "x", value: Any = sys) -> Still:
+    return Still()
+
+
+def insider() -> Still:
+    return changed("privileged", True)
+
+
+class Served(WebsocketPolicy):
+    """Says nothing of where its server listens, which is no part of what it is."""
+
+    def metadata(self) -> dict[str, Any]:
+        return {name: value for name, value in super().metadata().items() if name != "server"}
+
+
+def served(worker: int = 0) -> Served:
+    """One of the servers of SERVERS, host:port with commas between; waited for a second."""
+    host, port = os.environ["SERVERS"].split(",")[worker].split(":")
+    return Served(host, int(port), connect_s=1.0)
+
+
+CHECKPOINT = "OWN_POLICIES_CHECKPOINT"
+
+
+def from_checkpoint() -> Still:
+    """Return a policy that says which checkpoint an environment variable names."""
+    said = {"policy": "still", "checkpoint": os.environ[CHECKPOINT]}
+    return changed("metadata", lambda: said)

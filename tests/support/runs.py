@@ -1,0 +1,70 @@
+"""Runs over the tiny split, on the simulator and with the cheat of `worlds`."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from support import worlds
+
+from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
+from robomme_interference_data.evaluate.config import Run
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.rollout import run_rollout
+from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import TIMING_COLUMNS, Rollout
+from robomme_interference_data.rows import to_dict
+
+CHEAT = "python:support.worlds:make_cheat"
+WORLD = "support.worlds:World"
+EPISODE = EpisodeId("MoveCube", "test", 0)
+
+
+def config(**changes: Any) -> RunConfig:
+    """A run of two episodes under two conditions."""
+    usual: dict[str, Any] = {
+        "policy": CHEAT,
+        "split": Path(os.environ[worlds.SPLIT]),
+        "out": Path("nowhere"),
+        "simulator": WORLD,
+        "system": "mine",
+        "families": worlds.FAMILIES,
+        "episodes": "0",
+        "conditions": ("no-history", "k0"),
+    }
+    return RunConfig(**usual | changes)
+
+
+def run(
+    out: Path, executor: Executor | None = None, *, listener: Any = None, **changes: Any
+) -> RunResult:
+    settings = config(out=out, **changes)
+    return run_evaluation(settings, executor=executor or Serial(), listener=listener)
+
+
+def run_one(out: Path, **changes: Any) -> RunResult:
+    """A run of one rollout."""
+    one: dict[str, Any] = {"conditions": ("no-history",), "families": ("MoveCube",)}
+    return run(out, **one | changes)
+
+
+def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) -> Rollout:
+    """One rollout, outside of a run."""
+    parts = {name: changes.pop(name) for name in ("selector", "clip") if name in changes}
+    system = changes.pop("system", "mine")
+    split = worlds.split_here()
+    return run_rollout(
+        Run(config(**changes), system, split.name, split.revision),
+        WorkItem(condition, EPISODE),
+        simulator=simulator or worlds.World(),
+        policy=policy,
+        split=split,
+        **parts,
+    )
+
+
+def untimed(rows: tuple[Rollout, ...]) -> list[dict[str, Any]]:
+    return [
+        {name: value for name, value in to_dict(row).items() if name not in TIMING_COLUMNS}
+        for row in rows
+    ]

@@ -1,0 +1,217 @@
+"""A simulator without physics over a split's episodes, and a policy that would cheat."""
+
+import os
+import re
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence, Set
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data import Query, Split, load_split
+from robomme_interference_data.constants import STATE
+from robomme_interference_data.errors import SimulatorCrashError
+from robomme_interference_data.evaluate.policies.base import Frames, RolloutInfo
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
+from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
+
+SPLIT = "WORLDS_SPLIT"
+TROUBLE = "WORLDS_TROUBLE"
+PAUSE = "WORLDS_PAUSE"
+ANSWER_FRAME = 3
+STEPS = 40
+
+
+@cache
+def split_here() -> Split:
+    return load_split(os.environ[SPLIT], threads=1)
+
+
+@cache
+def query_of(episode: str) -> tuple[Query, NDArray[np.float32], Observation]:
+    """A query of the split, the states of its lesson, and its first live observation."""
+    query = split_here().query(episode)
+    dataset, index = query.dataset, query.record.episode_index
+    states = dataset.read_vectors(index, STATE, 0, query.lesson_frames)
+    views = {camera: query.frame(camera) for camera in dataset.cameras}
+    return query, states, Observation(views, query.state())
+
+
+def lesson_images(query: Query) -> dict[str, NDArray[np.uint8]]:
+    dataset, index = query.dataset, query.record.episode_index
+    return {
+        camera: np.stack(
+            [frame.copy() for frame in dataset.iter_frames(index, camera, 0, query.lesson_frames)]
+        )
+        for camera in dataset.cameras
+    }
+
+
+class World:
+    """Episodes of the split that `WORLDS_SPLIT` names, as a simulator.
+
+    The answer is the lesson's state at frame 3. An action that equals it succeeds; after 40 steps
+    without it the episode fails. `WORLDS_TROUBLE` names a folder: a file `<Family>-<index>` there
+    makes that episode behave as the file says at step 5 (`raise`, `die`, `hang`, `error`), once
+    if the text ends in `once`; or never end (`endless`).
+    """
+
+    def __init__(self) -> None:
+        self.pause = float(os.environ.get(PAUSE, "0"))
+        self.drawn = 0
+
+    def reset(
+        self, episode_id: str, demonstration: bool = True
+    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
+        self.trouble = trouble_of(EpisodeId.parse(episode_id))
+        query, states, self.seen = query_of(episode_id)
+        self.answer, self.steps = states[ANSWER_FRAME], 0
+        lesson = Demonstration(
+            lesson_images(query) if demonstration else {}, states, np.zeros_like(states)
+        )
+        goals = query.record.goals
+        info = EpisodeInfo(query.goal, goals, str(query.difficulty), query.seed or 0, "world")
+        return lesson, self.seen, info
+
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
+        time.sleep(self.pause)
+        self.steps += 1
+        if self.trouble and self.steps == 5:
+            self._break()
+        status = Status.ONGOING
+        if np.array_equal(action[:7], self.answer[:7]):
+            status = Status.SUCCESS
+        elif self.steps >= STEPS and self.trouble != "endless":
+            status = Status.FAIL
+        if self.trouble == "error" and self.steps == 7:
+            status = Status.ERROR
+        self.drawn += observe
+        return Observation(self.seen.images if observe else {}, self.seen.state), status
+
+    def act(self, policy: str) -> NDArray[np.float32]:
+        return np.append(self.answer[:7], np.float32(1.0))
+
+    def close(self) -> None:
+        pass
+
+    def _break(self) -> None:
+        if self.trouble.startswith("raise"):
+            raise SimulatorCrashError("the world fell apart", "Pick it up.")
+        if self.trouble.startswith("die"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.trouble.startswith("hang"):
+            time.sleep(3600)
+
+
+def trouble_of(episode: EpisodeId) -> str:
+    folder = os.environ.get(TROUBLE)
+    path = Path(folder or "/nowhere") / f"{episode.family}-{episode.index}"
+    text = path.read_text() if path.exists() else ""
+    if text.endswith("once"):
+        path.unlink()
+    return text
+
+
+class Cheat:
+    """Does what the lesson shows if it can get hold of any of it, by whatever way; else it holds.
+
+    It knows the split's demonstrations by heart, so that one frame or state of them tells it the
+    answer. It looks for one in all that it is given: everything that can be reached from the info
+    and the goal, the history, and the live observations.
+    """
+
+    cameras: tuple[str, ...] = ("front",)
+    history_cameras: tuple[str, ...] = ("front", "wrist")
+    wants_history = True
+    privileged = False
+    every_frame = True
+
+    def reset(self, info: RolloutInfo) -> None:
+        self.info = info
+        self.answer: NDArray[np.float32] | None = None
+        self.states: list[NDArray[np.float32]] = []
+        self.live: list[int] = []
+        self.chunks: list[tuple[int, int]] = []
+        self.search(info)
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        assert sorted(frames) == ["front", "wrist"]
+        assert all(len(part) == len(states) for part in frames.values())
+        self.search((frames, states))
+        self.states += list(states)
+        self.chunks.append((len(states), exec_start_idx))
+
+    def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
+        assert list(frames) == ["front"] and len(frames["front"]) == len(states)
+        self.search((frames, states))
+        self.live.append(len(states))
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        self.search((observation, goal))
+        state = observation.state if self.answer is None else self.answer
+        return np.tile(np.append(state[:7], np.float32(1.0)), (16, 1))
+
+    def search(self, given: object) -> None:
+        """Take the answer from the first demonstration frame or state in what was given."""
+        if self.answer is None:
+            found = (known()[piece] for piece in pieces(given, set()) if piece in known())
+            self.answer = next(found, None)
+
+    def metadata(self) -> dict[str, Any]:
+        return {"policy": "cheat"}
+
+    def close(self) -> None:
+        pass
+
+
+@cache
+def known() -> dict[bytes, NDArray[np.float32]]:
+    """Every frame and joint state of the split's lessons, as bytes, and the answer that it tells.
+
+    What `World` shows of an episode anyway is left out: its only view and state.
+    """
+    told: dict[bytes, NDArray[np.float32]] = {}
+    shown: set[bytes] = set()
+    for episode in FAMILIES:
+        query, states, seen = query_of(f"{episode}/test/0")
+        images = list(lesson_images(query).values())
+        told |= dict.fromkeys(pieces([states, images], set()), states[ANSWER_FRAME])
+        shown |= set(pieces([seen.state, list(seen.images.values())], set()))
+    return {piece: answer for piece, answer in told.items() if piece not in shown}
+
+
+FAMILIES = ("VideoRepick", "MoveCube")
+"""Those that the tests run: the first test episode of each."""
+
+
+def pieces(given: object, seen: set[int]) -> Iterator[bytes]:
+    """Yield every image, and every seven numbers that could be joints, in what was given."""
+    if id(given) in seen:
+        return
+    seen.add(id(given))
+    if isinstance(given, np.ndarray):
+        if given.dtype == np.uint8 and given.ndim >= 3:
+            yield from (image.tobytes() for image in given.reshape(-1, *given.shape[-3:]))
+        elif given.dtype.kind == "f" and given.ndim and given.shape[-1] >= 7:
+            rows = given.reshape(-1, given.shape[-1]).astype(np.float32)
+            yield from (row[:7].tobytes() for row in rows)
+        return
+    if isinstance(given, str):
+        numbers = np.array(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", given), np.float32)
+        yield from (numbers[at : at + 7].tobytes() for at in range(len(numbers) - 6))
+    elif isinstance(given, Mapping):
+        yield from pieces([*given.keys(), *given.values()], seen)
+    elif isinstance(given, Sequence | Set):
+        for one in given:
+            yield from pieces(one, seen)
+    if hasattr(given, "__dict__") and not isinstance(given, type):
+        yield from pieces(list(vars(given).values()), seen)
+
+
+def make_cheat() -> Cheat:
+    return Cheat()

@@ -1,0 +1,53 @@
+"""A LeRobot policy that is trained on a built dataset acts: features and sizes fit."""
+
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("lerobot")
+pytestmark = pytest.mark.slow
+
+
+def test_a_policy_trained_on_built_demonstrations_acts(tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.factory import (
+        get_policy_class,
+        make_policy_config,
+        make_pre_post_processors,
+    )
+    from support.lerobot_policies import SMALL, features, play
+
+    from robomme_interference_data.build_dataset.build import build_dataset
+    from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
+    from robomme_interference_data.console import WorkProgress
+    from robomme_interference_data.constants import ACTION
+    from robomme_interference_data.evaluate.policies.registry import make_policy
+    from robomme_interference_data.execution import Serial
+
+    out = tmp_path / "demonstrations"
+    config = BuildConfig(source=("sample:MoveCube,PatternLock",), out=out, split="test")
+    plan = plan_build("demonstrations", config)
+    build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
+    given = {"device": "cpu", "push_to_hub": False, "pretrained_backbone_weights": None}
+    act = make_policy_config("act", **given, **features(), **SMALL["act"])
+    steps = [step / 10 for step in act.action_delta_indices]
+    dataset = LeRobotDataset(
+        "local/it", root=out, delta_timestamps={ACTION: steps}, video_backend="pyav"
+    )
+    before, after = make_pre_post_processors(act, dataset_stats=dataset.meta.stats)
+    model = get_policy_class("act")(act).train()
+    optimizer = torch.optim.AdamW(model.parameters(), 1e-3)
+    batch = before(torch.utils.data.default_collate([dataset[index] for index in range(4)]))
+    losses = []
+    for _ in range(5):
+        loss, _ = model.forward(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+    for part in (model, before, after):
+        part.save_pretrained(tmp_path / "policy")
+    (actions,) = play(make_policy(f"lerobot:{tmp_path / 'policy'}", ["device=cpu"]), 0, [1])
+    assert actions.shape == (16, 8)

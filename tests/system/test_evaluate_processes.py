@@ -1,0 +1,255 @@
+"""Evaluations in real processes: killed, hung, stopped, and left by their policy servers."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import policy_server, runs, worlds
+
+from robomme_interference_data.errors import WorkerRetiredError
+from robomme_interference_data.evaluate.log import read_record
+from robomme_interference_data.execution import Processes
+from robomme_interference_data.records import TIMING_COLUMNS
+from robomme_interference_data.rows import to_dict
+
+TESTS = Path(__file__).parent.parent
+CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
+ROLLOUTS = 10  # two episodes, five conditions
+GUARD = 'if __name__ == "__main__":'
+
+
+@pytest.fixture(autouse=True)
+def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(worlds.SPLIT, str(TESTS / "golden" / "split"))
+    monkeypatch.setenv(worlds.TROUBLE, str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+
+
+def start(out: Path, pause: float = 0.0, policy: str = runs.CHEAT) -> subprocess.Popen[str]:
+    words = f"evaluate --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
+    words += " --families VideoRepick MoveCube --json"
+    command = [sys.executable, "-m", "robomme_interference_data.cli", *words.split()]
+    return subprocess.Popen(
+        [*command, "--split", os.environ[worlds.SPLIT], "--out", str(out)],
+        env=os.environ | {worlds.PAUSE: str(pause)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def finish(out: Path) -> None:
+    running = start(out)
+    _, err = running.communicate(timeout=200)
+    assert running.returncode == 0, err
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            text = path.read_text()
+        except OSError:
+            continue
+        if int(text.rpartition(")")[2].split()[1]) == pid:
+            found.append(int(path.parent.name))
+    return found
+
+
+def gone(pids: list[int]) -> bool:
+    end = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() for pid in pids):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.1)
+    return True
+
+
+def ended(out: Path) -> list[dict[str, Any]]:
+    """What came out, in canonical order, without what differs from run to run."""
+    rows = read_record(out)
+    own = {*TIMING_COLUMNS, "attempt"}
+    return [
+        {name: value for name, value in to_dict(rows[item]).items() if name not in own}
+        for item in sorted(rows)
+    ]
+
+
+def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:
+    log, end = out / "rollouts.jsonl", time.monotonic() + 120
+    while time.monotonic() < end and running.poll() is None:
+        if log.exists() and log.read_bytes().count(b"\n") >= count:
+            return
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def undisturbed(tmp_path: Path) -> list[dict[str, Any]]:
+    """What one process writes."""
+    runs.run(tmp_path / "undisturbed", conditions=CONDITIONS)
+    return ended(tmp_path / "undisturbed")
+
+
+def test_the_command_may_be_killed_or_stopped_at_any_moment(
+    tmp_path: Path, undisturbed: list[dict[str, Any]]
+) -> None:
+    out = tmp_path / "run"
+    before: dict[Any, Any] = {}
+    for already, number in ((1, signal.SIGKILL), (3, signal.SIGINT), (5, signal.SIGTERM)):
+        running = start(out, 0.02)
+        wait_for_rows(out, already, running)
+        workers = children(running.pid)
+        if number == signal.SIGKILL:
+            running.kill()
+        else:
+            os.killpg(running.pid, number)
+        _, err = running.communicate(timeout=60)
+        assert gone(workers), "workers end with their parent"
+        header, rows = json.loads((out / "run.json").read_text()), read_record(out)
+        # `read_record` refuses a second row of a finished rollout: none is lost, none is double.
+        assert all(rows[item] == row for item, row in before.items())
+        assert already <= len(rows) < ROLLOUTS and header["planned"] == ROLLOUTS
+        before = rows
+        if number == signal.SIGKILL:
+            assert header["status"] == "running" and set(header["counts"].values()) == {0}
+            continue
+        assert running.returncode == 128 + number
+        assert "Traceback" not in err and "go on with:\nrobomme-interference evaluate" in err
+        assert sum(header["counts"].values()) == len(rows)
+        assert header["starts"][-1]["stopped"] == "interrupted"
+        assert len((out / "rollouts.csv").read_text().splitlines()) == len(rows) + 1
+    finish(out)
+    starts = json.loads((out / "run.json").read_text())["starts"]
+    assert [one["ended"] is None for one in starts] == [True, False, False, False]
+    assert ended(out) == undisturbed
+
+
+def test_a_simulator_that_hangs_or_takes_its_process_along_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "VideoRepick-0").write_text("die")
+    (tmp_path / "MoveCube-0").write_text("hang")
+    options = {"conditions": ("no-history",), "simulator_timeout": 6.0}
+    died, hung = runs.run(tmp_path / "run", Processes(2), **options).rows
+    assert (died.error, died.attempt) == ("the worker process died (exit code -9)", 2)
+    assert (hung.error, hung.attempt) == ("the simulator's steps took more than 6 s", 2)
+    log = (tmp_path / "run" / "errors.log").read_text()
+    assert "MoveCube/test/0 under no-history, attempt 2" in log
+    assert "worlds.py" in log and "in step" in log  # where it hung
+    # Once only, it costs no rollout.
+    (tmp_path / "VideoRepick-0").write_text("die once")
+    (tmp_path / "MoveCube-0").write_text("hang once")
+    again = runs.run(tmp_path / "run", Processes(2), **options, rollout_timeout=60.0)
+    assert [(row.status, row.attempt) for row in again.rows] == [("fail", 4), ("fail", 4)]
+
+
+def test_policies_are_closed_and_what_they_print_is_not_among_the_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLOSED", str(tmp_path / "closed"))
+    running = start(tmp_path / "run", policy="python:support.own_policies:talker")
+    out, err = running.communicate(timeout=120)
+    assert [row["status"] for row in json.loads(out)] == ["fail", "fail"]
+    words = err.split()
+    assert (words.count("made"), words.count("reset"), words.count("closed")) == (3, 2, 3)
+    pids = (tmp_path / "closed").read_text().split()
+    assert len(set(pids)) == 3  # the command itself, and two workers
+
+
+# --- policy servers ----------------------------------------------------------------------------
+
+
+@contextmanager
+def servers(count: int) -> Iterator[tuple[list[subprocess.Popen[str]], str]]:
+    """Servers in processes of their own, and their addresses with commas between."""
+    with ExitStack() as stack:
+        started = []
+        for _ in range(count):
+            command = [sys.executable, str(Path(policy_server.__file__)), "--port", "0"]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            started.append(process)
+        urls = [process.stdout.readline().strip() for process in started if process.stdout]
+        yield started, ",".join(url.removeprefix("websocket://") for url in urls)
+
+
+class Killer:
+    """Kills servers as soon as a row is written."""
+
+    def __init__(self, processes: list[subprocess.Popen[str]]):
+        self.processes = processes
+
+    def start(self, items: Any, done: Any) -> None: ...
+
+    def row(self, row: Any) -> None:
+        while self.processes:
+            self.processes.pop().kill()
+
+
+def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) -> None:
+    """The policy holds still: all rollouts fail. Another server does the rest, or a later run."""
+    served: dict[str, Any] = {"policy": "python:support.own_policies:served", "workers": 2}
+    served |= {"conditions": CONDITIONS}
+    with servers(2) as (processes, urls):
+        monkeypatch.setenv("SERVERS", urls)
+        result = runs.run(tmp_path / "one", Processes(2), listener=Killer(processes[1:]), **served)
+        assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * ROLLOUTS
+        with pytest.raises(WorkerRetiredError, match="cannot be reached"):
+            runs.run(tmp_path / "two", Processes(1), listener=Killer(processes[:1]), **served)
+    rows = read_record(tmp_path / "two")
+    assert 1 <= len(rows) < ROLLOUTS and {row.status for row in rows.values()} == {"fail"}
+    header = json.loads((tmp_path / "two" / "run.json").read_text())
+    assert (
+        header["status"] == "incomplete" and "cannot be reached" in header["starts"][0]["stopped"]
+    )
+    with servers(2) as (_, urls):
+        monkeypatch.setenv("SERVERS", urls)
+        assert runs.run(tmp_path / "two", Processes(2), **served).counts["fail"] == ROLLOUTS
+
+
+# --- scripts -----------------------------------------------------------------------------------
+
+
+def script(tmp_path: Path, call: str, policy: str = runs.CHEAT) -> Any:
+    path = tmp_path / "script.py"
+    path.write_text(f"""
+from pathlib import Path
+from support.worlds import make_cheat
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
+
+options = {{"simulator": {runs.WORLD!r}, "conditions": ("k0",), "families": ("MoveCube",)}}
+split, out = Path({os.environ[worlds.SPLIT]!r}), Path("run")
+config = RunConfig({policy!r}, split, out, system="mine", **options)
+{call}
+""")
+    return subprocess.run(
+        [sys.executable, str(path)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_a_script_needs_its_guard_and_a_module_for_its_policy(tmp_path: Path) -> None:
+    call = "run_evaluation(config)"
+    done = script(tmp_path, call)
+    assert done.returncode == 1 and done.stderr.count("Traceback") == 1
+    assert done.stderr.splitlines()[-1].endswith(GUARD)
+    assert read_record(tmp_path / "run") == {}
+    stopped = json.loads((tmp_path / "run" / "run.json").read_text())["starts"][0]["stopped"]
+    assert "came upon the call that start" in stopped
+    done = script(tmp_path, f"{GUARD}\n    print({call}.counts)")
+    assert done.stderr == ""
+    assert done.stdout == "{'success': 1, 'fail': 0, 'timeout': 0, 'error': 0}\n"
+    done = script(tmp_path, f"{GUARD}\n    {call}", "python:__main__:make_cheat")
+    assert done.stderr.splitlines()[-1].endswith("and write python:MODULE:FUNCTION.")

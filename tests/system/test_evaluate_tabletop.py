@@ -1,0 +1,75 @@
+"""Evaluations on the embedded simulator: replay over the lesson, guesses without drawing."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.runs import untimed
+
+from robomme_interference_data.errors import NoRendererError
+from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.evaluate.checks import check_simulator
+from robomme_interference_data.execution import Processes
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+pytestmark = pytest.mark.slow
+
+COMMAND = Path(sys.executable).parent / "robomme-interference"
+
+
+def test_a_machine_that_cannot_draw_is_told_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(name, "/nowhere.json")
+    with pytest.raises(NoRendererError) as raised:
+        check_simulator(RunConfig("hold", Path("S"), Path("R")), ("front",), Processes(1))
+    assert raised.value.hint
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two query episodes, a distractor unit."""
+    from robomme_interference_data.simulators.registry import make_simulator
+
+    try:
+        make_simulator("tabletop").close()
+    except NoRendererError as error:
+        pytest.skip(str(error))
+    out = tmp_path_factory.mktemp("tabletop")
+    played = "--source tabletop --episodes 0 --cameras front --workers 2"
+    for words in (
+        f"demonstrations {played} --split test --families MoveCube RouteStick "
+        f"--out {out}/demonstrations",
+        f"distractors {played} --families PatternLock --out {out}/distractors",
+        f"manifests {out} --conditions no-history k0 k1",
+    ):
+        command = [COMMAND, "build", *words.split()]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
+        assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_replay_retraces_the_lesson_with_one_worker_as_with_two(
+    split: Path, tmp_path: Path
+) -> None:
+    # The split was built from the same simulator: the same bits. All that MoveCube and RouteStick
+    # ask for is in the arm's motion.
+    runs = [
+        run_evaluation(
+            RunConfig(
+                *("replay", split, tmp_path / str(workers)),
+                conditions=("k0", "k1"),
+                workers=workers,
+                check_lesson=True,
+            )
+        )
+        for workers in (1, 2)
+    ]
+    one, two = (untimed(run.rows) for run in runs)
+    assert one == two
+    assert [row["status"] for row in one] == ["success"] * 4
+
+
+def test_the_oracle_always_succeeds_and_nothing_is_drawn(split: Path, tmp_path: Path) -> None:
+    config = RunConfig("oracle", split, tmp_path / "run", conditions=("no-history",))
+    assert [row.status for row in run_evaluation(config).rows] == ["success"] * 2
