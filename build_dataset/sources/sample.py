@@ -54,15 +54,16 @@ class SampleSource:
             for split, count in _EPISODES.items()
             for index in range(count)
         ]
-        return [SourceEpisode(one) for one in sorted(ids)]
+        # The same episode of another place among the families looks different.
+        return [SourceEpisode(one, self._families.index(one.family)) for one in sorted(ids)]
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Make an episode up; see `Source.read`."""
         name = episode.id
-        number = self._families.index(name.family)
+        number = episode.key
         scene = _Scene(name, number, self._size)
         short = (number, name.split, name.index) == (0, "train", 1)
-        chosen = choose_cameras(cameras, ("front", "wrist"), name)
+        chosen = choose_cameras(cameras, ("front", "wrist"))
         frames = scene.frames(_SHORT if short else _FRAMES, 48 + 16 * (name.index % 2), chosen)
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]
