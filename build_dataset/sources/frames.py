@@ -4,7 +4,7 @@
 episode either a video file or a folder of PNG images.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ class FramesSource:
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes; see `Source.episodes`."""
         table = read_frames_table(self._folder / TABLE)
-        places = self._find(set(table))
+        places = self._find(sorted(table))
         return [
             SourceEpisode(name, _Key(rows, places[name], self._state(places[name])))
             for name, rows in sorted(table.items())
@@ -113,7 +113,7 @@ class FramesSource:
     def close(self) -> None:
         """Nothing is held."""
 
-    def _find(self, episodes: set[EpisodeId]) -> dict[EpisodeId, dict[str, Path]]:
+    def _find(self, episodes: Iterable[EpisodeId]) -> dict[EpisodeId, dict[str, Path]]:
         """Find the video or image folder of every camera of every episode."""
         found: dict[EpisodeId, dict[str, Path]] = {episode: {} for episode in episodes}
         for path, camera, name in self._image_places():

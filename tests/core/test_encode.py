@@ -1,0 +1,168 @@
+"""The one writer of video: lossless at any size, the same bytes each time, one clear error."""
+
+import dataclasses
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from robomme_interference_data.encode import (
+    CLIP,
+    CODECS,
+    RECORDING,
+    Codec,
+    VideoEncoder,
+    get_codec,
+)
+from robomme_interference_data.errors import BuildError, InvalidOptionError
+from robomme_interference_data.video import iter_frames
+
+LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]
+
+
+def noise(seed: int, *shape: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (*shape, 3), dtype=np.uint8)
+
+
+def write(path: Path, images: NDArray[np.uint8], codec: Codec = LOSSLESS) -> NDArray[np.uint8]:
+    """Encode images, and return what the file decodes to."""
+    encoder = VideoEncoder(path, codec, 10, *images.shape[1:3])
+    for image in images:
+        encoder.add(image)
+    encoder.close()
+    return np.stack(list(iter_frames(path, 0, None, 10)))
+
+
+def test_names() -> None:
+    assert get_codec("av1-lossless") is LOSSLESS
+    assert {name: (codec.name, codec.exact) for name, codec in CODECS.items()} == {
+        "av1-lossless": ("av1-lossless", True),
+        "lerobot-default": ("lerobot-default", False),
+    }
+    with pytest.raises(InvalidOptionError, match="'av1-losless'.*\n.*'av1-lossless'"):
+        get_codec("av1-losless")
+
+
+# --- lossless ------------------------------------------------------------------------------------
+
+
+@given(
+    arrays(
+        np.uint8,
+        st.tuples(st.integers(1, 20), st.integers(1, 40), st.integers(1, 40), st.just(3)),
+        elements=st.sampled_from([0, 1, 127, 128, 254, 255]),
+    ),
+    st.integers(0, 1000),
+)
+@settings(max_examples=25)
+def test_any_size_and_value(images: NDArray[np.uint8], seed: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for given_images in (images, noise(seed, *images.shape[:3])):
+            assert np.array_equal(write(Path(folder) / "v.mp4", given_images), given_images)
+
+
+@pytest.mark.parametrize(("codec", "name"), [(LOSSLESS, "v.mp4"), (RECORDING, "v.mkv")])
+def test_all_colours_survive(tmp_path: Path, codec: Codec, name: str) -> None:
+    # Every value of each pair of channels, at three values of the other one.
+    first, second = np.mgrid[0:256, 0:256].astype(np.uint8)
+    images = np.stack(
+        [
+            np.stack(np.roll([first, second, np.full_like(first, other)], turn, axis=0), axis=-1)
+            for turn in range(3)
+            for other in (0, 100, 255)
+        ]
+    )
+    assert np.array_equal(write(tmp_path / name, images, codec), images)
+
+
+def test_file_layout(tmp_path: Path) -> None:
+    write(tmp_path / "video.mp4", noise(0, 40, 16, 24))
+    with av.open(str(tmp_path / "video.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("libdav1d", "gbrp")
+        assert (stream.height, stream.width, stream.average_rate) == (16, 24, 10)
+        packets = [packet for packet in container.demux(stream) if packet.pts is not None]
+    numbers = [round(float(packet.pts * packet.time_base) * 10) for packet in packets]
+    keys = [n for n, packet in zip(numbers, packets, strict=True) if packet.is_keyframe]
+    assert numbers == list(range(40))  # no reordering: a packet a frame, in order
+    assert keys == [0, 16, 32]
+    assert all(packet.pts == packet.dts for packet in packets)
+
+
+@pytest.mark.parametrize("codec", [LOSSLESS, LOSSY, RECORDING, CLIP], ids=lambda one: one.name)
+def test_the_same_frames_give_the_same_bytes_and_nothing_is_printed(
+    tmp_path: Path, codec: Codec, capfd: pytest.CaptureFixture[str]
+) -> None:
+    images = noise(2, 10, 64, 66)
+    one, two = tmp_path / "one.mp4", tmp_path / "two.mp4"
+    if codec is RECORDING:
+        one, two = tmp_path / "one.mkv", tmp_path / "two.mkv"
+    found = write(one, images, codec)
+    write(two, images, codec)
+    assert one.read_bytes() == two.read_bytes()
+    assert found.shape == images.shape
+    assert np.array_equal(found, images) == codec.exact
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_container_can_be_named(tmp_path: Path) -> None:
+    encoder = VideoEncoder(tmp_path / "clip.partial", CLIP, 10, 16, 16, container="mp4")
+    encoder.add(noise(0, 16, 16))
+    encoder.close()
+    assert b"ftyp" in (tmp_path / "clip.partial").read_bytes()[:16]
+
+
+# --- lossy, and what cannot be encoded -----------------------------------------------------------
+
+
+def test_lossy_keeps_number_and_size_of_frames(tmp_path: Path) -> None:
+    images = noise(3, 20, 65, 67)
+    assert write(tmp_path / "video.mp4", images, LOSSY).shape == images.shape
+
+
+@pytest.mark.parametrize(("height", "width"), [(63, 64), (64, 63)])
+def test_too_small_for_the_lossy_codec(tmp_path: Path, height: int, width: int) -> None:
+    with pytest.raises(BuildError, match=f"{width}×{height} pixels are too small") as raised:
+        VideoEncoder(tmp_path / "video.mp4", LOSSY, 10, height, width)
+    assert "--codec av1-lossless" in str(raised.value.hint)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("side", range(64, 100, 5))
+def test_the_lossy_encoder_does_not_crash_from_its_smallest_size_on(side: int) -> None:
+    # SVT-AV1 ends the process with SIGFPE or SIGSEGV on some small frames.
+    script = (
+        "import numpy as np, tempfile, pathlib\n"
+        "from robomme_interference_data.encode import CODECS, VideoEncoder\n"
+        "folder = pathlib.Path(tempfile.mkdtemp())\n"
+        f"for h, w in ((64, {side}), ({side}, 64), ({side}, 256)):\n"
+        "    encoder = VideoEncoder(folder / 'v.mp4', CODECS['lerobot-default'], 10, h, w)\n"
+        "    for i in range(10):\n"
+        "        encoder.add(np.full((h, w, 3), 20 * i, np.uint8))\n"
+        "    encoder.close()\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+def test_what_cannot_be_written(tmp_path: Path) -> None:
+    images = noise(0, 2, 8, 8)
+    with pytest.raises(BuildError, match=r"missing/video\.mp4: the video cannot be written"):
+        write(tmp_path / "missing" / "video.mp4", images)
+    codec = dataclasses.replace(LOSSLESS, vcodec="libmissing")
+    with pytest.raises(BuildError, match="the video cannot be written: libmissing"):
+        write(tmp_path / "video.mp4", images, codec)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk(tmp_path: Path) -> None:
+    (tmp_path / "video.mp4").symlink_to("/dev/full")
+    with pytest.raises(BuildError, match="No space left on device"):
+        write(tmp_path / "video.mp4", noise(0, 2, 8, 8))
