@@ -282,8 +282,10 @@ def _write(
     ordered = sorted(stored, key=lambda one: one.episode_id.sort_key)
     shapes = [one.features for one in ordered]
     # Actions are kept only where all episodes have them: buffers do not show them.
-    features = {name: shape for name, shape in shapes[0].items() if all(name in s for s in shapes)}
-    if any(features != {n: s for n, s in one.items() if n in features} for one in shapes):
+    kept = all(ACTION in one for one in shapes)
+    alike = [{n: s for n, s in one.items() if kept or n != ACTION} for one in shapes]
+    features = alike[0]
+    if any(one != features for one in alike):
         raise BuildError(f"{out} has episodes of other sizes than those to be added", _ADVICE)
     with progress.status("Loading lerobot"):
         load_lerobot()
@@ -294,7 +296,9 @@ def _write(
         progress.advance(1)
     records = [one.record(index, tuple(features)) for index, one in enumerate(ordered)]
     told: list[dict[str, Any]] = list(earlier.dataset.identity.sources) if earlier else []
-    told += [one.provenance for one in plan.sources if one.provenance not in told]
+    for source in plan.sources:
+        if source.provenance not in told:
+            told.append(source.provenance)
     with progress.status("Hashing"):
         complete_dataset(made, plan.kind, plan.version, records, plan.codec, told, skipped)
         os.sync()

@@ -40,6 +40,7 @@ class BuildConfig:
     """What to build of which recordings, and how."""
 
     source: tuple[str, ...] = setting(
+        whole=True,
         metavar="SOURCE…",
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
         "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; several, with spaces.",

@@ -62,6 +62,8 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
             if other != record.episode_index:
                 yield path, f"is shared by episodes {other} and {record.episode_index}"
         try:
+            for path, _ in place.videos.values():
+                dataset.files.path(path)
             yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal))
         except InterferenceError as error:
             yield place.data, error.message

@@ -91,8 +91,10 @@ def verify_split(
     for name, dataset in datasets.items():
         yield from _dataset(name, dataset, header, decode=decode, advance=advance)
         pool = datasets.get(DISTRACTORS)
-        if pool is not None:
-            yield from _indexes(name, dataset, pool.revision)
+        broken: list[Violation] = []
+        with _told(name, broken):
+            broken += [] if pool is None else _indexes(name, dataset, pool.revision)
+        yield from broken
     if not found:
         yield from _buffers(root, header)
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
@@ -128,12 +127,18 @@ class Dataset:
         Raises:
             UnknownNameError: The dataset does not hold it; offers the nearest id.
         """
-        column = self._column("episode_id")
-        found = pc.index(column, str(episode)).as_py()
-        if found < 0:
+        found = self._places.get(str(episode))
+        if found is None:
             where = f"the {self.kind} of {self.files.describe()}"
-            raise UnknownNameError.among("episode", str(episode), where, column.to_pylist())
-        return int(found)
+            raise UnknownNameError.among("episode", str(episode), where, self._places)
+        return found
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        if "episode_id" not in self.lerobot.table.column_names:
+            raise FormatError.damaged(self.files.describe(), "its episodes have no episode_id")
+        ids = self.lerobot.table["episode_id"].to_pylist()
+        return {str(text): index for index, text in enumerate(ids)}
 
     def index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:
         """Return the embeddings of the stored frames, opened once.
@@ -210,14 +215,10 @@ class Dataset:
             raise FormatError.damaged(path, f"not the SHA-256 that {IDENTITY_PATH} says")
         return parse_sums(path.read_text(encoding="utf-8", errors="replace"), path)
 
-    def _column(self, name: str):  # type: ignore[no-untyped-def]
-        if name not in self.lerobot.table.column_names:
-            raise FormatError.damaged(self.files.describe(), f"its episodes have no {name}")
-        return self.lerobot.table[name]
-
     def _camera(self, camera: str) -> str:
         name = camera_feature(camera)
         if name not in self.features:
             where = self.files.describe()
-            raise UnknownNameError.among("camera", camera, where, self.cameras)
+            plain = camera.removeprefix(CAMERA_PREFIX)
+            raise UnknownNameError.among("camera", plain, where, self.cameras)
         return name

@@ -51,7 +51,8 @@ def to_dict(record: Any) -> dict[str, Any]:
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
     """Return records as a table; parts that records share are converted once."""
     kept = list(records)  # alive, so that an id is one object's
-    write, shared = _record_writer(type(kept[0])) if kept else None, {}
+    write = _record_writer(type(kept[0])) if kept else None
+    shared: dict[int, Any] = {}
     rows = [write(record, shared) for record in kept] if write else []
     columns = {field.name: [row.get(field.name) for row in rows] for field in schema}
     return pa.table([_column(columns[field.name], field.type) for field in schema], schema=schema)
@@ -62,7 +63,9 @@ def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
     if not (pa.types.is_list(kind) and pa.types.is_struct(kind.value_type)):
         return pa.array(values, kind)
     place: dict[int, int] = {}
-    distinct, picks, offsets = [], [], [0]
+    distinct: list[Any] = []
+    picks: list[int] = []
+    offsets = [0]
     for listed in values:
         for one in listed:
             if id(one) not in place:
@@ -81,11 +84,11 @@ def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]
         FormatError: A column is missing or of another type, or a value is not what it should be;
             `path` is named.
     """
-    names = list(_names(record))
+    names = _names(record)
     missing = [name for name in names if name not in table.column_names]
     if missing:
         raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
-    return (from_dict(record, row, path) for row in table.select(names).to_pylist())
+    return (from_dict(record, row, path) for row in table.select(list(names)).to_pylist())
 
 
 def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = False) -> T:
@@ -106,7 +109,8 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
             known |= set(_PARTS) if "episode_id" in known else set()
             if unknown := sorted(map(str, value.keys() - known)):
                 raise ValueError(f"unknown {', '.join(unknown)}")
-        found: T = _reader(record)(value)
+        kind: Any = record
+        found: T = _reader(kind)(value)
         return found
     except InterferenceError as error:
         raise FormatError.damaged(path, error.message) from None
@@ -190,9 +194,8 @@ def _mapped(item: _Writer | None) -> _Writer:
     return lambda value, shared: {key: item and item(one, shared) for key, one in value.items()}
 
 
-@cache
 def _names(record: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(record))
+    return tuple(_hints(record))
 
 
 def _arrow_fields(record: type, keys: tuple[str, ...]) -> list[pa.Field]:
@@ -223,8 +226,12 @@ def _arrow_type(hint: Any, keys: tuple[str, ...]) -> pa.DataType:
 # --- from plain values -------------------------------------------------------------------------
 
 
-@cache
 def _hints(record: Any) -> dict[str, Any]:
+    return _cached_hints(record)
+
+
+@cache
+def _cached_hints(record: Any) -> dict[str, Any]:
     hints = get_type_hints(record)
     return {field.name: hints[field.name] for field in fields(record)}
 

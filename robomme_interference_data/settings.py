@@ -12,7 +12,7 @@ def evaluate(config: Config, as_json: AsJson = False) -> None: ...
 ```
 
 gives the command the options `--out` and `--workers`. A tuple is an option that takes several
-values, with spaces or commas between them; a truth value is a flag.
+values, with spaces or, unless they are whole, commas between them; a truth value is a flag.
 """
 
 import dataclasses
@@ -35,6 +35,7 @@ def setting(
     metavar: str | None = None,
     env: str | None = None,
     shown: str | None = None,
+    whole: bool = False,
 ) -> Any:
     """Declare a field that is also an option.
 
@@ -45,8 +46,16 @@ def setting(
         metavar: What its value is called.
         env: Environment variable that can give it.
         shown: What is shown as its default, where that says more than the value.
+        whole: Values may hold commas, which do not part them.
     """
-    told = {"help": help, "name": name, "metavar": metavar, "env": env, "shown": shown}
+    told = {
+        "help": help,
+        "name": name,
+        "metavar": metavar,
+        "env": env,
+        "shown": shown,
+        "whole": whole,
+    }
     return dataclasses.field(default=default, metadata={_SETTING: told})
 
 
@@ -54,12 +63,12 @@ def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
     """Give a command the options of the dataclass that one of its parameters is."""
     signature = inspect.signature(function, eval_str=True)
     parameters: list[inspect.Parameter] = []
-    configs: dict[str, tuple[type, list[str]]] = {}
+    configs: dict[str, tuple[type, dict[str, bool]]] = {}
     for parameter in signature.parameters.values():
         kind = parameter.annotation
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             options = _options(kind)
-            configs[parameter.name] = kind, [option.name for option in options]
+            configs[parameter.name] = kind, {one[0]: one[2]["whole"] for one in _declared(kind)}
             parameters += options
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
@@ -68,7 +77,7 @@ def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
     @wraps(function)
     def command(**given: Any) -> R:
         built = {
-            name: config(**{field: _value(given.pop(field)) for field in fields})
+            name: config(**{one: _value(given.pop(one), whole) for one, whole in fields.items()})
             for name, (config, fields) in configs.items()
         }
         return function(**built, **given)  # type: ignore[call-arg]
@@ -82,26 +91,21 @@ def spread_values(arguments: Sequence[str], several: Sequence[str]) -> list[str]
     """Repeat an option before each of its values: click's options take one value each.
 
     Args:
-        arguments: The command line, such as `--k 0 1,3`.
-        several: Options that take several values, such as `--k`.
+        arguments: The command line, such as `--families A B`.
+        several: Options that take several values, such as `--families`.
 
     Returns:
-        The command line as click reads it: `--k 0 --k 1 --k 3`.
+        The command line as click reads it: `--families A --families B`.
     """
     spread: list[str] = []
     option: str | None = None
     for argument in arguments:
-        name, equals, value = argument.partition("=")
+        name, equals, _ = argument.partition("=")
         if argument.startswith("--"):
             option = name if name in several else None
-            argument = value if option and equals else argument  # noqa: PLW2901
-            if option and not equals:
-                continue
-        if option is None:
-            spread.append(argument)
-        else:
-            for part in filter(None, argument.split(",")):
-                spread += [option, part]
+        elif option is not None and spread[-1] != option:
+            spread.append(option)
+        spread += argument.split("=", 1) if option == name and equals else [argument]
     return spread
 
 
@@ -166,5 +170,9 @@ def _default(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _value(given: Any) -> Any:
-    return tuple(given) if isinstance(given, list) else given
+def _value(given: Any, whole: bool) -> Any:
+    if not isinstance(given, list):
+        return given
+    if whole:
+        return tuple(given)
+    return tuple(part for text in given for part in text.split(",") if part)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
@@ -64,7 +63,7 @@ class Split:
 
     def __len__(self) -> int:
         """Return the number of buffers."""
-        return len(self._keys)
+        return len(self._keys["episode_id"])
 
     @property
     def name(self) -> str:
@@ -104,8 +103,7 @@ class Split:
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
         """Ids of all query episodes, in canonical order."""
-        texts = pc.unique(self._keys["episode_id"]).to_pylist()
-        return tuple(sorted(map(EpisodeId.parse, texts)))
+        return tuple(sorted(EpisodeId.parse(text or "") for text in {*self._keys["episode_id"]}))
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -146,15 +144,10 @@ class Split:
                 f"robomme-interference build manifests {self.root} --conditions "
                 f"{' '.join(self.conditions)} {wanted.name}",
             )
-        keys = self._keys
-        same = pc.and_(
-            pc.equal(keys["episode_id"], str(episode)), pc.equal(keys["condition"], wanted.name)
-        )
-        row = pc.index(same, True).as_py()
-        if row < 0:
+        row = self._places.get((str(episode), wanted.name))
+        if row is None:
             self._check_episode(episode)
-            path = self._rows.path
-            raise FormatError.damaged(path, f"no row of {episode} under {wanted}")
+            raise FormatError.damaged(self._rows.path, f"no row of {episode} under {wanted}")
         return next(self._read(self._rows.part(row, row + 1)))
 
     def manifests(
@@ -173,13 +166,11 @@ class Split:
         name = None if condition is None and k is None else _condition(condition, k).name
         keep = np.ones(len(self), bool)
         for column, value in (("family", family), ("condition", name), ("difficulty", difficulty)):
-            if value is None:
-                continue
-            same = pc.equal(self._keys[column], value).fill_null(False).to_numpy()
-            if not same.any():
-                known = pc.unique(self._keys[column]).drop_null().to_pylist()
-                raise UnknownNameError.among(column, value, self.root, known)
-            keep &= same
+            if value is not None:
+                if value not in self._keys[column]:
+                    known = {one for one in self._keys[column] if one is not None}
+                    raise UnknownNameError.among(column, value, self.root, known)
+                keep &= np.array([one == value for one in self._keys[column]])
         return self._selected(keep)
 
     def load(
@@ -234,9 +225,17 @@ class Split:
         return RowSpan(self._manifests.path(MANIFEST_ROWS))
 
     @cached_property
-    def _keys(self) -> pa.Table:
+    def _keys(self) -> dict[str, list[str | None]]:
         """The columns by which buffers are found; kept, as many may be asked for."""
-        return self._rows.table(["episode_id", "condition", "family", "difficulty"])
+        columns = ["episode_id", "condition", "family", "difficulty"]
+        keys: dict[str, list[str | None]] = self._rows.table(columns).to_pydict()
+        return keys
+
+    @cached_property
+    def _places(self) -> dict[tuple[str | None, str | None], int]:
+        """The row of each buffer by its key."""
+        keys = zip(self._keys["episode_id"], self._keys["condition"], strict=True)
+        return {key: row for row, key in enumerate(keys)}
 
 
 def load_split(

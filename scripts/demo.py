@@ -35,12 +35,9 @@ def main() -> None:
     queries, units = recorded_here() if (ROOT / SHARED).is_dir() else self_recorded()
     run("build demonstrations", *queries, "--split test", f"--out {SPLIT}/demonstrations")
     run("build distractors", *units, f"--out {SPLIT}/distractors")
-    run(
-        f"build manifests --demonstrations {SPLIT}/demonstrations",
-        f"--distractors {SPLIT}/distractors --out {SPLIT}/manifests --k 0 1 3 7 --seed 0",
-    )
+    run(f"build manifests {SPLIT} --conditions no-history k0 k1 k3 k7 --seed 0")
     load()
-    run(f"show VideoRepick/test/0 --split {SPLIT} --k 7 --out {DEMO}/strip.png")
+    run(f"show VideoRepick/test/0 k7 --split {SPLIT} --out {DEMO}/strip.png")
     run(f"audit {SPLIT}")
     run(f"verify {SPLIT}")
     retrieve(SPLIT, "VideoUnmask/test/0", DEMO / "retrieval.png")
@@ -52,9 +49,9 @@ def main() -> None:
 
 def retrieve(split: Path, episode: str, picture: Path) -> None:
     """Embed a split, draw why a session was chosen, and grade the choice on all buffers."""
-    run(f"index --data {split} --encoder thumbnail")
-    run(f"retrieve {episode} --k 7 --split {split} --out {picture}")
-    run(f"retrieval-score --split {split} --out {DEMO}/retrieval/{split.name}")
+    run(f"index {split} --encoder thumbnail")
+    run(f"retrieve {episode} k7 --split {split} --out {picture}")
+    run(f"retrieval-score {split} --out {DEMO}/retrieval/{split.name}")
 
 
 def simulate() -> None:
@@ -63,11 +60,8 @@ def simulate() -> None:
     played = "--source tabletop --split test --episodes 0"
     run(f"build demonstrations {played} --out {out}/demonstrations")
     run(f"build distractors --source tabletop --episodes 2 --out {out}/distractors")
-    run(
-        f"build manifests --demonstrations {out}/demonstrations --distractors {out}/distractors",
-        f"--out {out}/manifests",
-    )
-    run(f"show PatternLock/test/0 --split {out} --k 7 --out {DEMO}/tabletop.png")
+    run(f"build manifests {out}")
+    run(f"show PatternLock/test/0 k7 --split {out} --out {DEMO}/tabletop.png")
 
 
 def evaluate() -> None:
@@ -86,7 +80,7 @@ def evaluate() -> None:
 
 def recorded_here() -> tuple[list[str], list[str]]:
     """Prepare RoboMME's recordings; return the sources of demonstrations and of distractors."""
-    recordings, lessons, fillers = DEMO / "recordings", DEMO / "lessons", DEMO / "fillers"
+    recordings, lessons = DEMO / "recordings", DEMO / "lessons"
     if not (recordings / "done").exists():
         say("Unpacking RoboMME's own recordings (HDF5, five families)")
         unpack = [sys.executable, str(SHARED / "unpack_h5.py"), str(recordings)]
@@ -95,21 +89,15 @@ def recorded_here() -> tuple[list[str], list[str]]:
     if not (lessons / "frames.parquet").exists():
         say("Laying out the first test episode of each of the nine families (front camera)")
         lay_out_lessons(SHARED / "lessons", lessons)
-    if not (fillers / "frames.parquet").exists():
-        say(f"Recording made-up sessions of {len(FILLERS)} further families")
-        record(fillers, FILLERS)
     return (
         [f"--source frames:{lessons}"],
-        [f"--source robomme-h5:{recordings} --source frames:{fillers}", "--cameras front"],
+        [f"--source robomme-h5:{recordings} sample:{','.join(FILLERS)}", "--cameras front"],
     )
 
 
 def self_recorded() -> tuple[list[str], list[str]]:
-    """Record the sample; return the sources of demonstrations and of distractors."""
-    sample = DEMO / "sample"
-    if not (sample / "frames.parquet").exists():
-        run(f"build sample --out {sample}")
-    return [f"--source frames:{sample}"], [f"--source frames:{sample}"]
+    """Return the sources of demonstrations and of distractors where no recordings are."""
+    return ["--source sample"], ["--source sample"]
 
 
 def lay_out_lessons(lessons: Path, folder: Path) -> None:
@@ -138,20 +126,12 @@ def lay_out_lessons(lessons: Path, folder: Path) -> None:
     pq.write_table(pa.Table.from_pylist(rows), folder / "frames.parquet")
 
 
-def record(folder: Path, families: tuple[str, ...]) -> None:
-    """Record made-up sessions."""
-    from robomme_interference_data.build_dataset.sample import write_sample
-
-    for _ in write_sample(folder, families=families, train=2, test=0):
-        pass
-
-
 def load() -> None:
     """Load a buffer by its episode id, as a notebook would."""
     from robomme_interference_data import load_buffer
 
-    say('\n>>> buffer = load_buffer("VideoRepick/test/0", k=3, split="demo/split", verify=True)')
-    buffer = load_buffer("VideoRepick/test/0", k=3, split=SPLIT, verify=True)
+    say('\n>>> buffer = load_buffer("VideoRepick/test/0", "k3", split="demo/split", verify=True)')
+    buffer = load_buffer("VideoRepick/test/0", "k3", split=SPLIT, verify=True)
     say(f'>>> buffer\n{buffer}\n>>> buffer.goal\n"{buffer.goal}"')
     say(f'>>> buffer.frames("front").shape\n{buffer.frames("front").shape}')
     say(f">>> buffer.states.shape\n{buffer.states.shape}")

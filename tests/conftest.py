@@ -139,32 +139,20 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return bare_python
 
 
-@pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let builds encode in this process, not in workers."""
-    from recordings import run_here
+@pytest.fixture(scope="session")
+def tiny_split() -> Path:
+    """The golden split: not to be written to. See `support/splits.py`."""
+    from support.splits import GOLDEN
 
-    from robomme_interference_data.build_dataset import build as build_module
-
-    monkeypatch.setattr(build_module, "run_tasks", run_here)
+    return GOLDEN
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the simulator `rollout_doubles:World` find the sample split, in workers too."""
-    import factories
-    import rollout_doubles
+def own_split(tmp_path: Path) -> Path:
+    """A copy of the golden split, to be damaged."""
+    from support.splits import copy_split
 
-    monkeypatch.setenv(rollout_doubles.SPLIT, str(factories.split()))
-
-
-@pytest.fixture
-def troubled_world(world: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Let it find a folder `trouble` too, whose files make episodes break."""
-    import rollout_doubles
-
-    (tmp_path / "trouble").mkdir()
-    monkeypatch.setenv(rollout_doubles.TROUBLE, str(tmp_path / "trouble"))
+    return copy_split(tmp_path / "split")
 
 
 @pytest.fixture

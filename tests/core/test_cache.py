@@ -2,6 +2,7 @@
 
 import os
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -165,3 +166,28 @@ def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert default_cache_folder() == tmp_path / ".cache" / "robomme-interference" / "decoded"
+
+
+@pytest.mark.parametrize("place", ["file", "missing parent is a file"])
+def test_where_nothing_can_be_written_it_is_said_once(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("")
+    cache = DecodedCache(tmp_path / "file" if place == "file" else tmp_path / "file" / "cache")
+    with pytest.warns(RuntimeWarning, match="decoded frames are not kept"):
+        cache.put(name(1), frames(1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.put(name(2), frames(2))
+    assert cache.get(name(1), SHAPE) is None
+
+
+def test_a_cache_that_only_others_may_write_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = DecodedCache(tmp_path)
+    cache.put(name(1), frames(1))
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "utime", refuse)
+    np.testing.assert_array_equal(cache.get(name(1), SHAPE), frames(1))

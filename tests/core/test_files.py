@@ -15,7 +15,9 @@ from robomme_interference_data.files import (
     LocalFiles,
     atomic_path,
     canonical_json,
-    check_names,
+    format_sums,
+    hold,
+    parse_sums,
     read_json,
     sha256_file,
     write_json,
@@ -85,7 +87,7 @@ def test_written_json_is_read_back(tmp_path: Path) -> None:
 def test_not_json(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "info.json"
     path.write_bytes(data)
-    with pytest.raises(FormatError, match=r"info\.json is not JSON") as caught:
+    with pytest.raises(FormatError, match=r"info\.json: not JSON") as caught:
         read_json(path)
     assert caught.value.hint
 
@@ -94,14 +96,74 @@ def test_not_json(tmp_path: Path, data: bytes) -> None:
 def test_json_but_no_object(tmp_path: Path, data: str) -> None:
     path = tmp_path / "info.json"
     path.write_text(data)
-    with pytest.raises(FormatError, match=r"info\.json holds no JSON object"):
+    with pytest.raises(FormatError, match=r"info\.json: no JSON object"):
         read_json(path)
 
 
-def test_check_names(tmp_path: Path) -> None:
-    check_names(tmp_path / "x", ["a", "b", "c"], ["a", "c"])
-    with pytest.raises(FormatError, match=r"x lacks c, d\n"):
-        check_names(tmp_path / "x", ["a", "b"], ["a", "c", "d"])
+@pytest.mark.parametrize(
+    "relative", ["../x", "a/../../x", "/etc/passwd", "..", "a/..", "meta/\0x", "videos/../../x"]
+)
+def test_a_path_never_leads_out(tmp_path: Path, relative: str) -> None:
+    (tmp_path / "x").write_text("secret")
+    (tmp_path / "data").mkdir()
+    with pytest.raises(FormatError, match="leads out of it"):
+        LocalFiles(tmp_path / "data").path(relative)
+
+
+def test_links_are_followed_inside_only(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("secret")
+    root = tmp_path / "data"
+    (root / "meta").mkdir(parents=True)
+    (root / "real").write_text("here")
+    (root / "meta" / "inside").symlink_to(root / "real")
+    (root / "meta" / "out").symlink_to(tmp_path / "secret")
+    (root / "folder").symlink_to(tmp_path)
+    assert LocalFiles(root).path("meta/inside").read_text() == "here"
+    for relative in ("meta/out", "folder/secret"):
+        with pytest.raises(FormatError, match="link that leads out"):
+            LocalFiles(root).path(relative)
+    (tmp_path / "link").symlink_to(root)  # the folder itself may be one
+    assert LocalFiles(tmp_path / "link").path("real").read_text() == "here"
+
+
+def test_snapshots_of_the_hubs_cache_link_to_its_blobs(tmp_path: Path) -> None:
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "blobs" / "abc").write_text("data")
+    (tmp_path / "refs").mkdir()
+    (tmp_path / "refs" / "main").write_text("no data")
+    root = tmp_path / "snapshots" / "0123"
+    root.mkdir(parents=True)
+    (root / "info.json").symlink_to("../../blobs/abc")
+    (root / "other").symlink_to("../../refs/main")
+    assert LocalFiles(root).path("info.json").read_text() == "data"
+    with pytest.raises(FormatError, match="link that leads out"):
+        LocalFiles(root).path("other")
+
+
+def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
+    (tmp_path / "b").write_bytes(b"")
+    (tmp_path / "a").write_bytes(b"abc")
+    text = format_sums(tmp_path, ["b", "a"])
+    assert text == (
+        "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad  a\n"
+        "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855  b\n"
+    )
+    assert list(parse_sums(text, "here")) == ["a", "b"]
+    for damaged in ("abc  a\n", "no sums\n", text.replace("  a", " a")):
+        with pytest.raises(FormatError, match="no line of SHA-256"):
+            parse_sums(damaged, "here")
+
+
+def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
+    busy = FormatError("busy")
+    with (
+        hold(tmp_path / "lock", busy),
+        pytest.raises(FormatError, match="busy"),
+        hold(tmp_path / "lock", busy),
+    ):
+        pass
+    with hold(tmp_path / "lock", busy):  # free again
+        pass
 
 
 def test_atomic_path_replaces(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 `golden/draws_rule_1.json` holds draws of rule version 1. They must never change: splits that were
 published with them could no longer be verified. Another rule needs another version, and another
-file, which `UPDATE_GOLDEN=1 pytest tests/test_draw.py` writes.
+file, which `UPDATE_GOLDEN=1 pytest tests/core/test_draw.py` writes.
 """
 
 import json
@@ -24,7 +24,7 @@ from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
 from robomme_interference_data.ids import EpisodeId
 
-GOLDEN = Path(__file__).parent / "golden" / f"draws_rule_{RULE_VERSION}.json"
+GOLDEN = Path(__file__).parents[1] / "golden" / f"draws_rule_{RULE_VERSION}.json"
 
 NOMINAL = dict.fromkeys(FAMILIES, 100)
 UNEVEN = dict(zip(FAMILIES, (100, 50, 10, 100, 30, 100, 5, 70, 100), strict=True))

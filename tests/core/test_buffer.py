@@ -1,0 +1,271 @@
+"""Buffers: the very frames of their sessions in order, however they are asked for."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.splits import (
+    CONDITIONS,
+    GOLDEN,
+    LESSON,
+    QUERIES,
+    expected_frames,
+    expected_states,
+    stored_frames,
+    stored_states,
+    with_sessions,
+)
+
+from robomme_interference_data import Buffer, DecodedCache, SessionEntry, load_split
+from robomme_interference_data.errors import (
+    HashMismatchError,
+    InvalidOptionError,
+    UnknownNameError,
+)
+
+SPLIT = load_split(GOLDEN)
+CAMERAS = ("front", "wrist")
+
+
+def buffer(condition: str = "k3", episode: str = QUERIES[1], **options: object) -> Buffer:
+    return load_split(GOLDEN, **options).load(episode, condition)  # type: ignore[arg-type]
+
+
+def of_sessions(*entries: SessionEntry) -> Buffer:
+    """A buffer that no condition has yet: any sessions in any order."""
+    made = buffer()
+    return Buffer(with_sessions(made.manifest, *entries), made.query, SPLIT.datasets)
+
+
+def unusual() -> Buffer:
+    """A unit, half of the lesson, a held frame, and the other half."""
+    lesson, *units = buffer().manifest.sessions
+    return of_sessions(
+        units[0],
+        replace(lesson, stop=20, sha256="-"),
+        replace(lesson, role="filler", start=19, stop=20, repeat=5, sha256="-"),
+        replace(units[1], repeat=3),
+        replace(lesson, start=20, sha256="-"),
+    )
+
+
+@pytest.mark.parametrize("episode", QUERIES)
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_lesson_first_then_the_units(condition: str, episode: str) -> None:
+    made = buffer(condition, episode)
+    k = int(condition[1:]) if condition != "no-history" else 0
+    lesson = [] if condition == "no-history" else [("lesson", 0, LESSON)]
+    frames = len(lesson) * LESSON + 32 * k
+    assert (str(made.episode_id), made.condition, made.k) == (episode, condition, k)
+    assert len(made) == made.exec_start_idx == frames
+    assert made.cameras == CAMERAS
+    starts = [LESSON + 32 * number for number in range(k)]
+    assert [(one.role, one.start, one.stop) for one in made.sessions] == [
+        *lesson,
+        *(("distractor", start, start + 32) for start in starts),
+    ]
+    families = [session.family for session in made.sessions]
+    assert len(set(families)) == len(families)  # eight other families: none twice
+    for session in made.sessions[1:]:
+        assert session.source.split == "train"
+    for camera in CAMERAS:
+        expected = expected_frames(made.manifest.sessions, camera)
+        np.testing.assert_array_equal(made.frames(camera), expected)
+    np.testing.assert_array_equal(made.states, expected_states(made.manifest.sessions))
+    made.verify()
+
+
+def test_repr() -> None:
+    assert repr(buffer()) == (
+        "Buffer(MoveCube/test/0, k3, frames=144, sessions=4, cameras=['front', 'wrist'])"
+    )
+
+
+@given(
+    st.sampled_from(["no-history", "k0", "k3", "unusual"]),
+    st.integers(1, 150),
+    st.sampled_from([CAMERAS, ("wrist",), ()]),
+    st.data(),
+)
+@settings(max_examples=20)
+def test_chunks_of_any_span_and_size(
+    condition: str, size: int, cameras: tuple[str, ...], data: st.DataObject
+) -> None:
+    made = unusual() if condition == "unusual" else buffer(condition)
+    start = data.draw(st.integers(0, len(made)))
+    stop = data.draw(st.integers(start, len(made)))
+    chunks = list(made.stream(size, cameras, start, stop))
+    assert [chunk.start for chunk in chunks] == list(range(start, stop, size))
+    entries = made.manifest.sessions
+    for camera in cameras:
+        whole = expected_frames(entries, camera)
+        joined = np.concatenate([whole[:0], *(chunk.frames[camera] for chunk in chunks)])
+        np.testing.assert_array_equal(joined, whole[start:stop])
+    assert all(chunk.frames.keys() == set(cameras) for chunk in chunks)
+    states = np.concatenate([made.states[:0], *(chunk.states for chunk in chunks)])
+    np.testing.assert_array_equal(states, expected_states(entries)[start:stop])
+    index = np.concatenate([made.session_index[:0], *(chunk.session_index for chunk in chunks)])
+    np.testing.assert_array_equal(index, made.session_index[start:stop])
+
+
+def test_sessions_of_any_kind() -> None:
+    made = unusual()
+    assert [(one.role, len(one)) for one in made.sessions] == [
+        ("distractor", 32),
+        ("lesson", 20),
+        ("filler", 5),
+        ("distractor", 96),
+        ("lesson", 28),
+    ]
+    whole = expected_frames(made.manifest.sessions, "front")
+    np.testing.assert_array_equal(made.frames("front"), whole)
+    for index in (0, 31, 32, 52, 56, 57, 58, 60, 152, 153, 180):
+        np.testing.assert_array_equal(made.frame(index), whole[index])
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_threads_do_not_matter(threads: int) -> None:
+    made = buffer("k7", threads=threads)
+    expected = expected_frames(made.manifest.sessions, "wrist")
+    np.testing.assert_array_equal(made.frames("wrist"), expected)
+
+
+def test_arrays_are_the_callers() -> None:
+    made = buffer()
+    first = made.frames()
+    first[:] = 0
+    assert made.frames().any()
+    for chunk in made.stream(50):
+        chunk.states[...] = 0
+        chunk.session_index[...] = 0
+    np.testing.assert_array_equal(made.states, expected_states(made.manifest.sessions))
+    with pytest.raises(ValueError, match="read-only"):
+        made.states[0] = 1
+    assert made.session_index[-1] == 3
+    made.verify()
+
+
+def test_stream_may_be_left_early() -> None:
+    stream = buffer().stream(10)
+    next(stream)
+    stream.close()
+
+
+@pytest.mark.parametrize("span", [(-1, 3), (4, 3), (0, 100_000), (145, 145)])
+def test_spans_are_inside(span: tuple[int, int]) -> None:
+    with pytest.raises(UnknownNameError, match="has 144 history frames"):
+        next(buffer().stream(8, None, *span))
+
+
+@pytest.mark.parametrize("index", [-1, 144])
+def test_single_frames_are_inside(index: int) -> None:
+    with pytest.raises(UnknownNameError, match="are not in the buffer of MoveCube/test/0 under k3"):
+        buffer().frame(index)
+
+
+@pytest.mark.parametrize("chunk", [0, -1])
+def test_chunk_must_be_positive(chunk: int) -> None:
+    with pytest.raises(InvalidOptionError, match=f"chunk {chunk}; expected 1 or more"):
+        next(buffer().stream(chunk))
+
+
+def test_the_query_needs_no_buffer() -> None:
+    query = SPLIT.query("PatternLock/test/0")
+    assert str(query.episode_id) == "PatternLock/test/0"
+    assert query.goal == "watch the video carefully, then do the PatternLock task again"
+    assert (query.difficulty, query.simulator, query.lesson_frames) == ("easy", "sample", LESSON)
+    for camera in CAMERAS:
+        frames = stored_frames("demonstrations", query.episode_id, camera)
+        np.testing.assert_array_equal(query.frame(camera), frames[LESSON])
+    states = stored_states("demonstrations", query.episode_id)
+    np.testing.assert_array_equal(query.state(), states[LESSON])
+    made = SPLIT.load("PatternLock/test/0", "no-history")
+    assert made.query.record == query.record
+    assert made.manifest.query == query.place
+    assert query.seed == made.manifest.seed
+    # It is never part of the buffer.
+    assert all(
+        entry.stop <= query.lesson_frames
+        for entry in buffer("k7", "PatternLock/test/0").manifest.sessions
+        if entry.source == query.episode_id
+    )
+
+
+@pytest.mark.parametrize("camera", ["front", "observation.images.front"])
+def test_cameras_by_short_or_full_name(camera: str) -> None:
+    made = buffer("k0")
+    np.testing.assert_array_equal(made.frames(camera), made.frames("front"))
+
+
+@pytest.mark.parametrize(
+    ("camera", "hint"),
+    [
+        ("frnt", "Did you mean 'front'?"),
+        ("observation.images.wrst", "Did you mean 'wrist'?"),
+        ("top", "Known: front, wrist"),
+    ],
+)
+def test_unknown_camera(camera: str, hint: str) -> None:
+    made = buffer()
+    uses: list[Callable[[], object]] = [
+        lambda: made.frames(camera),
+        lambda: made.query.frame(camera),
+        lambda: made.frame(0, camera),
+        lambda: next(made.stream(8, (camera,))),
+    ]
+    for use in uses:
+        with pytest.raises(UnknownNameError, match=r"camera '\w+' is not in") as caught:
+            use()
+        assert caught.value.hint == hint
+
+
+def test_verify_names_what_differs() -> None:
+    made = buffer("k1")
+    lesson, unit = made.manifest.sessions
+    other = of_sessions(lesson, replace(unit, sha256="0" * 64))
+    with pytest.raises(HashMismatchError, match=f"distractor {unit.source} .*the manifest itself"):
+        other.verify()
+
+
+# --- with a cache ------------------------------------------------------------------------------
+
+
+def test_cached_frames_are_those_that_are_decoded(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path / "cache")
+    for _ in range(2):
+        made = buffer("k3", cache=cache)
+        expected = expected_frames(made.manifest.sessions, "front")
+        np.testing.assert_array_equal(made.frames("front"), expected)
+        chunks = [chunk.frames["front"] for chunk in made.stream(7, ("front",), 40, 100)]
+        np.testing.assert_array_equal(np.concatenate(chunks), expected[40:100])
+    assert len(list(cache.folder.iterdir())) == 4  # lesson and three units of the front camera
+
+
+def test_what_is_cached_is_not_decoded(tmp_path: Path, own_split: Path) -> None:
+    made = load_split(own_split, cache=tmp_path / "cache").load(QUERIES[1], "k1")
+    before = made.frames("front")
+    for video in own_split.glob("*/videos/observation.images.front/*/*.mp4"):
+        video.unlink()
+    again = load_split(own_split, cache=tmp_path / "cache").load(QUERIES[1], "k1")
+    np.testing.assert_array_equal(again.frames("front"), before)
+    held = replace(again.manifest.sessions[1], repeat=2)
+    held_buffer = Buffer(
+        with_sessions(again.manifest, held),
+        again.query,
+        load_split(own_split).datasets,
+        cache=DecodedCache(tmp_path / "cache"),
+    )
+    np.testing.assert_array_equal(held_buffer.frames("front"), np.repeat(before[LESSON:], 2, 0))
+
+
+def test_a_full_disk_does_not_stop_loading(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    made = buffer("k1", cache=DecodedCache(tmp_path / "file"))
+    with pytest.warns(RuntimeWarning, match="not kept"):
+        frames = made.frames()
+    np.testing.assert_array_equal(frames, expected_frames(made.manifest.sessions, "front"))
+    assert sum(len(chunk) for chunk in made.stream()) == len(made)

@@ -1,0 +1,85 @@
+"""Episode ids and lists of numbers: parse and format are inverses, and slips are told."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data import EpisodeId
+from robomme_interference_data.constants import FAMILIES, SPLITS
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
+from robomme_interference_data.ids import format_numbers, parse_numbers
+
+IDS = st.builds(
+    EpisodeId,
+    st.sampled_from(FAMILIES) | st.from_regex(r"[A-Za-z][A-Za-z0-9_.-]{0,8}", fullmatch=True),
+    st.sampled_from(SPLITS),
+    st.integers(0, 10**18 - 1),
+)
+
+
+@given(IDS)
+def test_round_trip(episode: EpisodeId) -> None:
+    assert EpisodeId.parse(str(episode)) == episode
+    assert EpisodeId.parse(episode) is episode
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "MoveCube", "MoveCube/test", "MoveCube/test/1/2", "MoveCube/test/01", "/test/1"),
+        *("MoveCube/test/-1", "MoveCube/test/1.0", "MoveCube/test/", "MoveCube/tset/1"),
+        *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣"),
+        *("MoveCube/test/1234567890123456789", "../test/1"),
+    ],
+)
+def test_what_is_no_id(text: str) -> None:
+    with pytest.raises(InvalidIdError):
+        EpisodeId.parse(text)
+
+
+@pytest.mark.parametrize("given", [None, 7, True, b"MoveCube/test/1", ("MoveCube", "test", 1)])
+def test_other_types_are_refused(given: object) -> None:
+    with pytest.raises(InvalidIdError, match="is not an episode id"):
+        EpisodeId.parse(given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("index", [-1, 10**18, True, "3", 1.0, None])
+def test_indices_are_numbers(index: object) -> None:
+    with pytest.raises(InvalidIdError, match="is not an episode index"):
+        EpisodeId("MoveCube", "test", index)  # type: ignore[arg-type]
+
+
+def test_a_slip_in_the_split_is_offered() -> None:
+    with pytest.raises(InvalidIdError) as caught:
+        EpisodeId.parse("MoveCube/tset/1")
+    assert caught.value.hint == "Did you mean 'test'?"
+
+
+def test_canonical_order() -> None:
+    texts = [
+        *("VideoRepick/train/0", "VideoRepick/test/2", "VideoRepick/test/10"),
+        *("RouteStick/train/0", "AFamily/val/0", "Other/train/1"),
+    ]
+    ids = [EpisodeId.parse(text) for text in texts]
+    assert sorted(reversed(ids)) == ids
+
+
+@given(st.sets(st.integers(0, 300)))
+def test_numbers_round_trip(numbers: set[int]) -> None:
+    ordered = tuple(sorted(numbers))
+    if ordered:
+        assert parse_numbers(format_numbers(ordered)) == ordered
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [("0-3", (0, 1, 2, 3)), ("0,3,10-12", (0, 3, 10, 11, 12)), (" 5 , 5-6", (5, 6)), ("7", (7,))],
+)
+def test_numbers(text: str, numbers: tuple[int, ...]) -> None:
+    assert parse_numbers(text) == numbers
+
+
+@pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1,,2", "1 2", "1.5", "1-2-3"])
+def test_what_is_no_list_of_numbers(text: str) -> None:
+    with pytest.raises(InvalidOptionError, match="not a list of episode numbers"):
+        parse_numbers(text)

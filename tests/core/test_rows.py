@@ -1,0 +1,175 @@
+"""Records to Arrow and JSON and back: from one declaration, checked when read."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data import EpisodeId
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.rows import (
+    arrow_schema,
+    from_dict,
+    from_table,
+    read_header,
+    to_dict,
+    to_table,
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    name: str
+    source: EpisodeId
+    size: int
+
+
+@dataclass(frozen=True)
+class Row:
+    episode_id: EpisodeId
+    count: int
+    share: float
+    fine: bool
+    note: str | None
+    digests: dict[str, str]
+    goals: tuple[str, ...]
+    parts: tuple[Part, ...]
+    best: Part | None
+
+
+PART = Part("a", EpisodeId("MoveCube", "train", 1), 3)
+QUERY = EpisodeId("InsertPeg", "test", 4)
+ROW = Row(QUERY, 7, 0.5, True, None, {"x": "1", "y": "2"}, ("g",), (PART,), PART)
+PLAIN = {
+    "episode_id": "InsertPeg/test/4",
+    "family": "InsertPeg",
+    "split": "test",
+    "index": 4,
+    "count": 7,
+    "share": 0.5,
+    "fine": True,
+    "note": None,
+    "digests": {"x": "1", "y": "2"},
+    "goals": ["g"],
+    "parts": [{"name": "a", "source": "MoveCube/train/1", "size": 3}],
+    "best": {"name": "a", "source": "MoveCube/train/1", "size": 3},
+}
+
+ids = st.builds(EpisodeId, st.sampled_from(["MoveCube", "X"]), st.just("test"), st.integers(0, 99))
+parts = st.builds(Part, st.text(max_size=5), ids, st.integers(-(2**63), 2**63 - 1))
+rows = st.builds(
+    Row,
+    ids,
+    st.integers(-9, 9),
+    st.floats(allow_nan=False),
+    st.booleans(),
+    st.none() | st.text(max_size=5),
+    st.fixed_dictionaries({"x": st.text(max_size=3), "y": st.text(max_size=3)}),
+    st.lists(st.text(max_size=5), max_size=3).map(tuple),
+    st.lists(parts, max_size=3).map(tuple),
+    st.none() | parts,
+)
+
+
+def test_plain_values() -> None:
+    assert to_dict(ROW) == PLAIN
+    assert from_dict(Row, PLAIN, "here") == ROW
+
+
+def test_schema() -> None:
+    part = pa.struct(
+        [
+            pa.field("name", pa.string(), nullable=False),
+            pa.field("source", pa.string(), nullable=False),
+            pa.field("size", pa.int64(), nullable=False),
+        ]
+    )
+    digests = pa.struct([pa.field(key, pa.string(), nullable=False) for key in ("x", "y")])
+    assert arrow_schema(Row, ["x", "y"]) == pa.schema(
+        [
+            pa.field("episode_id", pa.string(), nullable=False),
+            pa.field("family", pa.string(), nullable=False),
+            pa.field("split", pa.string(), nullable=False),
+            pa.field("index", pa.int64(), nullable=False),
+            pa.field("count", pa.int64(), nullable=False),
+            pa.field("share", pa.float64(), nullable=False),
+            pa.field("fine", pa.bool_(), nullable=False),
+            pa.field("note", pa.string()),
+            pa.field("digests", digests, nullable=False),
+            pa.field("goals", pa.list_(pa.field("item", pa.string(), False)), nullable=False),
+            pa.field("parts", pa.list_(pa.field("item", part, False)), nullable=False),
+            pa.field("best", part),
+        ]
+    )
+
+
+@given(st.lists(rows, max_size=4))
+def test_round_trips(found: list[Row]) -> None:
+    table = to_table(found, arrow_schema(Row, ["x", "y"]))
+    assert table.to_pylist() == [to_dict(row) for row in found]
+    assert list(from_table(Row, table, "here")) == found
+    assert [from_dict(Row, to_dict(row), "here", strict=True) for row in found] == found
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"count": True}, "count: True; expected a whole number"),
+        ({"count": "7"}, "count: '7'"),
+        ({"count": None}, "count: None"),
+        ({"share": "0.5"}, "share: '0.5'; expected a number"),
+        ({"fine": 1}, "fine: 1; expected true or false"),
+        ({"note": 3}, "note: 3; expected text"),
+        ({"episode_id": "MoveCube"}, "'MoveCube' is not an episode id"),
+        ({"goals": "g"}, "goals: 'g'; expected a list"),
+        ({"goals": [None]}, "goals: None; expected text"),
+        ({"digests": []}, "digests: .*; expected a map"),
+        ({"parts": [{"name": "a", "size": 3}]}, "parts: source is missing"),
+        ({"best": []}, "best: .*; expected a map"),
+    ],
+)
+def test_wrong_values_are_told(change: dict[str, Any], told: str) -> None:
+    with pytest.raises(FormatError, match=told):
+        from_dict(Row, {**PLAIN, **change}, "here")
+
+
+def test_missing_and_unknown_names() -> None:
+    short = {name: value for name, value in PLAIN.items() if name not in ("note", "goals")}
+    with pytest.raises(FormatError, match="here: goals is missing"):
+        from_dict(Row, short, "here")
+    assert from_dict(Row, {**short, "goals": ["g"]}, "here") == ROW  # None may be left out
+    assert from_dict(Row, {**PLAIN, "more": 1}, "here") == ROW
+    with pytest.raises(FormatError, match="unknown more"):
+        from_dict(Row, {**PLAIN, "more": 1}, "here", strict=True)
+    table = to_table([ROW], arrow_schema(Row, ["x", "y"])).drop_columns(["share"])
+    with pytest.raises(FormatError, match="column share is missing"):
+        list(from_table(Row, table, "here"))
+
+
+@dataclass(frozen=True)
+class Header:
+    format_version: int
+    name: str
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('{"format_version": 2, "name": "a"}', "has format version 2; this package reads 1"),
+        ('{"name": "a"}', "has format version None"),
+        ('{"format_version": 1}', "name is missing"),
+        ('{"format_version": 1, "name": "a", "nmae": 1}', "unknown nmae"),
+        ("[]", "no JSON object"),
+        ("{", "not JSON"),
+        ("[" * 100_000, "not JSON"),
+    ],
+)
+def test_headers(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "header.json"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=told):
+        read_header(path, Header)

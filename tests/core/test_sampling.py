@@ -1,0 +1,106 @@
+"""Samples of a history, and how much of them is lesson, wherever the lesson stands."""
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robomme_interference_data import EpisodeId, Session, SessionEntry
+from robomme_interference_data.sampling import even_sample, lesson_frames, lesson_share, spread
+
+NAME = EpisodeId("MoveCube", "test", 0)
+ENTRY = SessionEntry("lesson", "MoveCube", NAME, "demonstrations", "r", 0, 0, 1, 1, "s")
+
+
+def sessions(*lengths: int) -> list[Session]:
+    """Sessions of so many frames; a negative length is one of another role."""
+    found, start = [], 0
+    for length in lengths:
+        role = "lesson" if length > 0 else "distractor"
+        found.append(Session(role, "MoveCube", NAME, start, start + abs(length), ENTRY))
+        start += abs(length)
+    return found
+
+
+def share(lesson: int, history: int) -> float:
+    """The share of a lesson that comes first."""
+    lengths = [length for length in (lesson, lesson - history) if length]
+    return lesson_share(sessions(*lengths), 0, history)
+
+
+def test_even_sample_is_numpys_linspace() -> None:
+    for history in range(400):
+        frames = history + 1
+        expected = (
+            np.arange(frames) if frames < 32 else np.linspace(0, history, 32).astype(np.int64)
+        )
+        assert even_sample(history) == expected.tolist()
+
+
+@pytest.mark.parametrize(
+    ("lesson", "history", "expected"),
+    [
+        (25, 25, 25 / 26),  # 26 frames, all taken; the last is the live observation
+        (30, 30, 30 / 31),
+        (31, 31, 31 / 32),
+        (66, 66, 31 / 32),  # 67 frames, 32 taken: all but the live observation are lesson
+        (1077, 1077, 31 / 32),
+        (10, 20, 10 / 21),
+        (0, 0, 0.0),  # the live observation alone
+        (0, 32, 0.0),
+        (66, 98, 21 / 32),  # ⌊j·98/31⌋ < 66 for j ≤ 20: 63.2 → 63, and 66.4 → 66
+        (25, 249, 4 / 32),  # ⌊j·249/31⌋ < 25 for j ≤ 3: 24.1 → 24, and 32.1 → 32
+        (750, 974, 24 / 32),  # ⌊j·974/31⌋ < 750 for j ≤ 23: 722.6 → 722, and 754.1 → 754
+    ],
+)
+def test_lesson_share_by_hand(lesson: int, history: int, expected: float) -> None:
+    assert share(lesson, history) == expected
+
+
+def test_a_lesson_that_comes_last_in_parts_or_not_at_all() -> None:
+    # 98 frames: of the sample's 31 history frames 10 are before frame 32: ⌊j·98/31⌋ ≤ 31 for j ≤ 10
+    assert even_sample(98)[10:12] == [31, 34]
+    assert lesson_share(sessions(-32, 66), 0, 98) == (31 - 11) / 32
+    assert lesson_share(sessions(33, -32, 33), 0, 98) == (11 + (31 - 21)) / 32
+    assert lesson_share(sessions(-98), 0, 98) == 0
+    assert lesson_share([], 0, 0) == 0
+
+
+@given(
+    st.lists(st.integers(-60, 60).filter(bool), max_size=6), st.data(), st.sampled_from([2, 5, 32])
+)
+def test_lesson_share_is_what_counting_gives(
+    lengths: list[int], data: st.DataObject, samples: int
+) -> None:
+    made = sessions(*lengths)
+    total = sum(map(abs, lengths))
+    start = data.draw(st.integers(0, total))
+    stop = data.draw(st.integers(start, total))
+    lesson = [i for one in made if one.role == "lesson" for i in range(one.start, one.stop)]
+    sample = even_sample(stop - start, samples)
+    expected = sum(start + index in lesson for index in sample[:-1]) / len(sample)
+    assert lesson_share(made, start, stop, samples) == pytest.approx(expected, abs=1e-12)
+    assert lesson_frames(made, start, stop) == sum(start <= i < stop for i in lesson)
+
+
+@given(st.integers(0, 50), st.integers(1, 400), st.integers(1, 70))
+def test_spread(start: int, frames: int, count: int) -> None:
+    found = spread(start, start + frames, count)
+    assert len(found) == min(count, frames)
+    assert found == sorted(set(found))
+    assert found[0] == start
+    assert count == 1 or found[-1] == start + frames - 1
+
+
+def test_lesson_share_of_the_released_rollouts(shared_data: Path) -> None:
+    """At k0 all released samples are lesson but for the live observation."""
+    with (shared_data / "results" / "retrieval_rollouts.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["condition"] == "k0"]
+    shares = Counter(float(row["retrieval_selected_lesson_fraction"]) for row in rows)
+    # One PatternLock lesson has 25 frames, all others 31 or more.
+    assert shares == {share(25, 25): 1, share(1077, 1077): 449}
+    assert share(1077, 1077) == 0.96875

@@ -1,0 +1,108 @@
+"""Settings declared once: as a dataclass, and as the options of a command."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from robomme_interference_data.console import AsJson
+from robomme_interference_data.settings import (
+    option_names,
+    setting,
+    spread_values,
+    with_settings,
+)
+
+SEVERAL = ("--families", "--source")
+
+
+@dataclass(frozen=True)
+class Config:
+    split: Path = setting(help="The split.", name="-")
+    out: Path = setting(help="The folder.")
+    families: tuple[str, ...] = setting(("all",), help="Families.")
+    source: tuple[str, ...] = setting((), help="Sources.", whole=True)
+    episode_split: str = setting("test", help="Split.")
+    k: int | None = setting(None, help="Number.", env="OF_THE_TEST_K")
+    videos: bool = setting(False, help="Clips.", name="--videos")
+
+    def __post_init__(self) -> None:
+        seen.append(self)
+
+
+seen: list[Any] = []
+app = typer.Typer()
+
+
+@app.command()
+@with_settings
+def command(config: Config, as_json: AsJson = False) -> None:
+    """Do it."""
+    seen.append(as_json)
+
+
+def called(*arguments: str) -> list[Any]:
+    seen.clear()
+    result = CliRunner().invoke(app, spread_values(arguments, SEVERAL), prog_name="it")
+    assert result.exit_code == 0, result.output
+    return list(seen)
+
+
+def test_defaults_are_those_of_the_dataclass() -> None:
+    assert called("S", "--out", "o") == [Config(Path("S"), Path("o")), False]
+
+
+@pytest.mark.parametrize("families", [["A", "B", "C"], ["A,B", "C"], ["A,B,C"], ["A,,B,", "C"]])
+def test_several_values_with_spaces_or_commas(families: list[str]) -> None:
+    config, _ = called("S", "--families", *families, "--out", "o")
+    assert config.families == ("A", "B", "C")
+
+
+def test_whole_values_keep_their_commas() -> None:
+    config, _ = called("S", "--out", "o", "--source", "x:a,b", "y")
+    assert config.source == ("x:a,b", "y")
+
+
+def test_all_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OF_THE_TEST_K", "7")
+    config, as_json = called("S", "--videos", "--episode-split=val", "--out=o", "--json")
+    assert config == Config(Path("S"), Path("o"), k=7, episode_split="val", videos=True)
+    assert as_json
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["S"], "--out"),
+        (["S", "--out", "o", "--famlies", "A"], "--families"),
+        (["S", "--out", "o", "--k", "x"], "--k"),
+    ],
+)
+def test_slips_are_told(arguments: list[str], told: str) -> None:
+    result = CliRunner().invoke(app, spread_values(arguments, SEVERAL))
+    assert result.exit_code == 2
+    assert told in result.output
+
+
+def test_help_shows_every_option() -> None:
+    text = CliRunner().invoke(app, ["--help"]).output
+    for name, option in option_names(Config).items():
+        assert name == "split" or option in text
+    assert "OF_THE_TEST_K" in text
+
+
+@pytest.mark.parametrize(
+    ("given", "spread"),
+    [
+        ("--families A B --out o", "--families A --families B --out o"),
+        ("--families=A B", "--families A --families B"),
+        ("x --out a b", "x --out a b"),
+        ("--families", "--families"),
+        ("--families --source s t", "--families --source s --source t"),
+    ],
+)
+def test_spread(given: str, spread: str) -> None:
+    assert spread_values(given.split(), SEVERAL) == spread.split()

@@ -1,0 +1,263 @@
+"""Splits: list, filter and load; what is missing, damaged or of other types is told."""
+
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from support.splits import CONDITIONS, GOLDEN, QUERIES
+
+from robomme_interference_data import (
+    DecodedCache,
+    EpisodeId,
+    InterferenceError,
+    load_buffer,
+    load_split,
+)
+from robomme_interference_data.conditions import parse_condition
+from robomme_interference_data.errors import (
+    FormatError,
+    HashMismatchError,
+    InvalidIdError,
+    InvalidOptionError,
+    MissingFileError,
+    UnknownNameError,
+)
+from robomme_interference_data.rows import to_dict
+
+HEADER = "manifests/manifest.json"
+ROWS = "manifests/buffers.parquet"
+
+
+def test_what_a_split_lists() -> None:
+    split = load_split(GOLDEN)
+    assert tuple(map(str, split.episode_ids)) == QUERIES
+    assert split.families == ("VideoRepick", "MoveCube", "PatternLock")
+    assert split.conditions == CONDITIONS
+    assert split.cameras == ("front", "wrist")
+    assert (len(split), split.name) == (15, "split")
+    assert [str(manifest) for manifest in split.manifests()] == [
+        f"{episode} under {condition}" for episode in QUERIES for condition in CONDITIONS
+    ]
+    assert repr(split) == f"Split(split, buffers=15, conditions={list(CONDITIONS)})"
+
+
+@pytest.mark.parametrize(
+    ("filters", "count"),
+    [
+        ({}, 15),
+        ({"family": "MoveCube"}, 5),
+        ({"condition": "k3"}, 3),
+        ({"k": 0}, 3),
+        ({"condition": "no-history", "family": "MoveCube"}, 1),
+        ({"difficulty": "easy"}, 15),  # the sample's index 0
+    ],
+)
+def test_filters(filters: dict[str, Any], count: int) -> None:
+    split = load_split(GOLDEN)
+    found = list(split.manifests(**filters))
+    assert len(found) == count
+    assert [buffer.manifest for buffer in split.buffers(**filters)] == found
+
+
+@pytest.mark.parametrize(
+    ("filters", "told"),
+    [
+        ({"family": "MoveCub"}, "Did you mean 'MoveCube'?"),
+        ({"difficulty": "hard"}, "Known: easy"),
+        ({"condition": "k2"}, "k1"),
+    ],
+)
+def test_unknown_filters(filters: dict[str, Any], told: str) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        load_split(GOLDEN).manifests(**filters)
+    assert told in str(caught.value)
+
+
+def test_a_buffer_by_its_key() -> None:
+    split = load_split(GOLDEN)
+    wanted = split.load("MoveCube/test/0", "k3").manifest
+    name = EpisodeId("MoveCube", "test", 0)
+    for found in (
+        load_buffer("MoveCube/test/0", "k3", split=GOLDEN),
+        load_buffer(name, parse_condition("k3"), split=split),
+        load_buffer("MoveCube/test/0", k=3, split=str(GOLDEN), verify=True),
+        split.load(name, k=3),
+    ):
+        assert found.manifest == wanted
+    assert to_dict(wanted)["episode_id"] == "MoveCube/test/0"
+    assert (to_dict(wanted)["family"], to_dict(wanted)["condition"]) == ("MoveCube", "k3")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "told"),
+    [
+        ((), InvalidOptionError, "expected one of the two"),
+        (("k3", 3), InvalidOptionError, "expected one of the two"),
+        ((None, True), InvalidOptionError, "k True; expected a whole number"),
+        ((None, "3"), InvalidOptionError, "k '3'; expected a whole number"),
+        ((None, 3.0), InvalidOptionError, "k 3.0; expected a whole number"),
+        ((None, -1), InvalidIdError, "'k-1' is not a condition"),
+        ((3,), InvalidIdError, "3 is not a condition"),
+        (("K3",), InvalidIdError, "'K3' is not a condition"),
+        (("k5",), UnknownNameError, "--conditions no-history k0 k1 k3 k7 k5"),
+    ],
+)
+def test_conditions_that_cannot_be_loaded(
+    arguments: tuple[Any, ...], error: type[InterferenceError], told: str
+) -> None:
+    given = dict(zip(("condition", "k"), arguments, strict=False))
+    with pytest.raises(error) as caught:
+        load_buffer("MoveCube/test/0", split=GOLDEN, **given)
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("episode", "error", "told"),
+    [
+        ("MoveCub/test/0", UnknownNameError, "Did you mean 'MoveCube'?"),
+        ("MoveCube/test/1", UnknownNameError, "Did you mean 'MoveCube/test/0'"),
+        ("MoveCube", InvalidIdError, "Expected <Family>/<split>/<index>"),
+        (("MoveCube", "test", 0), InvalidIdError, "is not an episode id"),
+        (None, InvalidIdError, "None is not an episode id"),
+    ],
+)
+def test_episodes_that_cannot_be_loaded(
+    episode: Any, error: type[InterferenceError], told: str
+) -> None:
+    split = load_split(GOLDEN)
+    for load in (lambda: split.load(episode, "k3"), lambda: split.query(episode)):
+        with pytest.raises(error) as caught:
+            load()
+        assert told in str(caught.value)
+
+
+@pytest.mark.parametrize("cache", [3, ["x"], b"x"])
+def test_no_such_cache(cache: Any) -> None:
+    with pytest.raises(InvalidOptionError, match="expected True, False, a folder"):
+        load_split(GOLDEN, cache=cache)
+
+
+@pytest.mark.parametrize("threads", [0, -3, True, "2"])
+def test_no_such_threads(threads: Any) -> None:
+    with pytest.raises(InvalidOptionError, match="threads .*; expected a number from 1"):
+        load_split(GOLDEN, threads=threads)
+
+
+def test_caches_by_folder_or_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    for cache, folder in (
+        (str(tmp_path / "a"), tmp_path / "a"),
+        (tmp_path / "b", tmp_path / "b"),
+        (DecodedCache(tmp_path / "c"), tmp_path / "c"),
+        (True, tmp_path / "home" / "robomme-interference" / "decoded"),
+    ):
+        load_split(GOLDEN, cache=cache).load("MoveCube/test/0", "k0").frames()
+        assert len(list(folder.iterdir())) == 1
+
+
+def test_a_split_travels_between_processes() -> None:
+    split = pickle.loads(pickle.dumps(load_split(GOLDEN)))
+    assert split.load("MoveCube/test/0", "k0").frames().shape == (48, 32, 32, 3)
+
+
+def test_loading_needs_light_libraries_only() -> None:
+    code = (
+        "import sys\n"
+        "from robomme_interference_data import load_buffer\n"
+        f"buffer = load_buffer('MoveCube/test/0', 'k3', split={str(GOLDEN)!r}, verify=True)\n"
+        "print(len(buffer.frames()), sorted({'torch', 'lerobot', 'datasets', 'typer',"
+        " 'rich', 'scipy', 'matplotlib', 'sapien', 'h5py'} & sys.modules.keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert done.stdout == "144 []\n"
+
+
+# --- what is not as it should be ----------------------------------------------------------------
+
+
+def test_what_is_no_split(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "nowhere", GOLDEN / "demonstrations"):
+        with pytest.raises(MissingFileError, match="is not a split") as caught:
+            load_split(folder)
+        assert "robomme-interference build all" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "distractors", ROWS])
+def test_missing_parts(own_split: Path, name: str) -> None:
+    part = own_split / name
+    shutil.rmtree(part) if part.is_dir() else part.unlink()
+    with pytest.raises(MissingFileError):
+        load_split(own_split).load("MoveCube/test/0", "k3")
+
+
+def test_another_dataset_than_the_manifests_name(own_split: Path) -> None:
+    identity = own_split / "distractors" / "meta" / "interference.json"
+    revision = load_split(own_split).header.datasets["distractors"].revision
+    identity.write_text(identity.read_text().replace(revision, "0" * 64))
+    with pytest.raises(HashMismatchError, match="the manifests were made for") as caught:
+        load_split(own_split).load("MoveCube/test/0", "k3")
+    assert f"robomme-interference build manifests {own_split}" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('"format_version": 1', '"format_version": 2'),
+        ('"conditions": [', '"conditionz": ['),
+        ('"datasets": {', '"datasets": null, "x": {'),
+        ('"seed": 0', '"seed": null'),
+        ('"seed": 0', '"seed": "0"'),
+        ('"demonstrations"', '"demonstration"'),
+        ("{", "["),
+        ("{", "{" * 5000),
+    ],
+)
+def test_damaged_headers(own_split: Path, before: str, after: str) -> None:
+    header = own_split / HEADER
+    text = header.read_text()
+    assert before in text
+    header.write_text(text.replace(before, after))
+    with pytest.raises(FormatError, match=r"manifest\.json"):
+        load_split(own_split).load("MoveCube/test/0", "k3")
+
+
+def rewritten(path: Path, change: Any) -> None:
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: t.drop_columns(["sessions"]),
+        lambda t: t.drop_columns(["condition"]),
+        lambda t: t.set_column(5, "k", t["condition"]),
+        lambda t: t.set_column(t.column_names.index("sessions"), "sessions", [[None] * len(t)]),
+    ],
+)
+def test_damaged_rows(own_split: Path, change: Any) -> None:
+    rewritten(own_split / ROWS, change)
+    with pytest.raises(FormatError, match=r"buffers\.parquet"):
+        load_split(own_split).load("MoveCube/test/0", "k3")
+
+
+@pytest.mark.parametrize("keep", [0, 3, 100, 2000])
+def test_truncated_rows(own_split: Path, keep: int) -> None:
+    path = own_split / ROWS
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(FormatError, match=r"buffers\.parquet"):
+        load_split(own_split).load("MoveCube/test/0", "k3")
+
+
+def test_a_row_that_is_missing(own_split: Path) -> None:
+    rewritten(own_split / ROWS, lambda table: table.slice(0, 3))
+    with pytest.raises(UnknownNameError):
+        load_split(own_split).load("MoveCube/test/0", "k3")
+    with pytest.raises(FormatError, match="no row of VideoRepick/test/0 under k7"):
+        load_split(own_split).load("VideoRepick/test/0", "k7")

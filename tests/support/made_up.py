@@ -1,0 +1,141 @@
+"""Datasets of metadata alone, and sources whose frames are made up."""
+
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robomme_interference_data.build_dataset.identity import counts_of, revision_of
+from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
+from robomme_interference_data.build_dataset.sources.base import choose_cameras
+from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
+    EPISODES_DIR,
+    IDENTITY_PATH,
+    INFO_PATH,
+)
+from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.files import LocalFiles, write_json
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import DatasetIdentity, EpisodeRecord
+from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+
+SHAPES = {"observation.images.front": (4, 6, 3), "observation.state": (8,)}
+
+
+def record(
+    kind: str, episode: str, index: int = 0, *, lesson: int = 20, **changes: Any
+) -> EpisodeRecord:
+    """The record of an episode that was never recorded; its digests tell its id."""
+    unit = kind == "distractors"
+    digests = {name: f"{episode} {name}" for name in SHAPES}
+    known: dict[str, Any] = {
+        "episode_index": index,
+        "episode_id": EpisodeId.parse(episode),
+        "length": 32 if unit else lesson + 1,
+        "goals": (f"do {episode}",),
+        "seed": None,
+        "difficulty": None,
+        "simulator": None,
+        "exec_start_idx": None if unit else lesson,
+        "exact": True,
+        "feature_sha256": digests,
+        "lesson_sha256": None if unit else digests,
+    }
+    return EpisodeRecord(**{**known, **changes})
+
+
+def write_metadata(root: Path, kind: str, records: Iterable[EpisodeRecord]) -> Dataset:
+    """Write a dataset of so many episodes without data or videos."""
+    listed = [
+        EpisodeRecord(**{**vars(one), "episode_index": index}) for index, one in enumerate(records)
+    ]
+    features = {
+        name: {"dtype": "video" if name.startswith(CAMERA_PREFIX) else "float32", "shape": shape}
+        for name, shape in SHAPES.items()
+    }
+    info = {
+        "codebase_version": "v3.0",
+        "fps": 10,
+        "total_episodes": len(listed),
+        "features": features,
+        "data_path": "data/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/file-{file_index:03d}.mp4",
+    }
+    write_json(root / INFO_PATH, info)
+    unit = {"frames": 32, "stride": 8} if kind == "distractors" else None
+    identity = DatasetIdentity(
+        1, kind, "1.0.0", revision_of(listed), True, "av1-lossless", ("front",), unit, (), (),
+        counts_of(listed), "0" * 64,
+    )  # fmt: skip
+    write_json(root / IDENTITY_PATH, to_dict(identity))
+    path = root / EPISODES_DIR / "file-000.parquet"
+    path.parent.mkdir(parents=True)
+    pq.write_table(to_table(listed, arrow_schema(EpisodeRecord, sorted(SHAPES))), path)
+    return Dataset(LocalFiles(root))
+
+
+@dataclass
+class MadeUpSource:
+    """A source in memory; what it does wrong is asked for by episode.
+
+    Attributes:
+        lengths: Frames of each episode, of them demonstration: `{"MoveCube/test/0": (20, 5)}`.
+        wrong: Of an episode, frame number to what is returned in its place, or raised.
+        actions: Whether frames have actions.
+    """
+
+    lengths: dict[str, tuple[int, int | None]]
+    wrong: dict[str, dict[int, Any]] = field(default_factory=dict)
+    actions: bool = True
+    kind: str = "made-up"
+    whole: bool = True
+    time_limit: float = 60.0
+    cameras: tuple[str, ...] = ("front",)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        return {"kind": self.kind}
+
+    def episodes(self) -> list[SourceEpisode]:
+        return sorted(
+            (SourceEpisode(EpisodeId.parse(name), length) for name, length in self.lengths.items()),
+            key=lambda one: one.id,
+        )
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        chosen = choose_cameras(cameras, self.cameras, episode.id)
+        frames = self._frames(str(episode.id), chosen)
+        return Recording((f"do {episode.id}",), 7, "easy", "made-up", True, frames)
+
+    def close(self) -> None:
+        pass
+
+    def _frames(self, name: str, cameras: tuple[str, ...]) -> Generator[Frame]:
+        length, lesson = self.lengths[name]
+        for number in range(length):
+            wrong = self.wrong.get(name, {}).get(number)
+            if isinstance(wrong, BaseException):
+                raise wrong
+            yield wrong or self.frame(name, number, lesson, cameras)
+
+    def frame(
+        self, name: str, number: int, lesson: int | None, cameras: tuple[str, ...] = ("front",)
+    ) -> Frame:
+        """Frame `number` of an episode."""
+        return Frame(
+            {camera: picture(f"{name} {camera}", number) for camera in cameras},
+            np.full(8, number, np.float32),
+            np.full(8, -number, np.float32) if self.actions else None,
+            None if lesson is None else number < lesson,
+        )
+
+
+def picture(text: str, number: int) -> NDArray[np.uint8]:
+    """Return noise that differs by text and number, `(16, 24, 3) uint8`."""
+    seed = np.frombuffer(f"{text} {number}".encode(), np.uint8)
+    return np.random.default_rng(seed.tolist()).integers(0, 256, (16, 24, 3), np.uint8)

@@ -1,0 +1,29 @@
+"""Make the golden split anew: `python tests/support/make_golden.py tests/golden/split`."""
+
+import sys
+from pathlib import Path
+
+from robomme_interference_data.build_dataset.build import BuildPlan, build_dataset
+from robomme_interference_data.build_dataset.config import list_episodes
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.console import WorkProgress
+from robomme_interference_data.execution import Serial
+
+FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
+
+
+def make(root: Path) -> None:
+    """Build the split."""
+    source = (SampleSource(size=32),)
+    queries = list_episodes(source, families=FAMILIES, split="test")
+    units = list_episodes(source, split="train", numbers=(0, 1))
+    with WorkProgress(unit="episodes", quiet=True) as progress:
+        for kind, tasks in (("demonstrations", queries), ("distractors", units)):
+            build_dataset(BuildPlan(kind, source, tasks), root / kind, Serial(), progress)
+    for _ in write_manifests(plan_manifests(root), root):
+        pass
+
+
+if __name__ == "__main__":
+    make(Path(sys.argv[1]))

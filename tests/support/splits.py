@@ -1,0 +1,88 @@
+"""The tiny golden split, copies of it, and what its frames must be."""
+
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.build_dataset.cut import CUTS
+from robomme_interference_data.build_dataset.sources import Frame
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.constants import SUMS_PATH
+from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.files import LocalFiles, format_sums, sha256_file
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import BufferManifest, SessionEntry
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "split"
+"""Three test queries and the train units of nine families, 32 × 32 pixels, made by
+`support/make_golden.py` from the source `sample`."""
+
+QUERIES = ("VideoRepick/test/0", "MoveCube/test/0", "PatternLock/test/0")
+CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
+LESSON = 48
+UNITS = 17
+
+
+def copy_split(folder: Path) -> Path:
+    """Copy the golden split, to be damaged."""
+    return Path(shutil.copytree(GOLDEN, folder))
+
+
+def dataset(root: Path, name: str) -> Dataset:
+    """Open a dataset of a split."""
+    return Dataset(LocalFiles(root / name))
+
+
+@cache
+def _stored(kind: str, episode: EpisodeId) -> tuple[Frame, ...]:
+    source = SampleSource(size=32)
+    [listed] = [one for one in source.episodes() if one.id == episode]
+    return tuple(CUTS[kind](source.read(listed, None).frames))
+
+
+def stored_frames(kind: str, episode: EpisodeId, camera: str) -> NDArray[np.uint8]:
+    """Return what a dataset must store of an episode, from the source itself."""
+    return np.stack([frame.images[camera] for frame in _stored(kind, episode)])
+
+
+def stored_states(kind: str, episode: EpisodeId) -> NDArray[np.float32]:
+    """Return the states that go with `stored_frames`."""
+    return np.stack([frame.state for frame in _stored(kind, episode)])
+
+
+def expected_frames(entries: tuple[SessionEntry, ...], camera: str) -> NDArray[np.uint8]:
+    """Return the frames that sessions must show, one after the other."""
+    parts = [np.empty((0, 32, 32, 3), np.uint8)]
+    for entry in entries:
+        frames = stored_frames(entry.dataset, entry.source, camera)[entry.start : entry.stop]
+        parts.append(np.repeat(frames, entry.repeat, axis=0))
+    return np.concatenate(parts)
+
+
+def expected_states(entries: tuple[SessionEntry, ...]) -> NDArray[np.float32]:
+    """Return the states that sessions must show."""
+    parts = [np.empty((0, 8), np.float32)]
+    for entry in entries:
+        states = stored_states(entry.dataset, entry.source)[entry.start : entry.stop]
+        parts.append(np.repeat(states, entry.repeat, axis=0))
+    return np.concatenate(parts)
+
+
+def with_sessions(manifest: BufferManifest, *entries: SessionEntry) -> BufferManifest:
+    """Return a manifest that holds other sessions, in any order."""
+    known = {name: getattr(manifest, name) for name in BufferManifest.__dataclass_fields__}
+    frames = sum(entry.num_frames for entry in entries)
+    return BufferManifest(**{**known, "sessions": entries, "history_frames": frames})
+
+
+def renew_sums(root: Path) -> None:
+    """Write the SHA-256 of a dataset's files anew, as whoever changed them might."""
+    listed = [line.split("  ", 1)[1] for line in (root / SUMS_PATH).read_text().splitlines()]
+    there = [path for path in listed if (root / path).is_file()]
+    before = sha256_file(root / SUMS_PATH)
+    (root / SUMS_PATH).write_text(format_sums(root, there))
+    identity = root / "meta" / "interference.json"
+    identity.write_text(identity.read_text().replace(before, sha256_file(root / SUMS_PATH)))
