@@ -1,8 +1,6 @@
 """The one writer of video: lossless at any size, the same bytes each time, one clear error."""
 
 import dataclasses
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -69,20 +67,6 @@ def test_any_size_and_value(images: NDArray[np.uint8], seed: int) -> None:
             assert np.array_equal(write(Path(folder) / "v.mp4", given_images), given_images)
 
 
-@pytest.mark.parametrize(("codec", "name"), [(LOSSLESS, "v.mp4"), (RECORDING, "v.mkv")])
-def test_all_colours_survive(tmp_path: Path, codec: Codec, name: str) -> None:
-    # Every value of each pair of channels, at three values of the other one.
-    first, second = np.mgrid[0:256, 0:256].astype(np.uint8)
-    images = np.stack(
-        [
-            np.stack(np.roll([first, second, np.full_like(first, other)], turn, axis=0), axis=-1)
-            for turn in range(3)
-            for other in (0, 100, 255)
-        ]
-    )
-    assert np.array_equal(write(tmp_path / name, images, codec), images)
-
-
 def test_file_layout(tmp_path: Path) -> None:
     write(tmp_path / "video.mp4", noise(0, 40, 16, 24))
     with av.open(str(tmp_path / "video.mp4")) as container:
@@ -120,12 +104,7 @@ def test_a_container_can_be_named(tmp_path: Path) -> None:
     assert b"ftyp" in (tmp_path / "clip.partial").read_bytes()[:16]
 
 
-# --- lossy, and what cannot be encoded -----------------------------------------------------------
-
-
-def test_lossy_keeps_number_and_size_of_frames(tmp_path: Path) -> None:
-    images = noise(3, 20, 65, 67)
-    assert write(tmp_path / "video.mp4", images, LOSSY).shape == images.shape
+# --- what cannot be encoded ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("height", "width"), [(63, 64), (64, 63)])
@@ -136,20 +115,11 @@ def test_too_small_for_the_lossy_codec(tmp_path: Path, height: int, width: int) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("side", range(64, 100, 5))
-def test_the_lossy_encoder_does_not_crash_from_its_smallest_size_on(side: int) -> None:
+def test_the_lossy_encoder_does_not_crash_from_its_smallest_size_on(tmp_path: Path) -> None:
     # SVT-AV1 ends the process with SIGFPE or SIGSEGV on some small frames.
-    script = (
-        "import numpy as np, tempfile, pathlib\n"
-        "from robomme_interference_data.encode import CODECS, VideoEncoder\n"
-        "folder = pathlib.Path(tempfile.mkdtemp())\n"
-        f"for h, w in ((64, {side}), ({side}, 64), ({side}, 256)):\n"
-        "    encoder = VideoEncoder(folder / 'v.mp4', CODECS['lerobot-default'], 10, h, w)\n"
-        "    for i in range(10):\n"
-        "        encoder.add(np.full((h, w, 3), 20 * i, np.uint8))\n"
-        "    encoder.close()\n"
-    )
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+    for side in range(64, 100, 5):
+        for height, width in ((64, side), (side, 64), (side, 256)):
+            write(tmp_path / "video.mp4", noise(0, 10, height, width), LOSSY)
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
@@ -159,10 +129,7 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     codec = dataclasses.replace(LOSSLESS, vcodec="libmissing")
     with pytest.raises(BuildError, match="the video cannot be written: libmissing"):
         write(tmp_path / "video.mp4", images, codec)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk(tmp_path: Path) -> None:
-    (tmp_path / "video.mp4").symlink_to("/dev/full")
-    with pytest.raises(BuildError, match="No space left on device"):
-        write(tmp_path / "video.mp4", noise(0, 2, 8, 8))
+    if Path("/dev/full").exists():
+        (tmp_path / "full.mp4").symlink_to("/dev/full")
+        with pytest.raises(BuildError, match="No space left on device"):
+            write(tmp_path / "full.mp4", images)

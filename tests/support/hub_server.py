@@ -61,7 +61,7 @@ class HubServer:
             self._server.server_close()
             thread.join()
 
-    def answer(self, path: str) -> Answer:
+    def answer(self, path: str) -> Answer:  # noqa: PLR0911
         """Return status, headers and body (bytes, or a value to send as JSON)."""
         if self.down:
             return _error(503, "Down")

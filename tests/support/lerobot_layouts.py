@@ -1,7 +1,7 @@
 """Small LeRobot datasets, v3.0 and v2.1, written without lerobot: importing it takes 10 s."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -9,110 +9,84 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from support.episodes import MOVE, PEG, SIZE, Episode, encode_image, make_episode, write_video
+from support.recordings import EPISODES, SIZE, Episode, encode_image, write_video
 
-EPISODES = [make_episode(1, 12, MOVE, 5), make_episode(2, 9, PEG, 9), make_episode(3, 7, MOVE, 0)]
-IDS = {"MoveCube/train/0": 0, "MoveCube/train/1": 2, "InsertPeg/train/0": 1}
-"""Ids of `EPISODES` by the families file, in canonical order, and their places."""
-
-V21_NAMES = {"front": "image", "wrist": "wrist_image", "state": "state", "action": "actions"}
-V30_NAMES = {
-    "front": "observation.images.front",
-    "wrist": "observation.images.wrist",
-    "state": "observation.state",
-    "action": "action",
+NAMES = {
+    "v2.1": {"front": "image", "wrist": "wrist_image", "state": "state", "action": "actions"},
+    "v3.0": {
+        "front": "observation.images.front",
+        "wrist": "observation.images.wrist",
+        "state": "observation.state",
+        "action": "action",
+    },
 }
-FAMILIES = "episode_index,family\n0,MoveCube\n1,InsertPeg\n2,MoveCube\n"
-
-
-def write_families(folder: Path) -> Path:
-    """Write the families file of `EPISODES`, or of the first of them."""
-    path = folder / "families.csv"
-    path.write_text(FAMILIES)
-    return path
+TABLE = "meta/episodes/chunk-000/file-000.parquet"
+DATA = "data/chunk-000/file-000.parquet"
 
 
 def write_lerobot(
     root: Path,
-    episodes: Sequence[Episode] = EPISODES,
+    episodes: dict[str, Episode] = EPISODES,
     *,
     version: str = "v3.0",
     stored: str | None = "png",
     marked: bool = True,
     rows_a_group: int = 4,
-    **columns: list[Any],
+    **columns: list[Any] | None,
 ) -> Path:
-    """Write a dataset; in v3.0, all episodes share their files.
+    """Write a dataset; in v3.0 all episodes share their files, in v2.1 each has its own.
 
     Args:
         root: The folder.
-        episodes: What it holds.
-        version: `v3.0`, or `v2.1` as `Yinpei/robomme_data_lerobot` is laid out.
-        stored: Images as `png` or `jpg` in parquet, as `video` files (FFV1), or None for none.
+        episodes: What it holds, by id.
+        version: `v3.0` or `v2.1`.
+        stored: Images as `png` or `jpg` in parquet, or as `video` files (FFV1); None for
+            metadata alone.
         marked: Write the columns `is_demo` and `exec_start_idx`.
         rows_a_group: Rows in a row group.
-        **columns: Further per-episode columns.
+        **columns: Further per-episode columns; `episode_id=None` leaves the ids out.
     """
-    v21 = version == "v2.1"
-    names = V21_NAMES if v21 else V30_NAMES
-    tasks = list(dict.fromkeys(episode.goal for episode in episodes))
-    starts = [0, *accumulate(map(len, episodes))]
-    cameras = list(episodes[0].images) if episodes else []
-    for index in range(len(episodes)):
-        chosen = episodes[index : index + 1] if v21 else episodes
-        tables = [
-            _rows(one, i, tasks, names, stored if stored != "video" else None, marked)
-            for i, one in enumerate(chosen, index)
-        ]
-        path = root / f"data/chunk-000/{_file(v21, index)}.parquet"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.concat_tables(tables), path, row_group_size=rows_a_group)
-        for camera in cameras if stored == "video" else ():
-            place = (
-                f"chunk-000/{names[camera]}/{_file(v21, index)}"
-                if v21
-                else f"{names[camera]}/chunk-000/{_file(v21, index)}"
-            )
-            frames = np.concatenate([one.images[camera] for one in chosen])
-            write_video(root / f"videos/{place}.mkv", frames)
-        if not v21:
-            break
-    per_episode: dict[str, Any] = {
-        "episode_index": range(len(episodes)),
-        "length": [len(one) for one in episodes],
-        "tasks": [[one.goal] for one in episodes],
-        **columns,
+    names, listed = NAMES[version], list(episodes.values())
+    cameras = [*listed[0].images] if stored else []
+    tasks = list(dict.fromkeys(one.goal for one in listed))
+    zeros = [0] * len(listed)
+    per_episode = {
+        "episode_index": list(range(len(listed))),
+        "length": [len(one) for one in listed],
+        "tasks": [[one.goal] for one in listed],
+        "episode_id": list(episodes),
     }
-    if not v21:
-        zeros = [0] * len(episodes)
+    groups = [range(len(listed))]
+    if version == "v2.1":
+        groups = [range(index, index + 1) for index in range(len(listed))]
+    else:
         per_episode |= {"data/chunk_index": zeros, "data/file_index": zeros}
+        for key in (f"videos/{names[camera]}" for camera in cameras if stored == "video"):
+            starts = [0, *accumulate(map(len, listed))]
+            per_episode |= {f"{key}/chunk_index": zeros, f"{key}/file_index": zeros}
+            per_episode[f"{key}/from_timestamp"] = [start / 10 for start in starts[:-1]]
+    for group in groups if stored else ():
+        rows = [_rows(listed[i], i, tasks, names, stored, marked) for i in group]
+        file = "file-000" if version == "v3.0" else f"episode_{group[0]:06d}"
+        path = root / f"data/chunk-000/{file}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.concat_tables(rows), path, row_group_size=rows_a_group)
         for camera in cameras if stored == "video" else ():
-            key = f"videos/{names[camera]}/"
-            per_episode |= {key + "chunk_index": zeros, key + "file_index": zeros}
-            per_episode[key + "from_timestamp"] = [start / 10 for start in starts[:-1]]
-    _write_metadata(root, version, tasks, per_episode)
-    kind = {"dtype": "video", "info": {"video.codec": "ffv1", "video.pix_fmt": "bgr0"}}
-    features: dict[str, Any] = {
-        names[camera]: {**(kind if stored == "video" else {"dtype": "image"}), "shape": [*SIZE, 3]}
-        for camera in cameras
-    }
-    features[names["state"]] = {"dtype": "float32", "shape": [8]}
-    if episodes and episodes[0].action is not None:
-        features[names["action"]] = {"dtype": "float32", "shape": [8]}
-    if marked:
-        features["is_demo"] = {"dtype": "bool", "shape": [1]}
-        features["exec_start_idx"] = {"dtype": "int32", "shape": [1]}
+            frames = np.concatenate([listed[i].images[camera] for i in group])
+            write_video(root / f"videos/{names[camera]}/chunk-000/{file}.mkv", frames)
+    told = {name: values for name, values in (per_episode | columns).items() if values is not None}
+    _write_metadata(root / "meta", version, tasks, told)
+    v21 = version == "v2.1"
     file = "episode_{episode_index:06d}" if v21 else "file-{file_index:03d}"
     chunk = "chunk-{episode_chunk:03d}" if v21 else "chunk-{chunk_index:03d}"
-    videos = f"{chunk}/{{video_key}}" if v21 else f"{{video_key}}/{chunk}"
     info = {
         "codebase_version": version,
         "fps": 10,
-        "total_episodes": len(episodes),
+        "total_episodes": len(listed),
+        "chunks_size": 1000,
         "data_path": f"data/{chunk}/{file}.parquet",
-        "video_path": f"videos/{videos}/{file}.mkv",
-        "features": features,
-        **({"chunks_size": 1000} if v21 else {}),
+        "video_path": f"videos/{{video_key}}/{chunk}/{file}.mkv",
+        "features": _features(listed[0], names, stored, marked),
     }
     (root / "meta/info.json").write_text(json.dumps(info))
     return root
@@ -128,21 +102,17 @@ def edit_info(root: Path, change: Callable[[dict[str, Any]], Any] | None = None,
 
 
 def edit_columns(path: Path, **columns: Any) -> None:
-    """Put other columns into a parquet file, or other values into them; None removes one."""
+    """Put other columns into a parquet file; None removes one, an array brings its own type."""
     table = pq.read_table(path)
     for name, values in columns.items():
-        place = table.column_names.index(name) if name in table.column_names else None
-        kind = None if place is None else table.schema.field(name).type
-        if place is not None:
-            table = table.remove_column(place)
+        kind = None
+        if name in table.column_names:
+            kind = table.schema.field(name).type
+            table = table.drop_columns(name)
         if values is not None:
             given = values if isinstance(values, pa.Array) else pa.array(values, kind)
             table = table.append_column(name, given)
     pq.write_table(table, path)
-
-
-def _file(v21: bool, index: int) -> str:
-    return f"episode_{index:06d}" if v21 else "file-000"
 
 
 def _rows(
@@ -162,34 +132,41 @@ def _rows(
     }
     if episode.action is not None:
         table[names["action"]] = pa.array(list(episode.action), pa.list_(pa.float32()))
-    if marked:
+    if marked:  # as lists, which LeRobot's older writers made of numbers
         flags = [[step < episode.lesson] for step in range(length)]
         table["is_demo"] = pa.array(flags, pa.list_(pa.bool_()))
         table["exec_start_idx"] = pa.array([[episode.lesson]] * length, pa.list_(pa.int32()))
-    kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    for camera, frames in episode.images.items() if stored else ():
+    for camera, frames in episode.images.items() if stored in ("png", "jpg") else ():
         cells = [{"bytes": encode_image(frame, str(stored)), "path": None} for frame in frames]
+        kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
         table[names[camera]] = pa.array(cells, kind)
     return pa.table(table)
 
 
-def _write_metadata(
-    root: Path, version: str, tasks: list[str], per_episode: dict[str, Sequence[Any]]
-) -> None:
-    meta = root / "meta"
-    meta.mkdir(parents=True, exist_ok=True)
+def _features(
+    episode: Episode, names: dict[str, str], stored: str | None, marked: bool
+) -> dict[str, Any]:
+    image: dict[str, Any] = {"dtype": "image", "shape": [*SIZE, 3]}
+    if stored == "video":
+        described = {"video.codec": "ffv1", "video.pix_fmt": "bgr0"}
+        image |= {"dtype": "video", "info": described}
+    features = {names[camera]: image for camera in episode.images}
+    for name in ("state", "action") if episode.action is not None else ("state",):
+        features[names[name]] = {"dtype": "float32", "shape": [8]}
+    if marked:
+        features["is_demo"] = {"dtype": "bool", "shape": [1]}
+        features["exec_start_idx"] = {"dtype": "int32", "shape": [1]}
+    return features
+
+
+def _write_metadata(meta: Path, version: str, tasks: list[str], told: dict[str, list[Any]]) -> None:
+    numbered = [{"task_index": number, "task": task} for number, task in enumerate(tasks)]
+    (meta / "episodes/chunk-000").mkdir(parents=True)
     if version == "v3.0":
-        (meta / "episodes/chunk-000").mkdir(parents=True)
-        table = pa.table({name: pa.array(list(v)) for name, v in per_episode.items()})
-        pq.write_table(table, meta / "episodes/chunk-000/file-000.parquet")
-        numbered = pa.table({"task_index": range(len(tasks)), "task": tasks})
-        pq.write_table(numbered, meta / "tasks.parquet")
+        pq.write_table(pa.table(told), meta.parent / TABLE)
+        pq.write_table(pa.Table.from_pylist(numbered), meta / "tasks.parquet")
         return
-    columns = zip(*per_episode.values(), strict=True)
-    rows = [dict(zip(per_episode, values, strict=True)) for values in columns]
-    write_lines(meta / "episodes.jsonl", rows)
-    write_lines(meta / "tasks.jsonl", [{"task_index": i, "task": t} for i, t in enumerate(tasks)])
-
-
-def write_lines(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    rows = [dict(zip(told, values, strict=True)) for values in zip(*told.values(), strict=True)]
+    for name, lines in (("episodes", rows), ("tasks", numbered)):
+        text = "".join(json.dumps(line) + "\n" for line in lines)
+        (meta / f"{name}.jsonl").write_text(text)

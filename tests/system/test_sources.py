@@ -1,21 +1,14 @@
-"""Sources against the real thing: LeRobot's own writer and reader, and the tabletop simulator."""
+"""Sources against LeRobot's own writer and reader."""
 
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.episodes import Episode, check_recording, make_episode
+from support.recordings import check_recording, make_episode
 
-from robomme_interference_data.build_dataset.cut import cut_demonstration
-from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
 from robomme_interference_data.encode import CODECS, Codec
-from robomme_interference_data.errors import MissingExtraError, NoRendererError
-from robomme_interference_data.ids import EpisodeId
-
-SIZE = (64, 64)  # the least that lerobot's default encoder takes
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +29,11 @@ def test_codecs_are_those_that_lerobot_would_use(lerobot: Any, codec: Codec) -> 
         assert dict(codec.options) == default.get_codec_options(as_strings=True)
 
 
-def enlarged(episode: Episode) -> Episode:
-    images = {
-        camera: np.resize(frames, (len(episode), *SIZE, 3))
-        for camera, frames in episode.images.items()
-    }
-    return Episode(episode.goal, images, episode.state, episode.action, episode.lesson)
-
-
-EPISODES = [enlarged(make_episode(1, 12, lesson=5)), enlarged(make_episode(2, 7, lesson=7))]
+SIZE = (64, 64)  # the least that lerobot's default encoder takes
+EPISODES = {
+    "MoveCube/train/0": make_episode(1, 12, lesson=5, size=SIZE),
+    "MoveCube/train/1": make_episode(2, 7, lesson=7, size=SIZE),
+}
 
 
 def write(root: Path, stored: str) -> None:
@@ -72,7 +61,7 @@ def write(root: Path, stored: str) -> None:
     made = LeRobotDataset.create(
         "test/small", 10, features, root=root, use_videos=kind == "video", **encoder
     )
-    for episode in EPISODES:
+    for episode in EPISODES.values():
         for step in range(len(episode)):
             images = {f"observation.images.{n}": i[step] for n, i in episode.images.items()}
             assert episode.action is not None
@@ -93,11 +82,11 @@ def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
     source = LeRobotSource(str(root), families_file=names)
     theirs = lerobot.LeRobotDataset("test/small", root=root, video_backend="pyav")
     row = 0
-    for episode, expected in zip(source.episodes(), EPISODES, strict=True):
+    for episode in source.episodes():
         recording = source.read(episode, None)
         assert recording.exact == (stored != "lerobot-default")
         if recording.exact:
-            check_recording(source.read(episode, None), expected)
+            check_recording(source.read(episode, None), EPISODES[str(episode.id)])
         for frame in recording.frames:
             item = theirs[row]
             row += 1
@@ -106,23 +95,3 @@ def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
                 pixels = (item[f"observation.images.{camera}"] * 255).round().byte()
                 np.testing.assert_array_equal(image, pixels.permute(1, 2, 0).numpy())
     assert row == len(theirs)
-
-
-def test_fewer_cameras_of_the_tabletop_are_the_same_bits() -> None:
-    """Both parts of an episode: the end of the demonstration, and what the oracle does."""
-    read: dict[Any, list[np.ndarray]] = {}
-    for cameras in (("front",), None):
-        source = open_source("tabletop")
-        wanted = EpisodeId("VideoUnmask", "train", 0)
-        (episode,) = (one for one in source.episodes() if one.id == wanted)
-        try:
-            frames = source.read(episode, cameras).frames
-        except (NoRendererError, MissingExtraError) as error:
-            pytest.skip(str(error))
-        lesson = list(cut_demonstration(frames))
-        read[cameras] = [frame.images["front"] for frame in (*lesson, *islice(frames, 8))]
-        assert len(read[cameras]) == len(lesson) + 8
-        frames.close()
-        source.close()
-    for one, other in zip(*read.values(), strict=True):
-        np.testing.assert_array_equal(one, other)
