@@ -116,7 +116,8 @@ def place_episode(
     for name, feature in info["features"].items():
         if feature["dtype"] != "video":
             continue
-        key, start = f"videos/{name}", 0.0
+        key = f"videos/{name}"
+        start: Any = 0.0
         if info["codebase_version"] != "v2.1":
             start = row.get(f"{key}/from_timestamp")
             if not isinstance(start, int | float) or not 0 <= start < 1e9:

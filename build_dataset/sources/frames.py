@@ -96,9 +96,9 @@ class FramesSource:
                 _check_names(path, length)
                 streams[camera] = _iter_images(path, length)
             else:
-                header = probe_video(path)
-                streams[camera] = _iter_video(path, header.rate, length)
-                exact = exact and header.exact
+                rate, lossless = probe_video(path)
+                streams[camera] = _iter_video(path, rate, length)
+                exact = exact and lossless
         rows = RowSpan(self._folder / TABLE, key.rows.start, key.rows.start + key.rows.length)
         actions = rows.vectors("action") if key.rows.actions else None
         return Recording(

@@ -4,7 +4,6 @@ A recording counts as exact only where that is certain: PNG images, or video of 
 codec, or options, that lose nothing. Converting to YUV alone already changes 8-bit RGB values.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
 
-__all__ = ["VideoHeader", "decode_image", "info_is_exact", "is_png", "probe_video"]
+__all__ = ["decode_image", "info_is_exact", "is_png", "probe_video"]
 
 _RGB_FORMATS = (
     *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
@@ -26,21 +25,11 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 
 
-@dataclass(frozen=True)
-class VideoHeader:
-    """What the header of a video file says.
-
-    Attributes:
-        rate: Frames per second.
-        exact: Whether codec and pixel format alone make the video exact.
-    """
-
-    rate: float
-    exact: bool
-
-
-def probe_video(path: Path) -> VideoHeader:
+def probe_video(path: Path) -> tuple[float, bool]:
     """Read the header of a video file.
+
+    Returns:
+        Frames per second, and whether codec and pixel format alone make the video exact.
 
     Raises:
         SourceError: It is not a video, or does not say its frame rate.
@@ -58,7 +47,7 @@ def probe_video(path: Path) -> VideoHeader:
         raise SourceError(f"{path} is not a readable video: {error}", hint) from None
     if not rate:
         raise SourceError(f"{path} does not say its frame rate", hint)
-    return VideoHeader(float(rate), exact)
+    return float(rate), exact
 
 
 def info_is_exact(info: dict[str, Any]) -> bool:

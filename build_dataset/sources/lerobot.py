@@ -111,7 +111,7 @@ class LeRobotSource:
             UnknownNameError, InvalidOptionError: The column map does not fit.
             SourceError: The dataset cannot be used; says which episode, why and what to do.
         """
-        self._columns  # noqa: B018  # whether they can be found is told first
+        columns = set(self._columns.values())
         rows, known = self._lerobot.all_rows(), self._lerobot.tasks
         ids, simulator = self._ids(rows)
         found = []
@@ -122,10 +122,10 @@ class LeRobotSource:
                     raise FormatError.damaged(
                         self._where, f"episode {index}: unknown task {task!r}"
                     )
-            played = simulator or told.simulator or self._lerobot.info.get("simulator")
+            played = simulator or told.simulator
             if played in (None, "robomme"):
                 self._check_goals(index, name, told.wordings)
-            found.append(SourceEpisode(name, (index, played, self._state(index))))
+            found.append(SourceEpisode(name, (index, played, self._state(index, columns))))
         return sorted(found, key=lambda episode: episode.id)
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
@@ -223,13 +223,14 @@ class LeRobotSource:
                     _MEND_FAMILIES,
                 )
 
-    def _state(self, index: int) -> tuple[Any, ...]:
+    def _state(self, index: int, columns: set[str]) -> tuple[Any, ...]:
         """Return what changes when the episode's files do: times and sizes; the commit is known."""
         if isinstance(self._files, HubFiles):
             return ()
         place = self._lerobot.place(index)
         states: list[Any] = []
-        for relative in (place.data, *(path for path, _ in place.videos.values())):
+        videos = [path for name, (path, _) in place.videos.items() if name in columns]
+        for relative in (place.data, *videos):
             try:
                 status = self._files.path(relative).stat()
                 states.append((status.st_mtime_ns, status.st_size))

@@ -104,11 +104,11 @@ class _Scene:
     def front(self, step: int) -> NDArray[np.uint8]:
         """Draw the front view, `(size, size, 3) uint8`."""
         image: NDArray[np.uint8] = self._table.astype(np.uint8)
-        for (column, row), colour in zip(self._cubes, _CUBES, strict=True):
-            self._box(image, column, row, 12, 12, colour)
+        for place, colour in zip(self._cubes, _CUBES, strict=True):
+            self._box(image, place, (12, 12), colour)
         column, row = self._gripper(step)
-        self._box(image, column, row // 2, 5, row // 2, (235, 235, 235))
-        self._box(image, column, row, 14, 6, (60, 60, 70))
+        self._box(image, (column, row // 2), (5, row // 2), (235, 235, 235))
+        self._box(image, (column, row), (14, 6), (60, 60, 70))
         return image
 
     def wrist(self, step: int) -> NDArray[np.uint8]:
@@ -126,21 +126,14 @@ class _Scene:
     def _box(
         self,
         image: NDArray[np.uint8],
-        column: int,
-        row: int,
-        half_width: int,
-        half_height: int,
+        centre: tuple[int, int],
+        half: tuple[int, int],
         colour: tuple[int, int, int],
     ) -> None:
-        top, bottom, left, right = (
-            max(0, value * self.size // 256)
-            for value in (
-                row - half_height,
-                row + half_height,
-                column - half_width,
-                column + half_width,
-            )
-        )
+        """Fill a box: column and row of its centre, and half its width and height."""
+        (column, row), (width, height) = centre, half
+        edges = (row - height, row + height, column - width, column + width)
+        top, bottom, left, right = (max(0, edge * self.size // 256) for edge in edges)
         image[top:bottom, left:right] = colour
 
 

@@ -81,13 +81,6 @@ def test_what_per_episode_columns_say(tmp_path: Path, version: str) -> None:
     assert [frame.is_demonstration for frame in recording.frames] == [True, True, False, False]
 
 
-def test_the_simulator_of_the_whole_dataset(tmp_path: Path) -> None:
-    root = write_lerobot(tmp_path, one(make_episode(0, 2, "fold it")), episode_id=["Towel/val/3"])
-    assert read(root).simulator is None
-    edit_info(root, simulator="tabletop")
-    assert read(root).simulator == "tabletop"
-
-
 def test_a_part_of_a_dataset_can_be_used(v21: Path) -> None:
     (v21 / "data/chunk-000/episode_000001.parquet").unlink()
     check_recording(read(v21), EPISODES[NAME])
