@@ -1,7 +1,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup vulkan demo test check format types bench pins
+.PHONY: help setup install vulkan demo test check format types bench pins
 
 BIN := .venv/bin
 # The folders that pyproject.toml maps under robomme_interference_data.
@@ -12,14 +12,18 @@ ARGS ?=
 help:  ## Print this list.
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' Makefile
 
-setup:  ## Install what is missing: the pinned packages in .venv, a Vulkan driver.
+setup: install  ## Install what is missing: packages in .venv, a Vulkan driver, Chromium.
+	@scripts/system_packages.sh chromium
+
+# All but what only tests need.
+install:
 	@scripts/setup.sh
-	@$(BIN)/python scripts/software_vulkan.py
+	@scripts/system_packages.sh vulkan
 
 vulkan:  ## Install only the software Vulkan driver: sudo make vulkan.
-	@python3 scripts/software_vulkan.py
+	@scripts/system_packages.sh vulkan
 
-demo: setup  ## Set up, then go the whole way on real or recorded episodes.
+demo: install  ## Set up, then go the whole way on real or recorded episodes.
 	@$(BIN)/python scripts/demo.py
 
 test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -19,23 +19,25 @@ from typing import Any
 import av
 from timing import Times, interleave, machine, positive, table
 
-from robomme_interference_data.build_dataset.build import Filters, Settings, build_dataset
-from robomme_interference_data.build_dataset.encode import (
-    Codec,
-    ImageStats,
-    VideoEncoder,
-    get_codec,
+from robomme_interference_data.build_dataset.build import BuildPlan, build_dataset
+from robomme_interference_data.build_dataset.config import list_episodes
+from robomme_interference_data.build_dataset.cut import cut_demonstration
+from robomme_interference_data.build_dataset.image_stats import ImageStats
+from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot, require_lerobot
+from robomme_interference_data.build_dataset.sources import (
+    Frame,
+    Recording,
+    Source,
+    SourceEpisode,
+    open_source,
 )
-from robomme_interference_data.build_dataset.plan import PlannedEpisode, plan_dataset
-from robomme_interference_data.build_dataset.sample import write_sample
-from robomme_interference_data.build_dataset.sources import open_source
-from robomme_interference_data.build_dataset.sources.base import Frame, Source, SourceEpisode
-from robomme_interference_data.build_dataset.stage import stage_episode
-from robomme_interference_data.build_dataset.writer import load_lerobot, require_lerobot
+from robomme_interference_data.build_dataset.stage import StageTask
+from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
 from robomme_interference_data.digest import FeatureDigests
+from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.progress import BuildProgress
+from robomme_interference_data.execution import Executor, Processes, Serial, Worker
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 FAMILIES = ("VideoUnmask", "VideoUnmaskSwap", "PatternLock")
@@ -46,17 +48,30 @@ AIM = "≥ 0.8"
 class Held:
     """A source whose frames are in memory, so that reading costs nothing."""
 
-    frames: dict[str, list[Frame]]
-    kind: str = "held"
+    recordings: dict[str, tuple[Recording, list[Frame]]]
     provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "held"})
+    time_limit = 300.0
+    whole = True
 
     def episodes(self) -> list[SourceEpisode]:
-        """List nothing: the planned episodes are given."""
+        """List nothing: the episodes are given."""
         return []
 
-    def read(self, episode: SourceEpisode) -> Generator[Frame]:
-        """Yield the frames of an episode."""
-        yield from self.frames[str(episode.id)]
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Open an episode."""
+        recording, frames = self.recordings[str(episode.id)]
+        return replace(recording, frames=_each(frames))
+
+    def frames(self, episode: SourceEpisode) -> list[Frame]:
+        """Return the frames of an episode."""
+        return self.recordings[str(episode.id)][1]
+
+    def close(self) -> None:
+        """Nothing is held from one episode to the next."""
+
+
+def _each(frames: list[Frame]) -> Generator[Frame]:
+    yield from frames
 
 
 def main() -> None:
@@ -95,18 +110,16 @@ def recordings(folder: Path) -> str:
         unpack = [sys.executable, str(RECORDINGS / "unpack_h5.py"), str(folder), *FAMILIES]
         subprocess.run(unpack, check=True, stdout=subprocess.DEVNULL)
         return f"robomme-h5:{folder}"
-    for _ in write_sample(folder, families=FAMILIES):
-        pass
-    return f"frames:{folder}"
+    return "sample:" + ",".join(FAMILIES)
 
 
 def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
     """Time the steps of a build on all demonstrations of a source; return the table."""
     codec, workers = get_codec(options.codec), options.workers
-    planned = plan_dataset(DEMONSTRATIONS, [source.episodes()]).episodes
-    held = Held({str(p.episode.id): read(source, p) for p in planned})
-    cameras = tuple(sorted(planned[0].episode.cameras))
-    count = sum(len(item.indices) for item in planned)
+    episodes = tuple(episode for _, episode in list_episodes([source]))
+    held = Held({str(episode.id): read(source, episode) for episode in episodes})
+    cameras = tuple(sorted(held.frames(episodes[0])[0].images))
+    count = sum(len(held.frames(episode)) for episode in episodes)
     began = time.perf_counter()
     load_lerobot()
     importing = time.perf_counter() - began
@@ -118,23 +131,23 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
         return made
 
     def stage(source: Source) -> None:
-        target = place()
-        for item in planned:
-            stage_episode(source, item, cameras, codec, FPS, target / name_of(item))
+        task = StageTask(DEMONSTRATIONS, (source,), cameras, codec, place())
+        for episode in episodes:
+            task((0, episode), Worker(0))
 
-    def build(workers: int) -> None:
-        settings = Settings(codec, workers=workers)
-        quiet = BuildProgress(quiet=True)
-        build_dataset(DEMONSTRATIONS, [source], place() / "out", Filters(), settings, quiet)
+    def build(executor: Executor) -> None:
+        tasks = tuple((0, episode) for episode in episodes)
+        plan = BuildPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
+        build_dataset(plan, place() / "out", executor, WorkProgress(quiet=True))
 
     times = interleave(
         {
-            "bare": lambda: encode_bare(planned, held, cameras, codec, place()),
-            "encode": lambda: encode_hashed(planned, held, cameras, codec, place()),
+            "bare": lambda: encode_bare(episodes, held, cameras, codec, place()),
+            "encode": lambda: encode_hashed(episodes, held, cameras, codec, place()),
             "verify": lambda: stage(held),
             "read": lambda: stage(source),
-            "build": lambda: build(1),
-            "parallel": lambda: build(workers),
+            "build": lambda: build(Serial()),
+            "parallel": lambda: build(Processes(workers)),
         },
         options.rounds,
     )
@@ -150,7 +163,7 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
         )
     ]
     title = (
-        f"{len(planned)} demonstrations, {count:,} frames of {' and '.join(cameras)}, "
+        f"{len(episodes)} demonstrations, {count:,} frames of {' and '.join(cameras)}, "
         f"{codec.name}; medians of {options.rounds} rounds. Importing lerobot took {importing:.1f} "
         "s, once a build, and is left out."
     )
@@ -165,32 +178,34 @@ def row(times: Times, count: int, way: str, text: str, cores: int, aim: str) -> 
     return [text, f"{1000 * each:.1f}", f"{1 / each:.1f}", f"{share:.2f}", aim]
 
 
-def read(source: Source, planned: PlannedEpisode) -> list[Frame]:
-    """Read the planned frames of an episode, which are its first ones."""
-    return list(itertools.islice(source.read(planned.episode), len(planned.indices)))
+def read(source: Source, episode: SourceEpisode) -> tuple[Recording, list[Frame]]:
+    """Read the demonstration of an episode into memory."""
+    recording = source.read(episode, None)
+    return recording, list(cut_demonstration(recording.frames))
 
 
-def name_of(planned: PlannedEpisode) -> str:
-    """Return a file name for an episode."""
-    return str(planned.episode.id).replace("/", "-")
+def path_of(folder: Path, episode: SourceEpisode, camera: str) -> Path:
+    """Return where a video goes."""
+    return folder / f"{str(episode.id).replace('/', '-')}-{camera}.mp4"
 
 
 def encode_bare(
-    planned: Sequence[PlannedEpisode],
+    episodes: Sequence[SourceEpisode],
     held: Held,
     cameras: tuple[str, ...],
     codec: Codec,
     folder: Path,
 ) -> None:
     """Encode all frames with nothing but PyAV, on one thread."""
-    for item in planned:
+    for episode in episodes:
+        frames = held.frames(episode)
         for camera in cameras:
-            with av.open(str(folder / f"{name_of(item)}-{camera}.mp4"), "w") as container:
+            with av.open(str(path_of(folder, episode, camera)), "w") as container:
                 stream = container.add_stream(codec.vcodec, rate=FPS, options=dict(codec.options))
                 stream.pix_fmt = codec.pix_fmt
-                stream.height, stream.width = item.episode.cameras[camera]
+                stream.height, stream.width = frames[0].images[camera].shape[:2]
                 stream.codec_context.thread_count = 1
-                for number, frame in enumerate(held.read(item.episode)):
+                for number, frame in enumerate(frames):
                     picture = av.VideoFrame.from_ndarray(frame.images[camera], format="rgb24")
                     picture.pts, picture.time_base = number, Fraction(1, FPS)
                     container.mux(stream.encode(picture))
@@ -198,24 +213,24 @@ def encode_bare(
 
 
 def encode_hashed(
-    planned: Sequence[PlannedEpisode],
+    episodes: Sequence[SourceEpisode],
     held: Held,
     cameras: tuple[str, ...],
     codec: Codec,
     folder: Path,
 ) -> None:
     """Encode, hash and count all frames, as staging does before it decodes them again."""
-    for item in planned:
-        sizes = item.episode.cameras
+    for episode in episodes:
+        frames = held.frames(episode)
         encoders = {
             camera: VideoEncoder(
-                folder / f"{name_of(item)}-{camera}.mp4", codec, FPS, *sizes[camera]
+                path_of(folder, episode, camera), codec, FPS, *frames[0].images[camera].shape[:2]
             )
             for camera in cameras
         }
         stats = {camera: ImageStats() for camera in cameras}
         digests = FeatureDigests()
-        for frame in held.read(item.episode):
+        for frame in frames:
             for camera, encoder in encoders.items():
                 image = frame.images[camera]
                 encoder.add(image)

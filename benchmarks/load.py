@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -23,8 +24,9 @@ from numpy.typing import NDArray
 from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
 from robomme_interference_data import Buffer, DecodedCache, Split, load_split
-from robomme_interference_data.build_dataset.writer import require_lerobot
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, FRONT
+from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.conditions import parse_condition
+from robomme_interference_data.constants import FRONT
 from robomme_interference_data.errors import InterferenceError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,9 +51,9 @@ def main() -> None:
     try:
         require_lerobot()
         split = options.split or demo_split()
-        buffer, name = choose_buffer(load_split(split, threads=1), options.episode, options.k)
+        buffer = choose_buffer(load_split(split, threads=1), options.episode, options.condition)
         print(machine("av", "lerobot"), end="\n\n", flush=True)
-        print(time_loading(split, buffer, name, options), end="\n\n", flush=True)
+        print(time_loading(split, buffer, options), end="\n\n", flush=True)
         print(measure_streaming(split, buffer, options.chunk))
     except InterferenceError as error:
         sys.exit(str(error))
@@ -68,7 +70,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument(
         "--episode", help="query episode; by default the one with the median lesson length"
     )
-    parser.add_argument("--k", type=int, default=7, help="distractor sessions, or the most planned")
+    parser.add_argument("--condition", help="by default the one with the most sessions")
     parser.add_argument("--rounds", type=positive, default=7, help="timed repetitions")
     parser.add_argument(
         "--threads", type=positive, default=2, help="threads of the second measurement"
@@ -77,7 +79,7 @@ def parse_options() -> argparse.Namespace:
         "--lerobot-frames",
         type=positive,
         default=48,
-        help="frames that LeRobotDataset reads in a round; its time is scaled to the whole buffer",
+        help="frames that LeRobotDataset reads in a round; its time is scaled to the whole",
     )
     parser.add_argument("--chunk", type=positive, default=64, help="frames in a chunk of stream()")
     return parser.parse_args()
@@ -91,19 +93,19 @@ def demo_split() -> Path:
     return DEMO_SPLIT
 
 
-def choose_buffer(split: Split, episode: str | None, k: int) -> tuple[Buffer, str]:
-    """Return the buffer to measure, and its name."""
-    k = min(k, max(split.k_values))
+def choose_buffer(split: Split, episode: str | None, condition: str | None) -> Buffer:
+    """Return the buffer to measure."""
+    name = condition or max(split.conditions, key=lambda name: parse_condition(name).k)
     if episode is None:
-        lengths = {m.lesson_frames: m.episode_id for m in split.manifests(k=k)}
+        lengths = {m.history_frames: m.episode_id for m in split.manifests(condition=name)}
         episode = str(lengths[statistics.median_low(lengths)])
-    return split.load(episode, k), f"{episode} at k{k}"
+    return split.load(episode, name)
 
 
-def time_loading(folder: Path, buffer: Buffer, name: str, options: argparse.Namespace) -> str:
+def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> str:
     """Time all ways of loading the front frames; return the table."""
     split = load_split(folder, threads=1)
-    episode, k, threads = buffer.episode_id, buffer.k, options.threads
+    key, threads = (buffer.episode_id, buffer.condition), options.threads
     spans = spans_of(buffer, split)
     wanted = buffer.frames("front")
 
@@ -124,8 +126,8 @@ def time_loading(folder: Path, buffer: Buffer, name: str, options: argparse.Name
     scale = len(items) / len(chosen)
     with tempfile.TemporaryDirectory(prefix="interference-cache-") as cache_folder:
         cache = DecodedCache(Path(cache_folder))
-        parallel = load_split(folder, threads=threads).load(episode, k)
-        cached = load_split(folder, cache=cache, threads=1).load(episode, k)
+        parallel = load_split(folder, threads=threads).load(*key)
+        cached = load_split(folder, cache=cache, threads=1).load(*key)
         found = [bare_kept(), parallel.frames("front"), cached.frames("front")]
         found += [np.stack([read_item(position) for position in chosen])]
         check_equal(found, [wanted] * 3 + [wanted[chosen]])
@@ -163,7 +165,8 @@ def time_loading(folder: Path, buffer: Buffer, name: str, options: argparse.Name
         row("cached", f"{ours}, cached, 1 thread", "copy", "np.copy", "≤ 3"),
     ]
     title = (
-        f"Front frames of {name}: {len(buffer)} frames, {len(buffer.sessions)} sessions; medians "
+        f"Front frames of {buffer.episode_id} under {buffer.condition}: {len(buffer)} frames, "
+        f"{len(buffer.sessions)} sessions; medians "
         f"of {options.rounds} rounds; LeRobotDataset timed on {len(chosen)} frames and scaled."
     )
     return table(title, COLUMNS, rows)
@@ -175,22 +178,14 @@ def check_equal(found: list[NDArray[np.uint8]], wanted: list[NDArray[np.uint8]])
         sys.exit("The ways of loading give different pixels: their times mean nothing.")
 
 
-def spans_of(buffer: Buffer, split: Split) -> list[Span]:
-    """Return where the front frames of a buffer lie."""
-    key = f"videos/{FRONT}/"
+def spans_of(buffer: Buffer, split: Split, camera: str = FRONT) -> list[Span]:
+    """Return where the frames of a camera lie."""
     spans = []
     for session in buffer.sessions:
-        entry = session.entry
-        dataset = split.datasets[entry.dataset]
-        row = dataset.episodes.slice(entry.episode_index, 1).to_pylist()[0]
-        path = dataset.info["video_path"].format(
-            video_key=FRONT,
-            chunk_index=row[key + "chunk_index"],
-            file_index=row[key + "file_index"],
-        )
-        fps = dataset.info["fps"]
-        first = round(row[key + "from_timestamp"] * fps)
-        spans.append(Span(dataset.files.path(path), first + entry.start, first + entry.stop, fps))
+        entry, lerobot = session.entry, split.datasets[session.entry.dataset].lerobot
+        path, first = lerobot.place(entry.episode_index).videos[camera]
+        start, stop = first + entry.start, first + entry.stop
+        spans.append(Span(lerobot.files.path(path), start, stop, lerobot.fps))
     return spans
 
 
@@ -209,6 +204,15 @@ def decode(span: Span) -> Iterator[NDArray[np.uint8]]:
                 return
 
 
+def open_lerobot(name: str, root: Path) -> Any:
+    """Open a dataset with lerobot."""
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    logging.disable(logging.WARNING)
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset(name, root=root, video_backend="pyav", return_uint8=True)
+
+
 def lerobot_reader(
     split: Split, buffer: Buffer
 ) -> tuple[Callable[[int], NDArray[np.uint8]], list[tuple[str, int]]]:
@@ -216,16 +220,10 @@ def lerobot_reader(
 
     LeRobotDataset decodes every camera of an item; here it is left with the front camera only.
     """
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")
-    logging.disable(logging.WARNING)
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    opened = {}
-    for name in (DEMONSTRATIONS, DISTRACTORS):
-        root = split.root / name
-        opened[name] = LeRobotDataset(name, root=root, video_backend="pyav", return_uint8=True)
-        for camera in [key for key in opened[name].meta.video_keys if key != FRONT]:
-            del opened[name].meta.info.features[camera]
+    opened = {name: open_lerobot(name, split.root / name) for name in split.datasets}
+    for dataset in opened.values():
+        for camera in [key for key in dataset.meta.video_keys if key != FRONT]:
+            del dataset.meta.info.features[camera]
     frames = []
     for session in buffer.sessions:
         entry = session.entry
@@ -243,14 +241,15 @@ def lerobot_reader(
 def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
     """Measure the peak memory of streaming buffers of all lengths; return the table."""
     split = load_split(folder)
-    cases = [(k, 1) for k in split.k_values] + [(max(split.k_values), TIMES_LONGER)]
+    names = [name for name in split.conditions if split.manifest(buffer.episode_id, name).sessions]
+    cases = [(name, 1) for name in names] + [(names[-1], TIMES_LONGER)]
     peaks, rows = [], []
-    for k, times in cases:
+    for name, times in cases:
         frames, decoded, peak = in_fresh_process(
-            stream_peak, str(folder), str(buffer.episode_id), k, times, chunk
+            stream_peak, str(folder), str(buffer.episode_id), name, times, chunk
         )
         peaks.append(peak)
-        label = f"k{k}" if times == 1 else f"k{k}, {times} times as long"
+        label = name if times == 1 else f"{name}, {times} times as long"
         rows.append([label, f"{frames:,}", megabytes(decoded), megabytes(peak)])
     title = (
         f"Peak memory of Buffer.stream(chunk={chunk}), front camera, over what the process holds "
@@ -259,16 +258,18 @@ def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
     return table(title, ("<buffer", ">frames", ">decoded MB", ">peak MB"), rows)
 
 
-def stream_peak(folder: str, episode: str, k: int, times: int, chunk: int) -> tuple[int, int, int]:
+def stream_peak(
+    folder: str, episode: str, condition: str, times: int, chunk: int
+) -> tuple[int, int, int]:
     """Stream a buffer, its sessions so many times over; return frames, their bytes, the peak."""
     split = load_split(folder)
-    manifest = split.manifest(episode, k)
+    manifest = split.manifest(episode, condition)
     longer = dataclasses.replace(
         manifest,
         sessions=manifest.sessions * times,
         history_frames=manifest.history_frames * times,
     )
-    buffer = Buffer(longer, split.datasets)
+    buffer = Buffer(longer, split.query(episode), split.datasets)
     before = peak_memory()
     decoded = sum(part.frames["front"].nbytes for part in buffer.stream(chunk, ("front",)))
     return len(buffer), decoded, peak_memory() - before

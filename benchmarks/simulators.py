@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.execution import Processes, Worker
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.registry import own_simulator
-from robomme_interference_data.workers import run_tasks
+from robomme_interference_data.simulators import Simulator, Status, make_simulator
 
 EPISODE = "MoveCube/test/0"
 
@@ -58,8 +58,6 @@ def _pick_cube() -> Callable[[], None]:
 
 
 def _tabletop() -> Callable[[], None]:
-    from robomme_interference_data.simulators import make_simulator
-
     simulator = make_simulator("tabletop")
     _, first, _ = simulator.reset(EPISODE)
     action = np.append(first.state[:7], 1).astype(np.float32)
@@ -91,8 +89,6 @@ def resets() -> None:
 
     In brackets: seconds of processor time, which other work on the machine does not lengthen much.
     """
-    from robomme_interference_data.simulators import make_simulator
-
     simulator = make_simulator("tabletop")
     simulator.reset(EPISODE)
     print("| family | easy | medium | hard | frames |\n| --- | --- | --- | --- | --- |")
@@ -107,13 +103,19 @@ def resets() -> None:
         print(f"| {family} | {' | '.join(seconds)} | {', '.join(frames)} |", flush=True)
 
 
-def _play(episode: EpisodeId | None) -> None:
-    simulator = own_simulator("tabletop")
-    if episode is None:  # only start up
-        return
-    simulator.reset(str(episode))
-    for _ in range(100):
-        simulator.step(simulator.act("oracle"))
+class _Play:
+    """Plays 100 steps of episodes, each worker on a simulator of its own."""
+
+    simulator: Simulator | None = None
+
+    def __call__(self, episode: EpisodeId | None, worker: Worker) -> None:
+        self.simulator = self.simulator or make_simulator("tabletop")
+        if episode is None:  # only start up
+            return
+        self.simulator.reset(str(episode))
+        for _ in range(100):
+            if self.simulator.step(self.simulator.act("oracle"))[1] is not Status.ONGOING:
+                break
 
 
 def workers(episodes: int = 24) -> None:
@@ -122,7 +124,8 @@ def workers(episodes: int = 24) -> None:
     taken = {1: 0.0, 2: 0.0}
     for count in (1, 2, 2, 1):  # so that neither has the better half of the time
         started = 0.0
-        for number, _ in enumerate(run_tasks(_play, [*[None] * count, *todo], workers=count)):
+        outcomes = Processes(count).run(_Play(), [*[None] * count, *todo])
+        for number, _ in enumerate(outcomes):
             if number == 0:  # the others are up at about the same time; if later, it counts
                 started = time.perf_counter()
         taken[count] += (time.perf_counter() - started) / (2 * episodes)
@@ -136,9 +139,7 @@ def leaks(episodes: int = 100) -> None:
     Demonstrations are played without drawing them, to be through in minutes; the first live
     observation and ten steps are drawn.
     """
-    from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
-
-    simulator = TabletopSimulator()
+    simulator = make_simulator("tabletop")
     print("| episodes | resident MiB | open files |\n| --- | --- | --- |")
     for number in range(episodes + 1):
         episode = f"{FAMILIES[number % len(FAMILIES)]}/train/{number // 9 % 100}"

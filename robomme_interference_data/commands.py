@@ -1,5 +1,6 @@
 """Commands that look at splits and at this machine: `list`, `show` and `doctor`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -120,10 +121,10 @@ def doctor(as_json: AsJson = False) -> None:
     """
     from robomme_interference_data import doctor as module
 
-    checks = module.checks()
+    rows = module.checks()
     if as_json:
-        typer.echo(module.to_json(checks))
+        print_json([asdict(row) for row in rows])
     else:
-        typer.echo(module.render(checks))
-    if module.any_failed(checks):
+        typer.echo(module.report(rows).text())
+    if module.any_failed(rows):
         raise typer.Exit(1)

@@ -1,47 +1,43 @@
 """Find out what works on this machine, and which command mends what does not.
 
-Nothing heavy is imported: installed versions are read from the packages' metadata.
+Nothing heavy is imported: installed versions are read from the packages' metadata, and other
+processes are asked whether the simulators work.
 """
 
 import ctypes
-import json
 import os
 import platform
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from importlib import metadata
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata, util
 from pathlib import Path
 
 from packaging.requirements import Requirement
-from rich.table import Table
-from rich.text import Text
 
-from robomme_interference_data.vulkan import find_vulkan
+from robomme_interference_data.errors import InterferenceError, first_line
+from robomme_interference_data.tables import Column, Table
 
-__all__ = ["Check", "any_failed", "checks", "render", "to_json"]
+__all__ = ["Check", "any_failed", "checks", "report"]
 
 DISTRIBUTION = "robomme-interference-data"
 
 MIN_PYTHON = (3, 12)
 
-_CODECS = (("libaom-av1", "w"), ("libsvtav1", "w"), ("libdav1d", "r"))
+CODECS = (("libaom-av1", "w"), ("libsvtav1", "w"), ("libdav1d", "r"))
 """Codecs that datasets are written and read with: FFmpeg's name, `w` encoder or `r` decoder."""
 
-_LIBAVUTIL_VERSIONS = range(60, 55, -1)
+LIBAVUTIL = range(60, 55, -1)
 """Versions of libavutil in FFmpeg 8 to 4, which torchcodec can load."""
 
-_ROBOMME_TIMEOUT_S = 120
+RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
+"""The program that draws a picture: a broken driver can crash its process or never return."""
 
-_EXTRAS = {
-    "build": "Build datasets",
-    "sim": "Simulator",
-    "evaluate": "Evaluate",
-    "retrieval": "Retrieval",
-    "score": "Score",
-}
+RENDERER_S, ROBOMME_S = 30, 120
+"""Seconds that the simulators have to answer."""
 
 
 @dataclass(frozen=True)
@@ -63,22 +59,22 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """Look at everything; takes about a second."""
+    """Look at everything; takes a few seconds."""
     return [
-        _python(),
-        _core(),
-        _video(),
-        _extra("build"),
-        _shared_ffmpeg(),
-        _opencv(),
-        _extra("sim"),
-        _vulkan(),
-        _robomme(),
-        _extra("evaluate"),
-        _extra("retrieval"),
-        _extra("score"),
-        _hub_token(),
-        _hub_cache(),
+        check_python(),
+        check_packages("Core libraries"),
+        check_video(CODECS),
+        check_packages("Build datasets", "build"),
+        check_shared_ffmpeg(LIBAVUTIL),
+        check_opencv(),
+        check_packages("Simulator", "sim"),
+        check_renderer(),
+        check_robomme(),
+        check_packages("Evaluate", "evaluate"),
+        check_packages("Retrieval", "retrieval"),
+        check_packages("Score", "score"),
+        check_hub_token(),
+        check_hub_cache(),
     ]
 
 
@@ -87,27 +83,20 @@ def any_failed(rows: Sequence[Check]) -> bool:
     return any(row.ok is False for row in rows)
 
 
-def render(rows: Sequence[Check]) -> Table:
-    """Return the rows as a table for a terminal."""
-    words = {True: ("ok", "green"), False: ("FAILS", "bold red"), None: ("absent", "yellow")}
-    table = Table(show_lines=False, pad_edge=False, box=None)
-    for title in ("", "what", "found"):
-        table.add_column(title, overflow="fold", no_wrap=title == "")
+def report(rows: Sequence[Check]) -> Table:
+    """Return the rows as a table for a terminal; what mends one stands below it."""
+    words = {True: "ok", False: "FAILS", None: "absent"}
+    lines: list[tuple[str, str, str]] = []
     for row in rows:
-        # Text, not markup: a fix such as pip install "…[build]" holds brackets.
-        found = Text(row.detail)
+        lines.append((words[row.ok], row.name, row.detail))
         if row.fix is not None:
-            found.append(f"\nto mend: {row.fix}", style="cyan")
-        table.add_row(Text(*words[row.ok]), Text(row.name), found)
-    return table
+            lines.append(("", "", f"to mend: {row.fix}"))
+    columns = (Column(""), Column("what"), Column("found"))
+    return Table("doctor", "", columns, tuple(lines))
 
 
-def to_json(rows: Sequence[Check]) -> str:
-    """Return the rows as a JSON list of objects with the fields of `Check`."""
-    return json.dumps([asdict(row) for row in rows], indent=2, ensure_ascii=False)
-
-
-def _python() -> Check:
+def check_python() -> Check:
+    """Look at this interpreter."""
     ok = sys.version_info >= MIN_PYTHON
     needed = ".".join(map(str, MIN_PYTHON))
     return Check(
@@ -118,26 +107,24 @@ def _python() -> Check:
     )
 
 
-def _core() -> Check:
-    fix = f"pip install --upgrade {DISTRIBUTION}"
-    try:
-        ok, detail = _describe(_requirements(DISTRIBUTION, ""))
-    except metadata.PackageNotFoundError:
-        return Check("Core libraries", False, f"{DISTRIBUTION} itself is not installed", fix)
-    return Check("Core libraries", ok, detail, None if ok else fix)
+# --- packages ----------------------------------------------------------------------------------
 
 
-def _extra(extra: str) -> Check:
+def check_packages(name: str, extra: str = "") -> Check:
+    """Look at the packages of an extra; without one, at those that are always needed."""
     try:
-        ok, detail = _describe(_requirements(DISTRIBUTION, extra))
+        needed = _requirements(DISTRIBUTION, extra)
+        problems = [problem for requirement in needed for problem in _problems(requirement)]
     except metadata.PackageNotFoundError:
-        ok, detail = False, f"{DISTRIBUTION} itself is not installed"
-    return Check(
-        f"{_EXTRAS[extra]} [{extra}]",
-        True if ok else None,
-        detail,
-        None if ok else f'pip install "{DISTRIBUTION}[{extra}]"',
-    )
+        needed, problems = [], [f"{DISTRIBUTION} itself is not installed"]
+    if not problems:
+        problems = [f"{item.name} {metadata.version(item.name)}" for item in needed]
+        ok, fix = True, None
+    elif extra:
+        ok, fix = None, f'pip install "{DISTRIBUTION}[{extra}]"'
+    else:
+        ok, fix = False, f"pip install --upgrade {DISTRIBUTION}"
+    return Check(f"{name} [{extra}]" if extra else name, ok, ", ".join(problems), fix)
 
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:
@@ -154,15 +141,6 @@ def _requirements(distribution: str, extra: str) -> list[Requirement]:
     ]
 
 
-def _describe(requirements: Sequence[Requirement]) -> tuple[bool, str]:
-    """Return whether all requirements are met, and the installed versions or what is wrong."""
-    problems = [problem for requirement in requirements for problem in _problems(requirement)]
-    if problems:
-        return False, ", ".join(problems)
-    versions = (f"{item.name} {metadata.version(item.name)}" for item in requirements)
-    return True, ", ".join(versions)
-
-
 def _problems(requirement: Requirement) -> Iterator[str]:
     """Yield what is missing or of a wrong version, extras of the requirement included."""
     try:
@@ -177,7 +155,28 @@ def _problems(requirement: Requirement) -> Iterator[str]:
             yield from _problems(nested)
 
 
-def _video() -> Check:
+def check_opencv() -> Check:
+    """Look whether two packages of OpenCV overwrite each other's files."""
+    found = []
+    for name in ("opencv-python", "opencv-python-headless"):
+        with suppress(metadata.PackageNotFoundError):
+            found.append(f"{name} {metadata.version(name)}")
+    if len(found) < 2:
+        return Check("OpenCV", True if found else None, "".join(found) or "not installed")
+    return Check(
+        "OpenCV",
+        False,
+        f"{', '.join(found)} overwrite each other's files",
+        "pip uninstall -y opencv-python opencv-python-headless && "
+        'pip install "opencv-python-headless<4.14"',
+    )
+
+
+# --- video ---------------------------------------------------------------------------------------
+
+
+def check_video(codecs: Sequence[tuple[str, str]]) -> Check:
+    """Look for codecs in PyAV's own FFmpeg."""
     name = "Video (PyAV)"
     fix = 'pip install --force-reinstall --only-binary av "av>=14"'
     try:
@@ -185,7 +184,7 @@ def _video() -> Check:
     except ImportError as error:
         return Check(name, False, str(error), fix)
     missing = []
-    for codec, mode in _CODECS:
+    for codec, mode in codecs:
         try:
             av.codec.Codec(codec, mode)
         except ValueError:
@@ -193,82 +192,72 @@ def _video() -> Check:
     versions = f"FFmpeg {av.ffmpeg_version_info} in PyAV {av.__version__}"
     if missing:
         return Check(name, False, f"{versions} has no {', '.join(missing)}", fix)
-    return Check(name, True, f"{versions} with {', '.join(codec for codec, _ in _CODECS)}")
+    return Check(name, True, f"{versions} with {', '.join(codec for codec, _ in codecs)}")
 
 
-def _shared_ffmpeg() -> Check:
+def check_shared_ffmpeg(versions: Sequence[int]) -> Check:
+    """Look for FFmpeg's shared libraries."""
     name = "FFmpeg's shared libraries"
-    pattern = "libavutil.{}.dylib" if sys.platform == "darwin" else "libavutil.so.{}"
-    for version in _LIBAVUTIL_VERSIONS:
+    mac = sys.platform == "darwin"
+    for version in versions:
+        library = f"libavutil.{version}.dylib" if mac else f"libavutil.so.{version}"
         try:
-            ctypes.CDLL(pattern.format(version))
+            ctypes.CDLL(library)
         except OSError:
             continue
-        return Check(name, True, f"{pattern.format(version)}, for torchcodec")
-    install = "brew install ffmpeg" if sys.platform == "darwin" else "sudo apt-get install ffmpeg"
+        return Check(name, True, f"{library}, for torchcodec")
+    install = "brew install ffmpeg" if mac else "sudo apt-get install ffmpeg"
     return Check(name, None, "not found; only torchcodec needs them", install)
 
 
-def _opencv() -> Check:
-    installed = {}
-    for package in ("opencv-python", "opencv-python-headless"):
-        try:
-            installed[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    found = ", ".join(f"{package} {version}" for package, version in installed.items())
-    if len(installed) < 2:
-        return Check("OpenCV", True if installed else None, found or "not installed")
-    return Check(
-        "OpenCV",
-        False,
-        f"{found} overwrite each other's files",
-        "pip uninstall -y opencv-python opencv-python-headless && "
-        'pip install "opencv-python-headless<4.14"',
-    )
+# --- simulators ----------------------------------------------------------------------------------
 
 
-def _vulkan() -> Check:
-    report = find_vulkan()
-    if report.problem is None:
-        usable = [device for device in report.devices if device.usable]
-        names = [d.name + (", on the CPU" if d.software else "") for d in usable]
-        return Check("Vulkan", True, "; ".join(names))
-    return Check(
-        "Vulkan",
-        None,
-        f"{report.problem}; only simulators need it",
-        "sudo make vulkan (in a checkout, on Debian), or install your GPU's Vulkan driver",
-    )
-
-
-def _robomme() -> Check:
-    name = "Official simulator"
-    fix = "export ROBOMME_PYTHON=PATH, the Python of an environment that RoboMME is installed in"
-    python = os.environ.get("ROBOMME_PYTHON")
-    if not python:
-        return Check(
-            name, None, "ROBOMME_PYTHON is not set; only --simulator robomme needs it", fix
-        )
+def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check:
+    """Let the simulator's renderer draw a picture."""
+    name, only = "Vulkan", "; only simulators need it"
+    if util.find_spec("sapien") is None:
+        return Check(name, None, f"not tried without sapien{only}")
+    fix = "sudo make vulkan (in a checkout, on Debian), or install your GPU's Vulkan driver"
     try:
         done = subprocess.run(
-            [python, Path(__file__).parent / "simulators" / "robomme_worker.py"],
-            env={**os.environ, "PYTHONSAFEPATH": "1"},
+            [sys.executable, "-m", module],
             capture_output=True,
             text=True,
-            timeout=_ROBOMME_TIMEOUT_S,
-            check=True,
+            timeout=seconds,
+            check=False,
         )
-        found = json.loads(done.stdout.splitlines()[-1])
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError) as error:
-        return Check(name, False, f"{python} cannot be asked: {error}", fix)
-    if "problem" in found:
-        return Check(name, False, f"{python}: {found['problem']}", fix)
-    versions = f"Python {found['python']}, numpy {found['numpy']}"
-    return Check(name, True, f"{python}: {versions}, {len(found['families'])} families")
+    except subprocess.TimeoutExpired:
+        return Check(name, None, f"a driver did not answer within {seconds:g} s{only}", fix)
+    if done.returncode == 0:
+        return Check(name, True, f"drawn with {done.stdout.strip()}")
+    words = done.stderr.strip().splitlines() or [f"a driver crashed (exit code {done.returncode})"]
+    return Check(name, None, words[-1] + only, fix)
 
 
-def _hub_token() -> Check:
+def check_robomme() -> Check:
+    """Start RoboMME's interpreter, if one is named."""
+    from robomme_interference_data.simulators.robomme import PYTHON_VARIABLE, RoboMMESimulator
+
+    name = "Official simulator"
+    fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
+    python = os.environ.get(PYTHON_VARIABLE)
+    if not python:
+        detail = f"{PYTHON_VARIABLE} is not set; only --simulator robomme needs it"
+        return Check(name, None, detail, fix)
+    try:
+        with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
+            versions = [f"{key} {value}" for key, value in simulator.versions.items()]
+    except InterferenceError as error:
+        return Check(name, False, first_line(error), fix)
+    return Check(name, True, f"{python}: {', '.join(versions)}")
+
+
+# --- the Hub -------------------------------------------------------------------------------------
+
+
+def check_hub_token() -> Check:
+    """Look for a token; it is not shown."""
     from huggingface_hub import get_token
 
     if get_token():
@@ -276,7 +265,8 @@ def _hub_token() -> Check:
     return Check("Hub token", None, "none; only private datasets need it", "hf auth login")
 
 
-def _hub_cache() -> Check:
+def check_hub_cache() -> Check:
+    """Look whether the Hub's cache can be written, and how much room it has."""
     from huggingface_hub import constants
 
     cache = Path(constants.HF_HUB_CACHE)

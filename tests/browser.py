@@ -101,6 +101,9 @@ def open_page() -> Iterator[Page]:
     with tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True) as profile:
         options = ["--headless", "--disable-gpu", "--remote-debugging-port=0", "--no-first-run"]
         options += ["--disable-dev-shm-usage", f"--user-data-dir={profile}"]
+        # Else it asks for its maker's hosts at every start.
+        options += ["--disable-background-networking", "--disable-component-update"]
+        options += ["--disable-sync", "--disable-quic"]
         options += ["--no-sandbox"] if os.geteuid() == 0 else []
         process = subprocess.Popen(
             [found, *options, "about:blank"],

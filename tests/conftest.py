@@ -101,9 +101,9 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def tabletop() -> Iterator[Any]:
-    """The embedded simulator in this process, a `TabletopSimulator`."""
+    """The embedded simulator in this process, a `TabletopSimulator`: making it takes seconds."""
     from robomme_interference_data.errors import NoRendererError
     from robomme_interference_data.simulators import make_simulator
 
@@ -135,7 +135,7 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     It behaves badly, or ends an episode, where the episode's index asks for it.
     """
-    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "robomme_stand_in"))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "support" / "robomme_stand_in"))
     return bare_python
 
 

@@ -8,12 +8,12 @@ observation, status = simulator.step(action)
 simulator.close()
 """
 
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.base import (
     Demonstration,
     EpisodeInfo,
     Observation,
     Simulator,
-    Status,
 )
 from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
 

@@ -1,22 +1,30 @@
 """What every simulator serves, whatever engine is behind it."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
 
 __all__ = [
+    "ACTION_SIZE",
     "CAMERAS",
     "Demonstration",
     "EpisodeInfo",
     "Observation",
+    "OneAtATime",
     "Simulator",
-    "Status",
     "action_array",
     "camera_names",
 ]
@@ -24,18 +32,8 @@ __all__ = [
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""
 
-
-class Status(StrEnum):
-    """How an episode stands after a step.
-
-    `error` means that the simulator itself broke: such a rollout is no failure of the policy.
-    """
-
-    ONGOING = "ongoing"
-    SUCCESS = "success"
-    FAIL = "fail"
-    TIMEOUT = "timeout"
-    ERROR = "error"
+ACTION_SIZE = 8
+"""Numbers of an action, and of a state: 7 joints, then the gripper."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +94,9 @@ class EpisodeInfo:
     simulator: str
 
 
+Begun = tuple[Demonstration, Observation, EpisodeInfo]
+
+
 class Simulator(Protocol):
     """One episode at a time of the benchmark's task families.
 
@@ -103,9 +104,7 @@ class Simulator(Protocol):
     history while it begins the episode.
     """
 
-    def reset(
-        self, episode_id: str, demonstration: bool = True
-    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
+    def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
         """Start an episode: play its demonstration, then set the scene for execution.
 
         The same id gives the same frames, states and first observation, bit for bit.
@@ -114,6 +113,9 @@ class Simulator(Protocol):
             episode_id: `<Family>/<split>/<index>`, such as `MoveCube/test/3`.
             demonstration: Whether the frames of the demonstration are wanted. It is played in any
                 case; without, a simulator need not draw it, and its `images` may be empty.
+
+        Returns:
+            The demonstration, the first live observation, and what may be known of the episode.
 
         Raises:
             InvalidIdError: The text is not an episode id.
@@ -155,6 +157,71 @@ class Simulator(Protocol):
         ...
 
 
+class OneAtATime(ABC):
+    """What this package's simulators share: when there is an episode to step, and its time limit.
+
+    An episode that is refused, breaks or ends leaves none to step. One that goes on after 1300
+    steps has timed out.
+    """
+
+    _episode: EpisodeId | None = None
+    _steps = 0
+    _closed = False
+
+    def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
+        """Start an episode; see `Simulator.reset`."""
+        self._episode = None
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
+        episode = EpisodeId.parse(str(episode_id))
+        begun = self._begin(episode, demonstration)
+        self._episode, self._steps = episode, 0
+        return begun
+
+    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
+        """Execute one action; see `Simulator.step`."""
+        episode = self._running()
+        action = action_array(action)
+        self._episode = None
+        self._steps += 1
+        seen, status = self._execute(episode, action, observe)
+        if status is Status.ONGOING:
+            if self._steps >= MAX_STEPS:
+                return seen, Status.TIMEOUT
+            self._episode = episode
+        return seen, status
+
+    def close(self) -> None:
+        """Release everything; further calls but `close` are errors."""
+        self._episode, self._closed = None, True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def _running(self) -> EpisodeId:
+        """Return the episode that runs."""
+        if self._closed:
+            raise SimulatorCrashError("the simulator is closed", "Make another one.")
+        if self._episode is None:
+            raise SimulatorCrashError(
+                "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
+            )
+        return self._episode
+
+    @abstractmethod
+    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+        """Start an episode."""
+
+    @abstractmethod
+    def _execute(
+        self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
+    ) -> tuple[Observation, Status]:
+        """Execute one action in the episode that runs."""
+
+
 def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:
     """Return the cameras that are asked of a simulator, in the order of `CAMERAS`.
 
@@ -163,31 +230,36 @@ def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:
         UnknownNameError: There is no such camera.
     """
     if not isinstance(cameras, list | tuple):
-        raise InvalidOptionError(
-            f"cameras {cameras!r}; expected a list of names", f"Known: {', '.join(CAMERAS)}"
-        )
+        raise InvalidOptionError.expected("cameras", cameras, "a list of names")
     for camera in cameras:
         if camera not in CAMERAS:
-            raise UnknownNameError(
-                f"the {simulator} simulator has no camera {camera!r}",
-                nearest(str(camera), CAMERAS),
-            )
+            raise UnknownNameError.among("camera", camera, f"the {simulator} simulator", CAMERAS)
     return tuple(camera for camera in CAMERAS if camera in cameras)
 
 
-def action_array(action: ArrayLike) -> NDArray[np.float32]:
-    """Return an action as `(8,) float32`.
+def action_array(action: ArrayLike, *, chunk: bool = False) -> NDArray[np.float32]:
+    """Return an action as `(8,) float32`: the one check of actions.
+
+    Args:
+        action: 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.
+        chunk: Whether these are several actions, returned as `(n, 8) float32`, n at least 1.
 
     Raises:
         InvalidOptionError: It has another shape, or is not finite numbers.
     """
-    hint = "Expected 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open."
     try:
-        array = np.asarray(action, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise InvalidOptionError(f"an action is 8 finite numbers, not {action!r}", hint) from error
-    if array.shape != (8,) or not np.isfinite(array).all():
-        raise InvalidOptionError(
-            f"an action is 8 finite numbers, not {array.shape} {array.tolist()}", hint
-        )
-    return array
+        given = np.asarray(action)
+    except ValueError:  # rows of several lengths
+        given = np.empty(0)
+    shape = given.shape[1:] if chunk else given.shape
+    if shape == (ACTION_SIZE,) and given.dtype.kind in "fiu":
+        with np.errstate(over="ignore"):
+            array = given.astype(np.float32)
+        if len(array) and np.isfinite(array).all():
+            return array
+    expected = f"(n, {ACTION_SIZE}) actions, n at least 1" if chunk else f"({ACTION_SIZE},) action"
+    raise InvalidOptionError(
+        f"{given.dtype} {given.shape} {np.array2string(given, threshold=2 * ACTION_SIZE)} is no "
+        f"{expected}, of finite numbers",
+        "An action is 7 absolute joint targets in rad, then the gripper, −1 closed to 1 open.",
+    )

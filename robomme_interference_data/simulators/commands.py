@@ -1,31 +1,23 @@
-"""The commands `simulate` and `simulate-score`."""
+"""The command `simulate`."""
 
-import json
-from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.progress import MofNCompleteColumn, Progress
 
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
-from robomme_interference_data.progress import MESSAGES
-from robomme_interference_data.simulators.base import Observation, Status
+from robomme_interference_data.console import AsJson, print_json
+from robomme_interference_data.errors import InvalidOptionError
 
-__all__ = ["simulate", "simulate_score"]
+__all__ = ["simulate"]
 
+POLICIES = ("oracle", "guess", "none")
+"""Built-in policies; `none` plays the demonstration only, which is all that robomme can do."""
 
-POLICIES = ("oracle", "guess")
-
-NO_POLICY = "none"
-"""Plays the demonstration only: all that there is to see where no policy is built in."""
-
-Policy = Annotated[str, typer.Option(help="oracle: knows the answer; guess: draws one.")]
-Json = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
+LESSON, LIVE = (40, 90, 200), (230, 130, 20)
+"""Colours of the bar above the pictures."""
 
 
 def simulate(
@@ -40,10 +32,10 @@ def simulate(
         ),
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Write a video here, .mp4.")] = None,
-    as_json: Json = False,
+    as_json: AsJson = False,
     simulator: Annotated[str, typer.Option(help="tabletop or robomme.")] = "tabletop",
     robomme_python: Annotated[
-        Path | None,
+        str | None,
         typer.Option(help="RoboMME's own interpreter.", envvar="ROBOMME_PYTHON", show_envvar=True),
     ] = None,
 ) -> None:
@@ -53,33 +45,45 @@ def simulate(
     orange one while the policy acts.
 
     Examples:
-    robomme-interference simulate --family MoveCube --episode 3 --video out.mp4;
+    ```
+    robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
     robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
+    ```
     """
+    from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId
+    from robomme_interference_data.records import Status
     from robomme_interference_data.simulators.registry import make_simulator
 
-    policies = (NO_POLICY,) if simulator == "robomme" else (*POLICIES, NO_POLICY)
+    policies = POLICIES if simulator != "robomme" else POLICIES[2:]
     policy = policy or policies[0]
-    _check(policy, policies)
-    if video is not None and video.suffix != ".mp4":
-        raise InvalidOptionError(
-            f"cannot write {video}: only .mp4 is written", "Give a path that ends in .mp4."
-        )
-    if video is not None:
-        _check_folder(video)
+    if policy not in policies:
+        raise InvalidOptionError.one_of(f"--policy on {simulator}", policy, policies)
+    if video is not None and (video.suffix != ".mp4" or video.is_dir()):
+        raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     name = EpisodeId(family, split, episode)
     options: dict[str, Any] = {}
     if simulator == "tabletop":
         options = {"render": video is not None}
     elif simulator == "robomme":
         options = {"python": robomme_python}
-    with closing(make_simulator(simulator, **options)) as running:
-        lesson, first, info = running.reset(str(name))
-        live, status = [first], Status.ONGOING
-        while status is Status.ONGOING and policy != NO_POLICY:
+    with ExitStack() as stack:
+        # First: minutes are spent on what is to be in it.
+        clip = None if video is None else _Clip(stack.enter_context(atomic_path(video)))
+        running = stack.enter_context(closing(make_simulator(simulator, **options)))
+        lesson, seen, info = running.reset(str(name))
+        if clip is not None:
+            for index in range(len(lesson)):
+                clip.add({camera: f[index] for camera, f in lesson.images.items()}, LESSON)
+            clip.add(seen.images, LIVE)
+        steps, status = 0, Status.ONGOING
+        while status is Status.ONGOING and policy != "none":
             seen, status = running.step(running.act(policy))
-            live.append(seen)
+            steps += 1
+            if clip is not None:
+                clip.add(seen.images, LIVE)
+        if clip is not None:
+            clip.close()
     result: dict[str, Any] = {
         "episode": str(name),
         "simulator": info.simulator,
@@ -89,99 +93,35 @@ def simulate(
         "policy": policy,
         "status": str(status),
         "lesson_frames": len(lesson),
-        "steps": len(live) - 1,
+        "steps": steps,
     }
     if video is not None:
-        frames = [_picture(lesson.images, (40, 90, 200), index) for index in range(len(lesson))]
-        frames += [_picture(_one(seen), (230, 130, 20), 0) for seen in live]
-        _write_video(video, frames)
         result["video"] = str(video)
     if as_json:
-        typer.echo(json.dumps(result, ensure_ascii=False))
-    else:
-        for key, value in result.items():
-            typer.echo(f"{key.replace('_', ' ')}: {value}")
+        print_json(result)
+        return
+    for key, value in result.items():
+        typer.echo(f"{key.replace('_', ' ')}: {value}")
 
 
-def simulate_score(
-    policy: Policy = "oracle",
-    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
-    family: Annotated[str | None, typer.Option(help="One family; all by default.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Worker processes.")] = 1,
-    as_json: Json = False,
-) -> None:
-    """Play all episodes of a split with a built-in policy, and write a Markdown table.
+class _Clip:
+    """Both cameras side by side, under a bar of a colour, frame by frame into a file."""
 
-    Example: robomme-interference simulate-score --policy guess --workers 2
-    """
-    from robomme_interference_data.simulators.score import markdown_table, play_all
-    from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+    def __init__(self, path: Path):
+        self._path = path
+        self._encoder: Any = None
 
-    _check(policy, POLICIES)
-    episodes, outcomes = episode_ids(family, split), []
-    with Progress(
-        *Progress.get_default_columns(), MofNCompleteColumn(), console=MESSAGES
-    ) as progress:
-        bar = progress.add_task("episodes", total=len(episodes))
-        for outcome in play_all(policy, episodes, workers=workers):
-            outcomes.append(outcome)
-            progress.advance(bar)
-            if outcome.why or (policy == "oracle" and outcome.status is not Status.SUCCESS):
-                MESSAGES.print(f"{outcome.episode}: {outcome.status} {outcome.why}")
-    outcomes.sort(key=lambda outcome: episodes.index(outcome.episode))
-    if as_json:
-        rows = [{**vars(o), "episode": str(o.episode), "status": str(o.status)} for o in outcomes]
-        typer.echo(json.dumps(rows))
-    else:
-        typer.echo(markdown_table(outcomes))
+    def add(self, images: dict[str, NDArray[np.uint8]], colour: tuple[int, int, int]) -> None:
+        from robomme_interference_data.constants import FPS
+        from robomme_interference_data.encode import CLIP, VideoEncoder
 
+        picture = np.concatenate(list(images.values()), axis=1)
+        bar = np.full((16, picture.shape[1], 3), colour, np.uint8)
+        picture = np.concatenate([bar, picture])
+        if self._encoder is None:
+            height, width, _ = picture.shape
+            self._encoder = VideoEncoder(self._path, CLIP, FPS, height, width, container="mp4")
+        self._encoder.add(picture)
 
-def _check(policy: str, policies: Sequence[str]) -> None:
-    if policy not in policies:
-        raise UnknownNameError(
-            f"there is no built-in policy {policy!r} here; expected {' or '.join(policies)}",
-            nearest(policy, policies),
-        )
-
-
-def _check_folder(video: Path) -> None:
-    """Make the folder of a video, before minutes are spent on what is to be in it."""
-    hint = "Give a path in a folder where you may write."
-    if video.is_dir():
-        raise InvalidOptionError(f"cannot write {video}: it is a folder", hint)
-    try:
-        video.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=video.parent):
-            pass
-    except OSError as error:
-        raise InvalidOptionError(f"cannot write {video}: {error.strerror}", hint) from error
-
-
-def _one(seen: Observation) -> dict[str, NDArray[np.uint8]]:
-    return {name: image[None] for name, image in seen.images.items()}
-
-
-def _picture(
-    images: dict[str, NDArray[np.uint8]], colour: tuple[int, int, int], index: int
-) -> NDArray[np.uint8]:
-    """Both cameras side by side under a bar of a colour."""
-    picture = np.concatenate([images["front"][index], images["wrist"][index]], axis=1)
-    bar = np.empty((16, picture.shape[1], 3), np.uint8)
-    bar[:] = colour
-    return np.concatenate([bar, picture])
-
-
-def _write_video(path: Path, frames: list[NDArray[np.uint8]]) -> None:
-    import av
-
-    from robomme_interference_data.constants import FPS
-    from robomme_interference_data.files import atomic_path
-
-    with atomic_path(path) as partial, av.open(str(partial), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=FPS)
-        stream.height, stream.width = frames[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "20"}
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
+    def close(self) -> None:
+        self._encoder.close()

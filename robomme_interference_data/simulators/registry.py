@@ -1,53 +1,28 @@
 """Simulators by name; the libraries behind them are imported when one is made."""
 
 from collections.abc import Callable
-from functools import cache
 from importlib import import_module
-from inspect import signature
 from typing import Any
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    MissingExtraError,
-    UnknownNameError,
-    nearest,
-)
+from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Simulator
 
-__all__ = [
-    "SIMULATORS",
-    "find_simulator",
-    "make_simulator",
-    "own_simulator",
-    "simulator_versions",
-]
+__all__ = ["SIMULATORS", "find_simulator", "make_simulator", "simulator_versions"]
 
 
 def _tabletop(**options: Any) -> Simulator:
     try:
         from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
     except ImportError as error:
-        raise MissingExtraError(
-            f"the tabletop simulator needs {error.name or 'a library'}, which is not installed",
-            "pip install 'robomme-interference-data[sim]'",
-        ) from error
-    return _with_options("tabletop", TabletopSimulator, options)
+        library = error.name or "a library"
+        raise MissingExtraError.needs("the tabletop simulator", library, "sim") from error
+    return TabletopSimulator(**options)
 
 
 def _robomme(**options: Any) -> Simulator:
-    from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+    from robomme_interference_data.simulators.robomme import RoboMMESimulator
 
-    return _with_options("robomme", RoboMMESimulator, options)
-
-
-def _with_options(name: str, make: Callable[..., Simulator], options: dict[str, Any]) -> Simulator:
-    known = signature(make).parameters
-    for option in options:
-        if option not in known:
-            raise InvalidOptionError(
-                f"the {name} simulator has no option {option!r}", nearest(option, known)
-            )
-    return make(**options)
+    return RoboMMESimulator(**options)
 
 
 SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop, "robomme": _robomme}
@@ -55,7 +30,7 @@ SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop, "robom
 
 
 def make_simulator(name: str, **options: Any) -> Simulator:
-    """Make a simulator in this process; keep to one, and use `RemoteSimulator` for more.
+    """Make a simulator in this process; keep to one.
 
     Args:
         name: `tabletop`, `robomme`, or `module:function` for a simulator of your own.
@@ -112,22 +87,7 @@ def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
         return {"tabletop": str(SUITE_VERSION)}
     if name != "robomme":
         return {}
-    from robomme_interference_data.simulators.robomme_client import RoboMMESimulator
+    from robomme_interference_data.simulators.robomme import RoboMMESimulator
 
     with RoboMMESimulator(python) as simulator:
         return simulator.versions
-
-
-def own_simulator(name: str, **options: Any) -> Simulator:
-    """Return this process's simulator of a name and options; it is made once and kept.
-
-    For functions that `workers.run_tasks` calls in its worker processes, each many times. Lists
-    among the options count as the tuples of the same items.
-    """
-    hashable = {key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
-    return _kept(name, **hashable)
-
-
-@cache
-def _kept(name: str, **options: Any) -> Simulator:
-    return make_simulator(name, **options)

@@ -1,11 +1,8 @@
 """RoboMME's side of the official simulator: runs in RoboMME's own interpreter, started by path.
 
 That interpreter has numpy < 2 and no package of ours, so this file imports neither, and keeps to
-Python 3.11. It answers on an inherited socket, never on stdout, where ManiSkill prints. Run
-without an argument it prints, as its last line, in JSON, what `probe` finds.
-
-A message is the length of its head (4 bytes, big-endian), the head as JSON, and the bytes of its
-arrays one after the other. No pickles: those of numpy 1 and 2 differ.
+Python 3.11. It answers on an inherited pipe, never on stdout, where ManiSkill prints. No pickles
+go through it: those of numpy 1 and 2 differ.
 """
 
 import importlib
@@ -16,81 +13,58 @@ import os
 import platform
 import queue
 import signal
-import socket
-import struct
 import sys
 import threading
 import traceback
-from collections.abc import Mapping
+from multiprocessing.connection import Connection
 from typing import Any
 
-__all__ = ["probe", "receive", "send"]
-
-MAX_HEAD = 1 << 20
-"""Bytes; a head longer than that is no message."""
+__all__ = ["receive", "send"]
 
 LISTS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
 """Camera name to the key under which RoboMME returns its frames."""
 
 
 def send(
-    channel: socket.socket,
-    head: Mapping[str, Any],
-    arrays: Mapping[str, Any] | None = None,
+    channel: Connection, head: dict[str, Any], arrays: dict[str, list[Any]] | None = None
 ) -> None:
-    """Send a message.
+    """Send a message: its head as JSON, then the bytes of each of its arrays.
 
     Args:
-        channel: A connected stream socket.
+        channel: The pipe.
         head: Plain values; `arrays` is taken.
-        arrays: Name to a sequence of numpy arrays of one shape and type; they arrive as one
-            array with a new first axis. An array is a sequence of its rows.
+        arrays: Name to at least one numpy array, all of one shape and type; they arrive as one
+            array with a new first axis.
     """
-    parts = {name: list(items) for name, items in (arrays or {}).items()}
+    arrays = arrays or {}
     described = []
-    for name, items in parts.items():
-        kinds = {(item.dtype.str, tuple(item.shape)) for item in items}
+    for name, items in arrays.items():
+        kinds = {(item.dtype.str, item.shape) for item in items}
         if len(kinds) != 1:
             raise ValueError(f"{name}: expected arrays of one shape and type, got {sorted(kinds)}")
         (dtype, shape) = kinds.pop()
         described.append([name, dtype, [len(items), *shape]])
-    encoded = json.dumps({**head, "arrays": described}).encode()
-    channel.sendall(struct.pack(">I", len(encoded)) + encoded)
-    for items in parts.values():
+    channel.send_bytes(json.dumps({**head, "arrays": described}).encode())
+    for items in arrays.values():
         for item in items:
-            channel.sendall(item.tobytes())
+            channel.send_bytes(item.tobytes())
 
 
-def receive(channel: socket.socket) -> tuple[dict[str, Any], dict[str, Any]]:
+def receive(channel: Connection) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the head and the arrays, by name, of the next message.
 
     Raises:
-        EOFError: The other side closed the socket.
-        ValueError: What came is no message.
+        EOFError: The other side closed the pipe.
     """
-    (length,) = struct.unpack(">I", _exactly(channel, bytearray(4)))
-    if length > MAX_HEAD:
-        raise ValueError(f"a head of {length} bytes; expected {MAX_HEAD} at most")
-    head = json.loads(bytes(_exactly(channel, bytearray(length))))
+    head = json.loads(channel.recv_bytes())
     arrays: dict[str, Any] = {}
     for name, dtype, shape in head.pop("arrays"):
         import numpy as np
 
-        array = np.empty(shape, dtype)
-        _exactly(channel, array.reshape(-1).view(np.uint8))
-        arrays[name] = array
+        arrays[name] = np.empty(shape, dtype)
+        for item in arrays[name].reshape(shape[0], -1):
+            channel.recv_bytes_into(item)
     return head, arrays
-
-
-def _exactly(channel: socket.socket, buffer: Any) -> Any:
-    """Fill the buffer."""
-    view = memoryview(buffer)
-    while view:
-        count = channel.recv_into(view)
-        if count == 0:
-            raise EOFError("the other side closed the socket")
-        view = view[count:]
-    return buffer
 
 
 def probe() -> dict[str, Any]:
@@ -190,7 +164,7 @@ class Episodes:
         joints = np.stack(observations["joint_state_list"])[:, :7]
         gripper = np.stack(observations["gripper_state_list"])[:, :1]
         states = np.concatenate([joints, gripper], axis=1).astype(np.float32)
-        arrays: dict[str, Any] = {"states": states}
+        arrays: dict[str, Any] = {"states": list(states)}
         for camera in self._cameras:
             frames = observations[LISTS[camera]]
             if len(frames) != len(states):
@@ -200,8 +174,8 @@ class Episodes:
         return arrays
 
 
-def serve(channel: socket.socket) -> None:
-    """Answer requests until the other side closes the socket, which ends this process."""
+def serve(channel: Connection) -> None:
+    """Answer requests until the other side closes the pipe, which ends this process."""
     requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(channel, requests), daemon=True).start()
     hello = probe()
@@ -223,7 +197,7 @@ def serve(channel: socket.socket) -> None:
         send(channel, answer, found)
 
 
-def _read(channel: socket.socket, requests: Any) -> None:
+def _read(channel: Connection, requests: Any) -> None:
     """Queue requests; end this process, whatever it is doing, when the other side is gone."""
     try:
         while True:
@@ -243,15 +217,10 @@ def _text(error: BaseException) -> str:
 
 
 def main() -> None:
-    """Serve on the socket whose descriptor is the first argument, or print what `probe` finds."""
+    """Serve on the pipe whose descriptor is the argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the other side's to handle
-    if len(sys.argv) == 1:
-        found = json.dumps(probe())
-        sys.stdout.write(f"\n{found}\n")
-        return
-    channel = socket.socket(fileno=int(sys.argv[1]))
-    channel.set_inheritable(False)
-    serve(channel)
+    os.set_inheritable(int(sys.argv[1]), False)
+    serve(Connection(int(sys.argv[1])))
 
 
 if __name__ == "__main__":

@@ -14,26 +14,17 @@ from mani_skill.utils.structs.types import SimConfig
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import FAMILIES, FPS
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    NoRendererError,
-    UnknownNameError,
-    nearest,
-)
-from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation, Status
-from robomme_interference_data.simulators.tabletop.episodes import (
-    DIFFICULTIES,
-    difficulty_of,
-    guess_of,
-    turn_of,
-)
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, FPS
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.records import Status
+from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
+from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, guess_of, turn_of
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
-from robomme_interference_data.simulators.tabletop.panda import PANDA, draw_low_polygon
-from robomme_interference_data.simulators.tabletop.shading import SHADER
+from robomme_interference_data.simulators.tabletop.renderer import make_renderer
 
 __all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
 
@@ -58,9 +49,10 @@ _POSSIBLE_BLIND = _POSSIBLE | {"obs_mode": ("none", "state", "state_dict"), "ren
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
     """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
 
-    `demonstrated` names the cameras that draw the demonstration. `reset` takes seeds from 0 to
-    2**32 - 1 and the options `difficulty`, and `answer`, the index of the hidden answer to use
-    instead of the seed's own. Its info holds `goal`, `goals`, `difficulty` and `demonstration`.
+    `demonstrated` names the cameras that draw the demonstration; where `demonstrating` is False it
+    is not even played. `reset` takes seeds from 0 to 2**32 - 1 and the options `difficulty`, and
+    `answer`, the index of the hidden answer to use instead of the seed's own. Its info holds
+    `goal`, `goals`, `difficulty` and `demonstration`.
 
     Args:
         family: Task family to start with; `family` may be set before a reset.
@@ -81,17 +73,15 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.family = family
         self.drawing = render
         self.demonstrated: Sequence[str] = CAMERAS
-        self._demonstrating = False
+        self.demonstrating = False
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
             if options.setdefault(name, values[0]) not in values:
-                raise InvalidOptionError(
-                    f"{name} {options[name]!r} is not possible here",
-                    f"Expected {' or '.join(map(repr, values))}.",
-                )
+                expected = " or ".join(map(repr, values))
+                raise InvalidOptionError.expected(name, options[name], expected)
         options.setdefault("render_backend", "cpu" if render else "none")
-        _find_renderer()  # sapien wants one even where nothing is drawn
+        make_renderer()  # sapien wants one even where nothing is drawn
         super().__init__(**options)
-        self._demonstrating = True
+        self.demonstrating = True
 
     # --- what ManiSkill asks for ---------------------------------------------------------------
 
@@ -144,8 +134,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         """Start the episode of a seed: play its demonstration, then set the live scene.
 
         Raises:
-            InvalidOptionError: The seed or the answer is outside what it may be.
-            UnknownNameError: There is no such family or difficulty.
+            InvalidOptionError: Seed, difficulty or answer is outside what it may be.
+            UnknownNameError: There is no such family.
         """
         options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
         if seed is None:
@@ -153,17 +143,15 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         number = _index(np.ravel(seed)[0], 0, 2**32, "seed")
         difficulty = options.get("difficulty", difficulty_of(number))
         if difficulty not in DIFFICULTIES:
-            raise UnknownNameError(
-                f"{difficulty!r} is not a difficulty", nearest(str(difficulty), DIFFICULTIES)
-            )
+            raise InvalidOptionError.one_of("difficulty", difficulty, DIFFICULTIES)
         episode: Family = family_class(self.family)(difficulty, RandomState(number))
         answers = episode.answers
         turn = turn_of(number, len(answers))
         answer = _index(options.get("answer", turn), -len(answers), len(answers), "answer")
-        self.episode, self._answer = episode, answers[answer]
-        self._guess = answers[guess_of(number, len(answers))]
+        self.episode, self.answer = episode, answers[answer]
+        self.guess = answers[guess_of(number, len(answers))]
         observed, info = super().reset(seed=number, options=options)
-        if self._demonstrating:
+        if self.demonstrating:
             info["demonstration"] = self._demonstrate()
             observed = self.get_obs(self.get_info())
         goals = self.episode.goals()
@@ -173,13 +161,13 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def _step_action(self, action: Any) -> Any:
         done = super()._step_action(action)
         if self.status is Status.ONGOING:
-            self.status = self.episode.judge(self.arm, self._answer)
+            self.status = self.episode.judge(self.arm, self.answer)
         return done
 
     def act(self, policy: str) -> NDArray[np.float32]:
         """Return the next action of the policy `oracle` or `guess`, `(8,) float32`."""
         if policy not in self._scripts:
-            answer = self._answer if policy == "oracle" else self._guess
+            answer = self.answer if policy == "oracle" else self.guess
             self.arm.reset()
             self._scripts[policy] = self.episode.solve(self.arm, answer)
         next(self._scripts[policy], None)  # a script that is through holds its last pose
@@ -202,14 +190,9 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         name = camera_name or CAMERAS[0]
         return torch.from_numpy(self.observe((name,)).images[name])[None]
 
-    @property
-    def chance(self) -> float:
-        """Probability that a guess is right."""
-        return 1 / len(self.episode.answers)
-
     def _demonstrate(self) -> Demonstration:
         seen, actions = [], []
-        for _ in self.episode.demonstrate(self.arm, self._answer):
+        for _ in self.episode.demonstrate(self.arm, self.answer):
             seen.append(self.observe(self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
@@ -236,18 +219,5 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 def _index(value: Any, start: int, stop: int, what: str) -> int:
     """Return a whole number from start up to, not including, stop."""
     if not isinstance(value, int | np.integer) or not start <= value < stop:
-        raise InvalidOptionError(
-            f"{what} {value!r}; expected a whole number, {start} to {stop - 1}"
-        )
+        raise InvalidOptionError.expected(what, value, f"a whole number, {start} to {stop - 1}")
     return int(value)
-
-
-def _find_renderer() -> None:
-    try:
-        sapien.render.RenderSystem(sapien.Device("cpu"))
-    except RuntimeError as error:
-        raise NoRendererError(
-            f"no Vulkan device on this machine can render: {error}",
-            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
-            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
-        ) from error

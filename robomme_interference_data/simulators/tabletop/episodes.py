@@ -2,21 +2,11 @@
 
 from numpy.random import RandomState
 
-from robomme_interference_data.constants import FAMILIES, SPLITS
-from robomme_interference_data.errors import UnknownNameError, nearest
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
+from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = [
-    "DIFFICULTIES",
-    "EPISODES",
-    "difficulty_of",
-    "episode_ids",
-    "guess_of",
-    "seed_of",
-    "turn_of",
-]
-
-DIFFICULTIES = ("easy", "medium", "hard")
+__all__ = ["EPISODES", "difficulty_of", "episode_ids", "guess_of", "seed_of", "turn_of"]
 
 EPISODES = {"train": 100, "val": 50, "test": 50}
 """Episodes per family in each split."""
@@ -33,10 +23,7 @@ def seed_of(episode: EpisodeId) -> int:
         UnknownNameError: The suite has no such family or episode.
     """
     if episode.family not in FAMILIES:
-        raise UnknownNameError(
-            f"the tabletop simulator has no family {episode.family!r}",
-            nearest(episode.family, FAMILIES),
-        )
+        raise UnknownNameError.among("family", episode.family, "tabletop", FAMILIES)
     if episode.index >= EPISODES[episode.split]:
         raise UnknownNameError(
             f"{episode} does not exist: split {episode.split!r} has the episodes 0 to "
@@ -74,7 +61,7 @@ def _turn(seed: int, count: int, stream: int) -> int:
 
 def difficulty_of(seed: int) -> str:
     """Return the difficulty of a seed's scene: easy, medium, hard, in turn."""
-    return DIFFICULTIES[seed % 3]
+    return DIFFICULTIES[seed % len(DIFFICULTIES)]
 
 
 def episode_ids(

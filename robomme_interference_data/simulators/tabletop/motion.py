@@ -7,16 +7,13 @@ and at yaw 0 the fingers open along y.
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
 from robomme_interference_data.errors import MotionError
-
-if TYPE_CHECKING:
-    from robomme_interference_data.simulators.tabletop.kit import Body
 
 __all__ = ["BASE", "HOME", "REST_QPOS", "ROD", "Arm", "Point", "Script"]
 
@@ -156,9 +153,9 @@ class Arm:
         yield from self.wait(SETTLE)
         yield from self.grip(close=False)
 
-    def press(self, button: "Body", depth: float = 0.015) -> Script:
-        """Press a button with the closed gripper, and withdraw."""
-        x, y, z = button.home.p
+    def press(self, top: Point, depth: float = 0.015) -> Script:
+        """Press a button, the middle of its top given, with the closed gripper; withdraw."""
+        x, y, z = top
         yield from self.move((x, y, z + CLEARANCE), 0.0)
         yield from self.grip(close=True)
         yield from self.move((x, y, z - depth), speed=SLOW)

@@ -1,25 +1,19 @@
 """The embedded suite as a simulator: nine families in one environment, an episode at a time."""
 
 from collections.abc import Sequence
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import MAX_STEPS
-from robomme_interference_data.errors import (
-    SimulatorCrashError,
-    UnknownNameError,
-    nearest,
-)
+from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.base import (
     CAMERAS,
-    Demonstration,
+    Begun,
     EpisodeInfo,
     Observation,
-    Status,
-    action_array,
+    OneAtATime,
     camera_names,
 )
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
@@ -30,8 +24,8 @@ __all__ = ["TabletopSimulator"]
 POLICIES = ("oracle", "guess")
 
 
-class TabletopSimulator:
-    """See `Simulator`. Keep to one in a process: `worker.RemoteSimulator` is for more.
+class TabletopSimulator(OneAtATime):
+    """See `Simulator`. Keep to one in a process: an executor's workers are for more.
 
     Args:
         render: Whether to draw. Without, observations hold no images, and episodes run several
@@ -48,66 +42,31 @@ class TabletopSimulator:
     def __init__(self, render: bool = True, cameras: Sequence[str] = CAMERAS):
         self._cameras = camera_names(self.name, cameras)
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
-        self._env = TabletopEnv(render=render, obs_mode="none")
-        self._env.observe(self._cameras)  # the first picture is slow: shaders are compiled
-        self._steps: int | None = None
-        self._closed = False
-
-    def reset(
-        self, episode_id: str, demonstration: bool = True
-    ) -> tuple[Demonstration, Observation, EpisodeInfo]:
-        """Start an episode; see `Simulator.reset`."""
-        self._steps = None  # an episode that is refused, or breaks, leaves none to step
-        if self._closed:
-            raise SimulatorCrashError("the simulator is closed", "Make another one.")
-        episode = EpisodeId.parse(str(episode_id))
-        seed = seed_of(episode)
-        self._env.family = episode.family
-        self._env.demonstrated = self._cameras if demonstration else ()
-        _, info = self._env.reset(seed=seed)
-        self._steps = 0
-        about = EpisodeInfo(info["goal"], info["goals"], info["difficulty"], seed, self.name)
-        return info["demonstration"], self._env.observe(self._cameras), about
-
-    def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:
-        """Execute one action; see `Simulator.step`."""
-        steps = self._running()
-        self._env._step_action(action_array(action))
-        self._steps = steps + 1
-        status = self._env.status
-        if status is Status.ONGOING and self._steps >= MAX_STEPS:
-            status = self._env.status = Status.TIMEOUT
-        return self._env.observe(self._cameras if observe else ()), status
+        self.env = TabletopEnv(render=render, obs_mode="none")
+        self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
 
     def act(self, policy: str) -> NDArray[np.float32]:
         """Return the next action of `oracle` or `guess`; see `Simulator.act`."""
         self._running()
         if policy not in POLICIES:
-            raise UnknownNameError(f"no built-in policy {policy!r}", nearest(policy, POLICIES))
-        return self._env.act(policy)
-
-    @property
-    def chance(self) -> float:
-        """Probability that a guess at the hidden answer of the present episode is right."""
-        self._running()
-        return self._env.chance
+            raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
+        return self.env.act(policy)
 
     def close(self) -> None:
         """Release the scene; further calls but `close` are errors."""
-        self._steps, self._closed = None, True
-        self._env.close()
+        super().close()
+        self.env.close()
 
-    def __enter__(self) -> Self:
-        return self
+    def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+        seed = seed_of(episode)
+        self.env.family = episode.family
+        self.env.demonstrated = self._cameras if demonstration else ()
+        _, info = self.env.reset(seed=seed)
+        about = EpisodeInfo(info["goal"], info["goals"], info["difficulty"], seed, self.name)
+        return info["demonstration"], self.env.observe(self._cameras), about
 
-    def __exit__(self, *_: Any) -> None:
-        self.close()
-
-    def _running(self) -> int:
-        if self._closed:
-            raise SimulatorCrashError("the simulator is closed", "Make another one.")
-        if self._steps is None:
-            raise SimulatorCrashError(
-                "the simulator runs no episode", "Call reset('<Family>/<split>/<index>') first."
-            )
-        return self._steps
+    def _execute(
+        self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
+    ) -> tuple[Observation, Status]:
+        self.env._step_action(action)
+        return self.env.observe(self._cameras if observe else ()), self.env.status

@@ -1,6 +1,6 @@
 """The nine task families: a file each."""
 
-from robomme_interference_data.errors import UnknownNameError, nearest
+from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.simulators.tabletop.families.insert_peg import InsertPeg
 from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
 from robomme_interference_data.simulators.tabletop.families.pattern_lock import PatternLock
@@ -39,7 +39,5 @@ def family_class(name: str) -> type[Family]:
         UnknownNameError: There is no such family.
     """
     if name not in _FAMILIES:
-        raise UnknownNameError(
-            f"the tabletop simulator has no family {name!r}", nearest(name, _FAMILIES)
-        )
+        raise UnknownNameError.among("family", name, "tabletop", _FAMILIES)
     return _FAMILIES[name]

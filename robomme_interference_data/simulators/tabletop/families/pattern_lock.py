@@ -1,11 +1,12 @@
 """PatternLock: remember a path over a grid of buttons."""
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
@@ -71,6 +72,7 @@ class PatternLock(Family):
         return Status.SUCCESS if self.done == len(answer) else Status.ONGOING
 
 
+@cache
 def paths(length: int) -> list[tuple[int, ...]]:
     """All paths of `length` different buttons, each beside the one before it."""
     found: list[tuple[int, ...]] = [(start,) for start in range(SIDE * SIDE)]

@@ -1,12 +1,13 @@
 """RouteStick: remember a route round posts."""
 
+from functools import cache
 from itertools import pairwise, product
 
 import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
@@ -106,6 +107,7 @@ class RouteStick(Family):
         return False
 
 
+@cache
 def routes(turns: int) -> list[Route]:
     """All routes with a number of turns: targets, and the sides on which posts are passed."""
     walks: list[tuple[int, ...]] = [(start,) for start in range(COUNT)]

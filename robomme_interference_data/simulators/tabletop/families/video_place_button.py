@@ -2,7 +2,7 @@
 
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
@@ -106,7 +106,7 @@ class VideoPlaceButton(PlaceFamily):
         yield from arm.wait(15)
         for cube, target in zip(self.cubes, starts, strict=False):
             yield from self.place(arm, cube, target)
-        yield from arm.press(self.button)
+        yield from arm.press(self.button.home.p)
         # The second cube moves to the target that the first one has just left; a third one stays.
         for cube, target in zip(self.cubes[:2], [after, before], strict=False):
             yield from self.place(arm, cube, target)

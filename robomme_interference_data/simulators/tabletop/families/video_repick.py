@@ -2,7 +2,7 @@
 
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.base import Status
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
@@ -68,7 +68,7 @@ class VideoRepick(Family):
     def solve(self, arm: Arm, answer: int) -> Script:
         for _ in range(self.times):
             yield from self.lift(arm, answer)
-        yield from arm.press(self.button)
+        yield from arm.press(self.button.home.p)
 
     def judge(self, arm: Arm, answer: int) -> Status:
         heights = [cube.p[2] for cube in self.cubes]

@@ -1,0 +1,140 @@
+"""What it costs that every episode has files of its own.
+
+The bytes of the files that one buffer needs are compared with what lies in its spans. Then
+LeRobotDataset reads items all over the datasets as they are, and over the same datasets as
+lerobot's aggregate_datasets concatenates them.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import av
+import av.logging
+from load import Span, choose_buffer, demo_split, open_lerobot, spans_of
+from timing import interleave, machine, megabytes, positive, table
+
+from robomme_interference_data import Buffer, Split, load_split
+from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.constants import (
+    ACTION,
+    CAMERA_PREFIX,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    STATE,
+)
+from robomme_interference_data.errors import InterferenceError
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--split", type=Path, help="folder of a split; by default that of make demo"
+    )
+    parser.add_argument("--items", type=positive, default=100, help="items read in a round")
+    parser.add_argument("--rounds", type=positive, default=5, help="timed repetitions")
+    options = parser.parse_args()
+    try:
+        require_lerobot()
+        folder = options.split or demo_split()
+        split = load_split(folder)
+        print(machine("av", "lerobot"), end="\n\n", flush=True)
+        print(measure_bytes(split, choose_buffer(split, None, None)), end="\n\n", flush=True)
+        print(time_lerobot(folder, options))
+    except InterferenceError as error:
+        sys.exit(str(error))
+
+
+def measure_bytes(split: Split, buffer: Buffer) -> str:
+    """Compare the files that a buffer needs with what lies in its spans; return the table."""
+    videos = [
+        span
+        for camera in buffer.cameras
+        for span in spans_of(buffer, split, CAMERA_PREFIX + camera)
+    ]
+    inside, data = sum(map(packet_bytes, videos)), set()
+    for session in buffer.sessions:
+        entry, dataset = session.entry, split.datasets[session.entry.dataset]
+        data.add(dataset.lerobot.rows(entry.episode_index).path)
+        for feature in {STATE, ACTION} & dataset.features.keys():
+            inside += dataset.read_vectors(
+                entry.episode_index, feature, entry.start, entry.stop
+            ).nbytes
+    sizes = [
+        sum(path.stat().st_size for path in files) for files in ({v.path for v in videos}, data)
+    ]
+    title = (
+        f"Bytes of {buffer.episode_id} under {buffer.condition}, all cameras: the files of its "
+        "sessions, and the video packets and numbers of its spans in them."
+    )
+    cells = [megabytes(size) for size in (*sizes, inside)]
+    columns = (">video files, MB", ">data files, MB", ">in spans, MB", ">ratio", ">aim")
+    return table(title, columns, [[*cells, f"{sum(sizes) / inside:.3f}", "≤ 1.1"]])
+
+
+def packet_bytes(span: Span) -> int:
+    """Return the bytes of the video packets of a span."""
+    with av.open(str(span.path)) as container:
+        stream = container.streams.video[0]
+        tick = float(stream.time_base) * span.fps
+        return sum(
+            packet.size
+            for packet in container.demux(stream)
+            if packet.pts is not None and span.start <= round(packet.pts * tick) < span.stop
+        )
+
+
+def read(dataset: Any, order: list[int]) -> None:
+    """Read items of a dataset."""
+    for index in order:
+        dataset[index]
+
+
+def time_lerobot(folder: Path, options: argparse.Namespace) -> str:
+    """Time LeRobotDataset on the datasets as they are and concatenated; return the table."""
+    os.environ["TQDM_DISABLE"] = "1"
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    av.logging.set_libav_level(av.logging.ERROR)
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="interference-concatenated-") as name:
+        for kind in (DEMONSTRATIONS, DISTRACTORS):
+            apart, whole = folder / kind, Path(name) / kind
+            aggregate_datasets([kind], kind, [apart], whole)
+            items, joined = open_lerobot(kind, apart), open_lerobot(kind, whole)
+            chosen = range(0, len(items), max(1, len(items) // options.items) | 1)
+            scattered = [*chosen][::2] + [*chosen][1::2]
+
+            ways = {
+                "apart": partial(read, items, scattered),
+                "joined": partial(read, joined, scattered),
+            }
+            times = interleave(ways, options.rounds)
+            milliseconds = [1000 * times.median(way) / len(chosen) for way in ways]
+            files = [len(list(root.glob("videos/**/*.mp4"))) for root in (apart, whole)]
+            rows.append(
+                [
+                    f"{kind}, {len(items):,} frames",
+                    *(
+                        f"{count} files, {ms:.1f} ms"
+                        for count, ms in zip(files, milliseconds, strict=True)
+                    ),
+                    f"{times.ratio('apart', 'joined'):.2f}",
+                    "≤ 1",
+                ]
+            )
+    title = (
+        f"LeRobotDataset[i], all cameras, of about {options.items} items over the whole "
+        f"dataset; medians of {options.rounds} rounds."
+    )
+    columns = ("<dataset", ">a file an episode", ">concatenated", ">ratio", ">aim")
+    return table(title, columns, rows)
+
+
+if __name__ == "__main__":
+    main()

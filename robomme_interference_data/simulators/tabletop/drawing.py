@@ -1,0 +1,147 @@
+"""How the suite is drawn fast on a processor: a Panda with few polygons, matt surfaces.
+
+The visual meshes of the arm, 135,000 triangles, and of the camera on its wrist, 425,000, take
+nearly all of a frame's time. The arm's collision meshes, 2,100 triangles that ship beside them,
+have the same outline, and the camera is a box. The shaders that sapien brings compute reflections,
+textures, positions and segmentation too, of which nothing is seen here, and shade what is hidden
+as well: three times the work of those beside this file.
+"""
+
+import math
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sapien
+from mani_skill import PACKAGE_ASSET_DIR
+from mani_skill.agents.registration import register_agent
+from mani_skill.agents.robots import PandaWristCam
+from mani_skill.render.shaders import ShaderConfig
+from mani_skill.sensors.camera import CameraConfig
+
+from robomme_interference_data.simulators.tabletop.motion import ROD
+from robomme_interference_data.simulators.tabletop.renderer import SHADERS
+
+__all__ = ["PANDA", "SHADER", "draw_low_polygon"]
+
+SHADER = ShaderConfig(
+    shader_pack=str(SHADERS),
+    texture_names={"Color": ["rgb"]},
+    texture_transforms={"Color": lambda data: {"rgb": data[..., :3]}},
+)
+"""For every camera of the suite; it draws colours and nothing else."""
+
+sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
+
+PANDA = "panda_low_polygon"
+"""Name under which ManiSkill knows the arm."""
+
+_WHITE = (0.93, 0.94, 0.95)
+_JOINT = (0.72, 0.75, 0.78)
+_DARK = (0.16, 0.17, 0.19)
+_PAINT = {
+    **{f"link{number}": _WHITE for number in range(8)},
+    "link2": _JOINT,
+    "link4": _JOINT,
+    "link6": _JOINT,
+    "hand": _WHITE,
+    "leftfinger": _DARK,
+    "rightfinger": _DARK,
+    "camera_link": _DARK,
+}
+_CAMERA = (0.010, 0.045, 0.0115)  # half size in m
+
+
+@register_agent()
+class LowPolygonPanda(PandaWristCam):  # type: ignore[misc]
+    """The Panda with its wrist camera, 256×256."""
+
+    uid = PANDA
+
+    @property
+    def _sensor_configs(self) -> list[CameraConfig]:
+        return [
+            CameraConfig(
+                uid="wrist",
+                pose=sapien.Pose(),
+                width=256,
+                height=256,
+                fov=math.pi / 2,
+                near=0.01,
+                far=10,
+                shader_config=SHADER,
+                mount=self.robot.links_map["camera_link"],
+            )
+        ]
+
+
+def draw_low_polygon(articulation: Any, stick: float) -> None:
+    """Replace what is drawn of the arm; its physics stay.
+
+    Args:
+        articulation: sapien's articulation.
+        stick: Length in m of the stick to draw in the gripper, beyond the fingertips; 0 for none.
+    """
+    for link in articulation.links:
+        part = _part(link.name)
+        old = link.entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        if old is None or part not in _PAINT:
+            continue
+        link.entity.remove_component(old)
+        body = sapien.render.RenderBodyComponent()
+        if part == "camera_link":
+            shape = sapien.render.RenderShapeBox(_CAMERA, _material(_PAINT[part]))
+            shape.set_local_pose(sapien.Pose([-0.0125, -0.02, 0]))
+        else:
+            mesh = "finger" if part.endswith("finger") else part
+            shape = sapien.render.RenderShapeTriangleMesh(*_mesh(mesh), _material(_PAINT[part]))
+        if part == "rightfinger":  # the same mesh, turned half round
+            shape.set_local_pose(sapien.Pose([0, 0, 0], [0, 0, 0, 1]))
+        body.attach(shape)
+        if stick and part == "hand":
+            rod = sapien.render.RenderShapeCylinder(
+                ROD, (stick + 0.04) / 2, _material((0.30, 0.18, 0.08))
+            )
+            middle = 0.1034 + stick - (stick + 0.04) / 2
+            rod.set_local_pose(sapien.Pose([0, 0, middle], [math.sqrt(0.5), 0, math.sqrt(0.5), 0]))
+            body.attach(rod)
+        link.entity.add_component(body)
+
+
+def _part(name: str) -> str:
+    """`link3`, `hand`, `camera_link` …: a link's name without what ManiSkill puts before it."""
+    return name.removeprefix(f"scene-0-{PANDA}_").removeprefix("panda_")
+
+
+@lru_cache
+def _mesh(name: str) -> tuple[Any, Any, Any, Any]:
+    """Read a binary STL file as flat-shaded triangles: vertices, triangles, normals, uvs."""
+    folder = Path(PACKAGE_ASSET_DIR) / "robots/panda/franka_description/meshes/collision"
+    data = (folder / f"{name}.stl").read_bytes()
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")])
+    faces = np.frombuffer(data, record, offset=84)
+    corners = faces["corners"]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    vertices = corners.reshape(-1, 3).astype(np.float32)
+    triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
+    smooth = _smooth(vertices, np.repeat(normals, 3, axis=0))
+    return vertices, triangles, smooth, np.zeros((len(vertices), 2), np.float32)
+
+
+def _smooth(vertices: Any, normals: Any) -> Any:
+    """Average the normals of faces that meet at less than 45°, so that round parts look round."""
+    _, where = np.unique(np.round(vertices, 5), axis=0, return_inverse=True)
+    where = where.reshape(-1)
+    smooth = np.empty_like(normals)
+    order = np.argsort(where, kind="stable")
+    for group in np.split(order, np.flatnonzero(np.diff(where[order])) + 1):
+        near = normals[group] @ normals[group].T > math.cos(math.pi / 4)
+        smooth[group] = near @ normals[group]
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+    return smooth.astype(np.float32)
+
+
+def _material(colour: tuple[float, float, float]) -> Any:
+    return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.7, specular=0.2)

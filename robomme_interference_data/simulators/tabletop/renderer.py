@@ -1,0 +1,52 @@
+"""Whether this machine can draw: run as a program, it draws a picture and says on which devices.
+
+Light, as the check is asked often: ManiSkill and torch are not imported.
+"""
+
+import re
+import sys
+from pathlib import Path
+
+import sapien
+
+from robomme_interference_data.errors import NoRendererError
+
+__all__ = ["SHADERS", "make_renderer"]
+
+SHADERS = Path(__file__).parent / "shaders"
+"""Folder of the suite's own shaders. Those that sapien brings take ten seconds to compile."""
+
+
+def make_renderer() -> sapien.render.RenderSystem:
+    """Return sapien's renderer.
+
+    Raises:
+        NoRendererError: No Vulkan device of this machine can render.
+    """
+    try:
+        return sapien.render.RenderSystem(sapien.Device("cpu"))
+    except RuntimeError as error:
+        raise NoRendererError(
+            f"no Vulkan device on this machine can render: {error}",
+            "Install a software driver: sudo make vulkan. Without the repository: libvulkan1 and "
+            "mesa-vulkan-drivers 24.3 or newer (Debian 12 has it in bookworm-backports).",
+        ) from error
+
+
+def main() -> None:
+    """Draw a picture of nothing; print the devices that can, or why it is not possible."""
+    try:
+        sapien.render.set_camera_shader_dir(str(SHADERS))
+        scene = sapien.Scene([make_renderer()])
+        camera = scene.add_camera("camera", 16, 16, fovy=1.0, near=0.01, far=1.0)
+        scene.update_render()
+        camera.take_picture()
+        camera.get_picture("Color")
+    except (NoRendererError, RuntimeError) as error:
+        sys.exit(str(error).splitlines()[0])
+    devices = re.findall(r"GPU: (.+)\n +Supported: 1", sapien.render.get_device_summary())
+    sys.stdout.write("; ".join(devices) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,210 @@
+"""What all simulators share: names, actions, when there is an episode, and the command."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import typer
+from support.simulator_doubles import ENDLESS, UNKNOWN, Double
+from typer.testing import CliRunner
+
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidIdError,
+    InvalidOptionError,
+    MissingExtraError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.simulators import Status, make_simulator
+from robomme_interference_data.simulators.base import action_array, camera_names
+from robomme_interference_data.simulators.commands import simulate
+
+DOUBLE = "support.simulator_doubles:make"
+ACTION = np.zeros(8, np.float32)
+
+# --- by name ---------------------------------------------------------------------------------
+
+
+def test_a_simulator_is_made_by_its_name() -> None:
+    made = make_simulator(DOUBLE, cameras=("wrist",))
+    lesson, _, _ = made.reset("MoveCube/test/9")
+    assert list(lesson.images) == ["wrist"]
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("tabeltop", "Did you mean 'tabletop'"),
+        ("no_such_module:make", "no_such_module"),
+        ("support.simulator_doubles:nothing", "Expected <module>:<function>"),
+    ],
+)
+def test_an_unknown_simulator_is_named(name: str, told: str) -> None:
+    with pytest.raises(UnknownNameError, match=told):
+        make_simulator(name)
+
+
+def test_a_missing_extra_names_the_line_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if ".tabletop." in name and "episodes" not in name]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "sapien", None)
+    with pytest.raises(MissingExtraError, match=r"data\[sim\]"):
+        make_simulator("tabletop")
+
+
+def test_cameras_are_a_list_of_known_names() -> None:
+    assert camera_names("tabletop", ["wrist", "front"]) == ("front", "wrist")
+    assert camera_names("tabletop", ()) == ()
+    with pytest.raises(InvalidOptionError, match="list of names"):
+        camera_names("tabletop", "front")
+    with pytest.raises(UnknownNameError, match="Did you mean 'front'"):
+        camera_names("tabletop", ["fornt"])
+
+
+# --- actions ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64", "float16", "int64", "uint8"])
+def test_actions_are_numbers_of_any_type(dtype: str) -> None:
+    one = action_array(np.arange(8, dtype=dtype))
+    assert (one.dtype, one.tolist()) == (np.float32, list(range(8)))
+    several = action_array(np.ones((2, 8), dtype), chunk=True)
+    assert (several.dtype, several.shape) == (np.float32, (2, 8))
+
+
+@pytest.mark.parametrize(
+    "action",
+    [["a"] * 8, ["1"] * 8, [[1.0], [1.0, 2.0]], None, [0] * 7, [[0] * 8], [0] * 7 + [np.nan]],
+    ids=str,
+)
+def test_what_is_no_action_is_refused(action: Any) -> None:
+    with pytest.raises(InvalidOptionError, match=r"no \(8,\) action, of finite numbers"):
+        action_array(action)
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [np.zeros(8), np.zeros((0, 8)), np.zeros((2, 7)), np.full((1, 8), 1e300), np.zeros((1, 2, 8))],
+    ids=lambda actions: str(actions.shape),
+)
+def test_what_is_no_chunk_is_refused(actions: Any) -> None:
+    with pytest.raises(InvalidOptionError, match=r"no \(n, 8\) actions, n at least 1"):
+        action_array(actions, chunk=True)
+
+
+# --- when there is an episode ------------------------------------------------------------------
+
+
+def test_an_episode_runs_until_it_ends() -> None:
+    with Double() as simulator:
+        simulator.reset("MoveCube/test/9")
+        statuses = [simulator.step(simulator.act("oracle"))[1] for _ in range(3)]
+        assert statuses == [Status.ONGOING, Status.ONGOING, Status.SUCCESS]
+        with pytest.raises(SimulatorCrashError, match="runs no episode"):
+            simulator.step(ACTION)
+
+
+def test_an_episode_ends_after_1300_steps() -> None:
+    with Double() as simulator:
+        simulator.reset(f"MoveCube/test/{ENDLESS}")
+        statuses = [simulator.step(ACTION)[1] for _ in range(1300)]
+    assert statuses == [Status.ONGOING] * 1299 + [Status.TIMEOUT]
+
+
+def test_a_refused_episode_leaves_none_to_step() -> None:
+    simulator = Double()
+    for refused in ("MoveCube-test-0", "MoveCube/tests/0", f"MoveCube/test/{UNKNOWN}"):
+        simulator.reset("MoveCube/test/0")
+        with pytest.raises((InvalidIdError, UnknownNameError)):
+            simulator.reset(refused)
+        with pytest.raises(SimulatorCrashError, match="no episode"):
+            simulator.step(ACTION)
+
+
+def test_a_refused_action_leaves_the_episode_as_it_was() -> None:
+    simulator = Double()
+    simulator.reset("MoveCube/test/0")
+    with pytest.raises(InvalidOptionError):
+        simulator.step(np.zeros(7, np.float32))
+    assert [simulator.step(ACTION)[1] for _ in range(3)][-1] is Status.SUCCESS
+
+
+def test_a_closed_simulator_refuses_all_but_close() -> None:
+    simulator = Double()
+    simulator.reset("MoveCube/test/0")
+    simulator.close()
+    simulator.close()
+    for call in (lambda: simulator.reset("MoveCube/test/0"), lambda: simulator.step(ACTION)):
+        with pytest.raises(SimulatorCrashError, match="closed"):
+            call()
+
+
+# --- simulate ----------------------------------------------------------------------------------
+
+
+def play(*words: object) -> dict[str, Any]:
+    """Run the command; return its JSON."""
+    app = typer.Typer()
+    app.command()(simulate)
+    given = ["--family", "MoveCube", "--simulator", DOUBLE, "--json", *map(str, words)]
+    done = CliRunner().invoke(app, given)
+    if isinstance(done.exception, InterferenceError | OSError):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return dict(json.loads(done.stdout))
+
+
+def test_simulate_plays_an_episode_and_writes_what_is_seen(tmp_path: Path) -> None:
+    video = tmp_path / "new" / "out.mp4"
+    assert play("--episode", 200, "--video", video) == {
+        "episode": "MoveCube/test/200",
+        "simulator": "double",
+        "goal": "goal",
+        "difficulty": "easy",
+        "seed": 200,
+        "policy": "oracle",
+        "status": "success",
+        "lesson_frames": 5,
+        "steps": 3,
+        "video": str(video),
+    }
+    assert list(video.parent.iterdir()) == [video]
+    with av.open(str(video)) as container:
+        frames = [f.to_ndarray(format="rgb24").astype(int) for f in container.decode(video=0)]
+    # Five frames of the lesson, the first live one and three steps; 4×4 pixels twice, and a bar.
+    assert [frame.shape for frame in frames] == [(20, 8, 3)] * 9
+    red, blue = frames[4][8, 4, 0], frames[4][8, 4, 2]
+    assert blue > red + 100
+    assert frames[5][8, 4, 0] > frames[5][8, 4, 2] + 100
+    assert abs(frames[8][18, 1] - 200).max() < 40  # the front camera; the wrist's is 99
+
+
+def test_simulate_can_play_the_demonstration_only() -> None:
+    told = play("--policy", "none")
+    assert (told["status"], told["steps"]) == ("ongoing", 0)
+
+
+def test_what_simulate_cannot_do_is_refused_first(tmp_path: Path) -> None:
+    (tmp_path / "folder.mp4").mkdir()
+    (tmp_path / "file").touch()
+    episode = ("--episode", UNKNOWN)  # playing would refuse it
+    for video in ("out.avi", "folder.mp4"):
+        with pytest.raises(InvalidOptionError, match=r"\.mp4 file"):
+            play(*episode, "--video", tmp_path / video)
+    with pytest.raises(OSError, match=r"exists|[Nn]ot a directory"):
+        play(*episode, "--video", tmp_path / "file" / "out.mp4")
+    with pytest.raises(InvalidOptionError, match="oracle, guess, none"):
+        play(*episode, "--policy", "orakel")
+    with pytest.raises(InvalidOptionError, match="is none of none"):
+        play(*episode, "--simulator", "robomme", "--policy", "oracle")
+
+
+def test_an_episode_that_breaks_leaves_no_video(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError):
+        play("--episode", UNKNOWN, "--video", tmp_path / "out.mp4")
+    assert list(tmp_path.iterdir()) == []

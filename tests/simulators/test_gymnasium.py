@@ -1,0 +1,145 @@
+"""The suite's Gymnasium ids: they do what they say, and refuse what they cannot do."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robomme_interference_data.errors import InvalidOptionError, NoRendererError
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+import av
+import gymnasium
+import torch
+
+import robomme_interference_data.simulators.tabletop  # noqa: F401, registers the ids
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.simulators.tabletop.env import TabletopEnv
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+SEED = 19803  # of MoveCube/test/3
+
+
+def make(**options: Any) -> Any:
+    """Make an environment whose demonstration is not drawn, which takes seconds."""
+    try:
+        made = gymnasium.make("tabletop/MoveCube-v1", **options)
+    except NoRendererError as error:
+        pytest.skip(str(error))
+    made.unwrapped.demonstrated = ()
+    return made
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=240, env=environment or None
+    )
+
+
+def test_the_package_registers_the_families_and_imports_nothing_heavy() -> None:
+    code = """
+import sys
+import robomme_interference_data.simulators.commands
+assert "gymnasium" not in sys.modules
+import robomme_interference_data.simulators.tabletop
+assert not {"sapien", "torch", "mani_skill"} & set(sys.modules)
+import gymnasium
+print(*sorted(name for name in gymnasium.registry if name.startswith("tabletop/")))
+"""
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == sorted(f"tabletop/{family}-v1" for family in FAMILIES)
+
+
+def test_an_episode_is_the_simulators(tabletop: TabletopSimulator) -> None:
+    env = make(render_mode="rgb_array")
+    seen, info = env.reset(seed=SEED)
+    lesson, first, about = tabletop.reset("MoveCube/test/3", demonstration=False)
+    assert info["goal"] == about.goal
+    assert np.array_equal(info["demonstration"].states, lesson.states)
+    for name in ("front", "wrist"):
+        assert np.array_equal(seen["sensor_data"][name]["rgb"][0], first.images[name])
+    assert np.array_equal(seen["agent"]["qpos"][0, :8], first.state)
+    view = env.render()
+    assert (view.shape, view.dtype) == ((1, 256, 256, 3), torch.uint8)
+    assert np.array_equal(view[0], first.images["front"])
+    seen, _, _, _, info = env.step(env.unwrapped.act("oracle"))
+    assert not info["success"]
+    assert np.array_equal(env.render()[0], seen["sensor_data"]["front"]["rgb"][0])
+    env.close()
+
+
+def test_maniskills_recorder_writes_what_is_rendered(tmp_path: Path) -> None:
+    from mani_skill.utils.wrappers import RecordEpisode
+
+    env = RecordEpisode(make(render_mode="rgb_array"), str(tmp_path), save_trajectory=False)
+    env.unwrapped.demonstrating = False  # it is not recorded
+    env.reset(seed=SEED)
+    for _ in range(2):
+        env.step(env.unwrapped.act("oracle"))
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    with av.open(str(video)) as container:
+        sizes = [(frame.width, frame.height) for frame in container.decode(video=0)]
+    assert sizes == [(256, 256)] * 3
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "possible"),
+    [
+        ("obs_mode", "rgbd", "'rgb' or 'state' or 'state_dict' or 'none'"),
+        ("obs_mode", None, "'rgb' or 'state'"),
+        ("render_mode", "human", "None or 'rgb_array' or 'sensors'"),
+        ("control_mode", "pd_ee_delta_pose", "'pd_joint_pos'"),
+        ("sim_backend", "physx_cuda", "'physx_cpu'"),
+        ("reward_mode", "dense", "'sparse' or 'none'"),
+        ("robot_uids", "fetch", "'panda_low_polygon'"),
+        ("num_envs", 2, "expected 1"),
+    ],
+)
+def test_what_is_not_possible_is_refused(option: str, value: object, possible: str) -> None:
+    with pytest.raises(InvalidOptionError, match=f"^{option} {value!r}; .*{possible}"):
+        TabletopEnv(**{option: value})
+
+
+@pytest.mark.parametrize("option", [{"obs_mode": "rgb"}, {"render_mode": "rgb_array"}])
+def test_without_drawing_there_are_no_pictures_to_ask_for(option: dict[str, str]) -> None:
+    with pytest.raises(InvalidOptionError, match="_mode 'rgb"):
+        TabletopEnv(render=False, **option)
+
+
+def test_seeds_and_options_of_a_reset() -> None:
+    env = make(render=False, control_mode="pd_joint_pos", num_envs=1, obs_mode="state")
+    env.unwrapped.demonstrating = False
+    for seed, difficulty in ((0, "easy"), (2**32 - 1, "easy"), (2**32 - 2, "hard")):
+        seen, info = env.reset(seed=seed)
+        assert info["difficulty"] == difficulty  # the remainder by 3
+        assert seen.shape == (1, 18)  # positions and velocities of nine joints
+    assert env.reset(seed=0, options={"difficulty": "hard"})[1]["difficulty"] == "hard"
+    for seed in (-1, 2**32, "a", 0.5):
+        with pytest.raises(InvalidOptionError, match="whole number, 0 to 4294967295"):
+            env.unwrapped.reset(seed=seed)
+    for answer in (3, -4, "push", 1.0):
+        with pytest.raises(InvalidOptionError, match="a whole number, -3 to 2"):
+            env.reset(seed=0, options={"answer": answer})
+    for difficulty in ("eesy", 7):
+        with pytest.raises(InvalidOptionError, match="easy, medium, hard"):
+            env.reset(seed=0, options={"difficulty": difficulty})
+    env.close()
+
+
+def test_without_a_vulkan_device_there_is_one_error() -> None:
+    code = (
+        "from robomme_interference_data.simulators.tabletop.renderer import make_renderer\n"
+        "from robomme_interference_data.errors import NoRendererError\n"
+        "try: make_renderer()\n"
+        "except NoRendererError as error: print(error)\n"
+    )
+    done = run(code, VK_ICD_FILENAMES="/nonexistent", VK_DRIVER_FILES="/nonexistent")
+    assert "no Vulkan device on this machine can render" in done.stdout, done.stderr
+    assert "sudo make vulkan" in done.stdout

@@ -1,0 +1,183 @@
+"""The embedded suite's judges, against what a script without knowledge of them would try."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators import Status
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+from robomme_interference_data.simulators.tabletop.env import TabletopEnv
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
+from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
+from robomme_interference_data.simulators.tabletop.kit import CUBE
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+
+@pytest.fixture
+def env(tabletop: TabletopSimulator) -> Iterator[TabletopEnv]:
+    tabletop.env.drawing = False
+    yield tabletop.env
+    tabletop.env.drawing = True
+
+
+def start(env: TabletopEnv, episode: str, answer: int) -> Any:
+    """Begin an episode, not drawn, with an answer of our choice; return its scene."""
+    about = EpisodeId.parse(episode)
+    env.family = about.family
+    env.reset(seed=seed_of(about), options={"answer": answer})
+    env.arm.reset()
+    return env.episode
+
+
+def play(env: TabletopEnv, script: Script, seen: Callable[[], None] = lambda: None) -> Status:
+    """Step a script until it is through or the episode has ended."""
+    for _ in script:
+        env.step(env.arm.action.copy())
+        if env.status is not Status.ONGOING:
+            break
+        seen()
+    return env.status
+
+
+# --- VideoUnmask: nothing is seen under a wrong container --------------------------------------
+
+
+def pixels_of(colour: str, image: NDArray[np.uint8]) -> int:
+    """Number of pixels in which one channel leads the others by far."""
+    channel = ("red", "green", "blue").index(colour)
+    others = np.delete(image.astype(int), channel, axis=2).max(axis=2)
+    return int((image[..., channel].astype(int) - others > 50).sum())
+
+
+def test_no_cube_is_seen_under_a_wrong_container_before_the_failure(env: TabletopEnv) -> None:
+    scene = start(env, "VideoUnmask/test/0", 0)
+    wrong = next(number for number in scene.under if number != env.answer[0])
+    colour = scene.colours[scene.cubes.index(scene.under[wrong])]
+    heights, pixels = [], []
+
+    def look() -> dict[str, NDArray[np.uint8]]:
+        env.drawing = True
+        images = env.observe().images
+        env.drawing = False
+        return images
+
+    def note() -> None:
+        if scene.shells[wrong].p[2] > 0.004:  # lifted at all
+            images = look()
+            pixels.append([pixels_of(colour, images[name]) for name in ("front", "wrist")])
+            heights.append(scene.shells[wrong].p[2])
+
+    def lift_slowly() -> Script:
+        knob = scene.shells[wrong].point(0, 0, scene.shells[wrong].size)
+        yield from env.arm.pick(knob, lift=0.0)
+        yield from env.arm.move(knob + np.array([0, 0, 0.05]), speed=0.03)
+
+    assert play(env, lift_slowly(), note) is Status.FAIL
+    assert len(heights) > 2
+    assert max(heights) <= 0.010
+    assert not np.any(pixels)
+    scene.shells[wrong].put(scene.under[wrong].home)  # at 0.02 m, where the cube comes into sight
+    assert pixels_of(colour, look()["front"]) > 0
+
+
+# --- MoveCube: the manner is judged over the whole way -----------------------------------------
+
+PUSH, GRASP = 0, 1
+
+
+def push_slowly(arm: Arm, scene: MoveCube) -> Script:
+    """Push the cube to the target with the closed gripper, 1.5 mm a step at most."""
+    behind = scene.cube.p - 0.055 * scene.way
+    yield from arm.move((behind[0], behind[1], 0.12), scene.turn)
+    yield from arm.grip(close=True)
+    yield from arm.move(behind)
+    yield from arm.move(scene.target.p - 0.031 * scene.way + (0, 0, CUBE / 2), speed=0.025)
+    yield from arm.wait(10)
+
+
+def push_with_open_fingers(arm: Arm, scene: MoveCube) -> Script:
+    """Push the cube with the outer side of one of the open fingers."""
+    behind = scene.cube.p - 0.11 * scene.way
+    yield from arm.move((behind[0], behind[1], 0.12), scene.turn - np.pi / 2)
+    yield from arm.move((behind[0], behind[1], 0.03))
+    yield from arm.move(scene.target.p - 0.07 * scene.way + (0, 0, 0.03))
+
+
+def drag_slowly(arm: Arm, scene: MoveCube) -> Script:
+    """Grasp the cube and drag it, less than 1 mm in a step."""
+    yield from arm.pick(scene.cube.p, scene.turn, lift=0.0)
+    yield from arm.move(scene.target.p + np.array([0, 0, CUBE / 2]), speed=0.016)
+
+
+def drop(arm: Arm, scene: MoveCube) -> Script:
+    """Grasp the cube off its middle, and let it go above the target."""
+    aside = 0.006 * np.array([-np.sin(scene.turn), np.cos(scene.turn), 0.0])
+    yield from arm.pick(scene.cube.p + aside, scene.turn)
+    yield from arm.put(scene.target.p + np.array([0, 0, CUBE / 2 + 0.012]))
+
+
+@pytest.mark.parametrize(
+    ("way", "answer", "status"),
+    [
+        (push_slowly, PUSH, Status.SUCCESS),  # as slow as it likes
+        (push_with_open_fingers, PUSH, Status.FAIL),  # none of the three manners
+        (push_with_open_fingers, GRASP, Status.FAIL),
+        (drag_slowly, PUSH, Status.FAIL),
+        (drop, GRASP, Status.SUCCESS),  # its fall and slide belong to the grasp
+    ],
+)
+def test_the_manner_is_what_moves_the_cube(
+    env: TabletopEnv, way: Callable[[Arm, MoveCube], Script], answer: int, status: Status
+) -> None:
+    scene = start(env, "MoveCube/test/0", answer)
+    cube = scene.cube.p
+    assert play(env, way(env.arm, scene)) is status
+    if way is drag_slowly:  # a wrong manner fails within millimetres
+        assert np.linalg.norm(scene.cube.p - cube) < 0.004
+
+
+# --- the stick: it touches what it comes down to, and fails in a post -----------------------------
+
+
+@pytest.mark.parametrize(("height", "touches"), [(0.030, False), (0.015, False), (0.013, True)])
+def test_a_button_is_touched_within_4_mm_of_its_top(
+    env: TabletopEnv, height: float, touches: bool
+) -> None:
+    """Its top is at 0.010 m; a wrong button, so that touching it fails."""
+    scene = start(env, "PatternLock/test/0", 0)
+    spot = scene.spots[env.answer[1]]
+    status = play(env, env.arm.move((*spot, height)))
+    assert status is (Status.FAIL if touches else Status.ONGOING)
+    assert env.arm.tip[2] > height - 0.001
+
+
+@pytest.mark.parametrize(("family", "height"), [("PatternLock", 0.010), ("RouteStick", 0.003)])
+def test_the_oracle_brings_the_stick_1_mm_above_what_it_touches(
+    env: TabletopEnv, family: str, height: float
+) -> None:
+    scene = start(env, f"{family}/test/0", 0)
+    tips = [1.0]
+    solve = scene.solve(env.arm, env.answer)
+    assert play(env, solve, lambda: tips.append(float(env.arm.tip[2]))) is Status.SUCCESS
+    assert min(tips) == pytest.approx(height + 0.001, abs=0.0006)
+
+
+@pytest.mark.parametrize(("aside", "status"), [(0.0, "fail"), (0.012, "fail"), (0.03, "ongoing")])
+def test_a_stick_put_down_into_a_post_fails(env: TabletopEnv, aside: float, status: str) -> None:
+    """A post's radius is 10 mm, the stick's 6 mm; so too before the first target is reached."""
+    scene = start(env, "RouteStick/test/0", 0)
+    x, y = scene.posts[1]
+
+    def come_down() -> Script:
+        yield from env.arm.move((x + aside, y, 0.13))
+        yield from env.arm.move((x + aside, y, 0.02))
+        yield from env.arm.wait(3)
+
+    assert play(env, come_down()) == status

@@ -1,0 +1,341 @@
+"""The official simulator's seam, against a stand-in for RoboMME in an environment of its own."""
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator
+from multiprocessing import Pipe
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from support.worker_calls import wait_until_gone
+from typer.testing import CliRunner
+
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    MissingExtraError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.simulators import Status, make_simulator, robomme_worker
+from robomme_interference_data.simulators.commands import simulate
+from robomme_interference_data.simulators.registry import simulator_versions
+from robomme_interference_data.simulators.robomme import EPISODES, RoboMMESimulator, find_python
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+
+HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
+
+DIES, HANGS, RAISES, BREAKS, SMALL_WRIST = 40, 41, 42, 43, 44
+"""Indices of the stand-in's episodes that do so; those from 45 on end as `ENDS` says."""
+
+ENDS = {45: Status.SUCCESS, 46: Status.FAIL, 47: Status.TIMEOUT}
+
+
+@pytest.fixture
+def simulator(robomme_python: Path) -> Iterator[RoboMMESimulator]:
+    with RoboMMESimulator(robomme_python) as made:
+        yield made
+
+
+# --- what it serves ----------------------------------------------------------------------------
+
+
+def test_an_episode_is_what_robomme_returns(simulator: RoboMMESimulator) -> None:
+    lesson, first, info = simulator.reset("MoveCube/test/3")
+    # The stand-in's demonstration has 5 frames for index 3 (3 + 2), then the live observation;
+    # frame t of the front camera is all t, of the wrist camera all 100 + t.
+    assert len(lesson) == 5
+    for name, offset in (("front", 0), ("wrist", 100)):
+        frames = lesson.images[name]
+        assert (frames.shape, frames.dtype) == ((5, 256, 256, 3), np.uint8)
+        assert frames[:, 7, 9, 1].tolist() == [offset + t for t in range(5)]
+        assert first.images[name][0, 0].tolist() == [offset + 5] * 3
+    # Joint j at frame t is t + j / 8; the first value of the gripper t / 100, the second −1.
+    assert lesson.states.dtype == np.float32
+    joints = [2 + joint / 8 for joint in range(7)]
+    assert lesson.states[2].tolist() == [*joints, pytest.approx(0.02, rel=1e-6)]
+    assert lesson.actions.shape == (0, 8)
+    assert first.state[:7].tolist() == [5 + joint / 8 for joint in range(7)]
+    assert info.goals == ("move the cube as before", "do it again, Schritt für Schritt")
+    assert info.goal == info.goals[0]
+    assert (info.difficulty, info.seed, info.simulator) == ("easy", 640_003, "robomme")
+    # Seeds: 640000 + 1000 times the rank of test, val, train + index.
+    seeds = [simulator.reset(f"MoveCube/{split}/1")[2].seed for split in ("val", "train")]
+    assert seeds == [641_001, 642_001]
+
+
+def test_a_step_executes_the_action(simulator: RoboMMESimulator) -> None:
+    simulator.reset("MoveCube/test/0")
+    action = np.linspace(-1, 1, 8, dtype=np.float32)
+    seen, status = simulator.step(action)
+    assert status is Status.ONGOING
+    # The stand-in's arm is where it was sent, and its finger's way is (gripper + 1) / 50.
+    assert seen.state[:7].tolist() == action[:7].tolist()
+    assert seen.state[7] == pytest.approx(0.04)
+    # The front camera shows the number of the step.
+    assert [simulator.step(HOLD)[0].images["front"][0, 0, 0] for _ in range(3)] == [2, 3, 4]
+    with pytest.raises(InvalidOptionError, match="finite numbers"):
+        simulator.step(HOLD[:7])
+    assert simulator.step(HOLD)[0].images["front"][0, 0, 0] == 5  # that one did not reach it
+
+    lesson, _, _ = simulator.reset("PatternLock/test/2")  # a stick has no gripper
+    assert lesson.states[:, 7].tolist() == [0.0] * 4
+    assert simulator.step(HOLD)[0].state.tolist() == [*HOLD[:7].tolist(), 0.0]
+
+
+@pytest.mark.parametrize("index", ENDS)
+def test_robommes_statuses(simulator: RoboMMESimulator, index: int) -> None:
+    simulator.reset(f"MoveCube/test/{index}")
+    statuses = [simulator.step(HOLD, observe=False)[1] for _ in range(3)]
+    assert statuses == [Status.ONGOING, Status.ONGOING, ENDS[index]]
+
+
+def told(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
+    """Play an episode, and return all that came of it."""
+    lesson, first, info = simulator.reset(episode)
+    seen = [first, *(simulator.step(HOLD)[0] for _ in range(2))]
+    frames = [one.images[name].tobytes() for one in seen for name in ("front", "wrist")]
+    states = [lesson.states.tobytes(), *(one.state.tobytes() for one in seen)]
+    return (info, states, lesson.images["front"].tobytes(), frames)
+
+
+def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMESimulator) -> None:
+    # A second reset of one of the stand-in's environments would shift all frames.
+    episodes = [f"MoveCube/test/{index}" for index in range(EPISODES + 1)]
+    pids, results = [], []
+    for episode in episodes:
+        results.append(told(simulator, episode))
+        assert simulator.pid is not None
+        pids.append(simulator.pid)
+    one, two = dict.fromkeys(pids)
+    assert pids == [one] * EPISODES + [two]
+    wait_until_gone([one], seconds=20)
+    assert [told(simulator, episode) for episode in reversed(episodes)] == results[::-1]
+    # The goal of this episode counts the environments that are open, itself included.
+    assert simulator.reset("VideoRepick/test/0")[2].goals[-1] == "open environments: 1"
+
+
+def test_images_are_left_out_where_not_wanted(robomme_python: Path) -> None:
+    with RoboMMESimulator(robomme_python, cameras=["front"]) as simulator:
+        lesson, first, _ = simulator.reset("MoveCube/test/0")
+        assert list(lesson.images) == list(first.images) == ["front"]
+        lesson, first, _ = simulator.reset("MoveCube/test/3", demonstration=False)
+        assert (lesson.images, lesson.states.shape) == ({}, (5, 8))
+        assert first.images["front"][0, 0, 0] == 5
+        seen, _ = simulator.step(HOLD, observe=False)
+        assert (seen.images, seen.state.shape) == ({}, (8,))
+
+
+def test_simulate_plays_the_demonstration(robomme_python: Path) -> None:
+    app = typer.Typer()
+    app.command()(simulate)
+    words = ["--family", "MoveCube", "--episode", "3", "--json", "--simulator", "robomme"]
+    done = CliRunner().invoke(app, [*words, "--robomme-python", str(robomme_python)])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert (found["seed"], found["policy"], found["lesson_frames"]) == (640_003, "none", 5)
+
+
+# --- what it refuses ---------------------------------------------------------------------------
+
+
+def test_what_robomme_does_not_have(simulator: RoboMMESimulator) -> None:
+    for episode, message in (
+        ("MoveCube/test/50", "MoveCube has 50 test episodes"),
+        ("MoveQube/test/0", "Did you mean 'MoveCube'"),
+    ):
+        with pytest.raises(UnknownNameError, match=message):
+            simulator.reset(episode)
+    with pytest.raises(UnknownNameError, match="no built-in policy"):
+        simulator.act("oracle")
+    with pytest.raises(InvalidOptionError, match=r"wrist camera .* \(128, 128, 3\) uint8"):
+        simulator.reset(f"MoveCube/test/{SMALL_WRIST}")
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+
+
+# --- what breaks -------------------------------------------------------------------------------
+
+
+def test_a_death_shows_the_end_of_its_log_without_escapes(simulator: RoboMMESimulator) -> None:
+    with pytest.raises(SimulatorCrashError, match="died during reset, exit code 7") as caught:
+        simulator.reset(f"MoveCube/test/{DIES}")
+    lines = (caught.value.hint or "").splitlines()
+    # 20 lines at most, the last ones; the stand-in prints them in colour.
+    assert (len(lines), lines[-1]) == (21, "WARN: planner failure 99")
+    assert simulator.pid is None
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+
+
+@pytest.mark.parametrize("running", [True, False])
+def test_a_process_that_was_killed(simulator: RoboMMESimulator, running: bool) -> None:
+    if running:
+        simulator.reset("MoveCube/test/3")
+    assert simulator.pid is not None
+    os.kill(simulator.pid, signal.SIGKILL)
+    with pytest.raises(SimulatorCrashError, match="exit code -9"):
+        if running:
+            simulator.step(HOLD)
+        else:
+            simulator.reset("MoveCube/test/3")
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        simulator.step(HOLD)
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+
+
+def test_a_hang_is_ended(robomme_python: Path) -> None:
+    with RoboMMESimulator(robomme_python, answer_s=8) as simulator:
+        simulator.reset(f"MoveCube/test/{HANGS}")
+        assert simulator.pid is not None
+        pid = simulator.pid
+        with pytest.raises(SimulatorCrashError, match="more than 8 s to step"):
+            simulator.step(HOLD)
+        wait_until_gone([pid], seconds=20)
+        assert simulator.pid is None
+
+
+def test_an_exception_leaves_the_process_running(simulator: RoboMMESimulator) -> None:
+    pid = simulator.pid
+    with pytest.raises(SimulatorCrashError, match="RuntimeError: no Vulkan"):
+        simulator.reset(f"MoveCube/test/{RAISES}")
+    simulator.reset(f"MoveCube/test/{BREAKS}")
+    simulator.step(HOLD)
+    with pytest.raises(SimulatorCrashError, match="error at step 2: caught: no such joint"):
+        simulator.step(HOLD)
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        simulator.step(HOLD)
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+    assert simulator.pid == pid
+
+
+def test_it_ends_with_us_even_in_a_long_call(robomme_python: Path) -> None:
+    code = f"""
+        import numpy as np
+        from robomme_interference_data.simulators.robomme import RoboMMESimulator
+        simulator = RoboMMESimulator({str(robomme_python)!r})
+        simulator.reset("MoveCube/test/{HANGS}")
+        print(simulator.pid, flush=True)
+        simulator.step(np.zeros(8, np.float32))
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        time.sleep(0.5)
+        parent.kill()
+    wait_until_gone([pid], seconds=20)
+
+
+# --- its interpreter ---------------------------------------------------------------------------
+
+
+def test_an_interpreter_is_found(
+    robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    local = tmp_path / "python"  # there is another one on the path
+    local.symlink_to(robomme_python)
+    for given_path in ("./python", str(local), Path("python")):
+        assert find_python(given_path) == str(local)
+    assert find_python("python3") != str(local)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert find_python("~/python") == str(local)
+    monkeypatch.setenv("ROBOMME_PYTHON", str(robomme_python))
+    simulator = make_simulator("robomme")
+    assert len(simulator.reset("MoveCube/test/0")[0]) == 2
+    simulator.close()
+
+
+def test_an_interpreter_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptionError, match="none is given") as caught:
+        make_simulator("robomme")
+    assert "--robomme-python PATH" in str(caught.value)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "notes.txt").write_text("not a program")
+    for name in ("nowhere/python", "folder", "notes.txt"):
+        with pytest.raises(InvalidOptionError, match=f"{name} is not an executable file"):
+            RoboMMESimulator(tmp_path / name)
+
+
+def test_an_interpreter_that_will_not_do(
+    bare_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(python: Path | str, error: type[InterferenceError], message: str) -> None:
+        with pytest.raises(error, match=message):
+            RoboMMESimulator(python)
+
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\necho I am a shell\nexit 3\n")
+    program.chmod(0o755)
+    refused(program, SimulatorCrashError, r"(?s)died during start, exit code 3.*a shell")
+    program.write_bytes(b"\x7fELF of another machine")
+    refused(program, InvalidOptionError, "cannot be run as RoboMME's Python")
+    refused(bare_python, MissingExtraError, "robomme is not installed there")
+    (tmp_path / "robomme").mkdir()
+    (tmp_path / "robomme" / "env_record_wrapper.py").write_text("import mplib_is_missing\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    refused(bare_python, MissingExtraError, "imported: ModuleNotFoundError: .*mplib_is_missing")
+    refused(sys.executable, MissingExtraError, f"numpy is {np.__version__}; RoboMME needs numpy")
+
+
+def test_one_that_does_not_start_in_time(
+    robomme_python: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STAND_IN_IMPORT_SECONDS", "60")
+    with pytest.raises(SimulatorCrashError, match="more than 1 s to start"):
+        RoboMMESimulator(robomme_python, answer_s=1)
+
+
+def test_versions_are_told(
+    robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = simulator_versions("robomme", str(robomme_python))
+    assert found.keys() == {"robomme_python", "robomme_numpy"}  # it is on the path, not installed
+    assert found["robomme_python"] == platform.python_version()
+    assert found["robomme_numpy"].startswith("1.")
+    # What an installer leaves of a package that came from git.
+    installed = tmp_path / "robomme-0.2.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: robomme\nVersion: 0.2\n")
+    origin = {"url": "https://example.org/robomme", "vcs_info": {"vcs": "git", "commit_id": "ab12"}}
+    (installed / "direct_url.json").write_text(json.dumps(origin))
+    monkeypatch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}:{tmp_path}")
+    assert simulator_versions("robomme", str(robomme_python))["robomme"] == "0.2+ab12"
+    assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
+    assert simulator_versions("my.module:make") == {}
+
+
+# --- messages ------------------------------------------------------------------------------------
+
+ARRAYS = npst.arrays(
+    st.sampled_from([np.uint8, np.float32, np.float64, np.int64, np.bool_]),
+    npst.array_shapes(max_dims=4, max_side=5),
+)
+
+
+@given(st.dictionaries(st.text(max_size=5), ARRAYS, max_size=3), st.text())
+def test_messages_arrive_as_they_were_sent(arrays: dict[str, np.ndarray], text: str) -> None:
+    ours, theirs = Pipe()
+    with ours, theirs:
+        # In a thread: what a pipe holds without a reader is little.
+        lists = {name: list(array) for name, array in arrays.items()}
+        sender = threading.Thread(target=robomme_worker.send, args=(ours, {"text": text}, lists))
+        sender.start()
+        head, found = robomme_worker.receive(theirs)
+        sender.join()
+    assert head == {"text": text}
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
+        assert found[name].tobytes() == array.tobytes()

@@ -1,0 +1,272 @@
+"""The suite's scenes, all 1,800 of them, as they are laid out: nothing is simulated or drawn."""
+
+import math
+import re
+from collections import Counter
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.random import RandomState
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
+from robomme_interference_data.errors import InvalidIdError, UnknownNameError
+from robomme_interference_data.ids import EpisodeId
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+from robomme_interference_data.simulators.tabletop.env import FRONT_EYE, FRONT_TARGET, FRONT_VIEW
+from robomme_interference_data.simulators.tabletop.episodes import (
+    difficulty_of,
+    episode_ids,
+    guess_of,
+    seed_of,
+    turn_of,
+)
+from robomme_interference_data.simulators.tabletop.families import family_class
+from robomme_interference_data.simulators.tabletop.families.video_place_button import RADIUS
+from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE
+from robomme_interference_data.simulators.tabletop.stage import Spot, exchanges, lanes
+
+PAGE = Path(__file__).parents[2] / "docs" / "simulators.md"
+
+
+@cache
+def scenes(family: str, split: str | None = None, difficulty: str | None = None) -> list[Any]:
+    """Families drawn for episodes, each with `right`, its hidden answer."""
+    made: list[Any] = []
+    for seed in map(seed_of, episode_ids(family, split, difficulty)):
+        scene: Any = family_class(family)(difficulty_of(seed), RandomState(seed))
+        scene.right = scene.answers[turn_of(seed, len(scene.answers))]
+        made.append(scene)
+    return made
+
+
+# --- episodes --------------------------------------------------------------------------------
+
+
+def test_every_episode_has_a_seed_of_its_own() -> None:
+    seeds = [seed_of(episode) for episode in episode_ids()]
+    assert len(seeds) == len(set(seeds)) == 9 * 200
+    for family in FAMILIES:
+        counts = [len(episode_ids(family, "test", difficulty)) for difficulty in DIFFICULTIES]
+        assert counts == [17, 17, 16]
+
+
+@pytest.mark.parametrize(
+    ("text", "seed", "difficulty"),
+    [
+        ("VideoRepick/train/0", 3000, "easy"),
+        ("VideoRepick/train/99", 3099, "easy"),
+        ("VideoRepick/val/1", 3901, "medium"),
+        ("MoveCube/test/3", 19803, "easy"),
+        ("RouteStick/test/49", 28849, "medium"),
+    ],
+)
+def test_seeds_and_difficulties_are_fixed(text: str, seed: int, difficulty: str) -> None:
+    assert seed_of(EpisodeId.parse(text)) == seed
+    assert difficulty_of(seed) == difficulty
+
+
+def test_unknown_episodes_are_named() -> None:
+    for text, message in (
+        ("MoveCub/test/3", "Did you mean 'MoveCube'"),
+        ("MoveCube/test/50", "0 to 49"),
+        ("MoveCube/train/100", "0 to 99"),
+    ):
+        with pytest.raises(UnknownNameError, match=message):
+            seed_of(EpisodeId.parse(text))
+    with pytest.raises(InvalidIdError, match="not a split"):
+        episode_ids("MoveCube", "tests")
+
+
+# --- answers ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_each_answer_occurs_equally_often_to_within_one(family: str) -> None:
+    for split, difficulty in product(SPLITS, DIFFICULTIES):
+        drawn = scenes(family, split, difficulty)
+        counts = Counter(scene.right for scene in drawn)
+        each = [counts[answer] for answer in drawn[0].answers]
+        assert max(each) - min(each) <= 1
+        assert sum(each) == len(drawn)
+
+
+def test_answers_are_these() -> None:
+    """MoveCube's first twelve easy test episodes: fixed, in blocks of three."""
+    seeds = [seed_of(e) for e in episode_ids("MoveCube", "test", "easy")][:12]
+    turns = [turn_of(seed, 3) for seed in seeds]
+    assert turns == [0, 2, 1, 1, 0, 2, 2, 1, 0, 1, 0, 2]
+    assert all(sorted(turns[block : block + 3]) == [0, 1, 2] for block in range(0, 12, 3))
+
+
+@pytest.mark.parametrize("count", [3, 12])
+def test_a_guess_tells_nothing_of_the_answer(count: int) -> None:
+    """Of 1,800 guesses 1,800 / count are right, give or take four standard deviations."""
+    seeds = [seed_of(episode) for episode in episode_ids()]
+    right = sum(guess_of(seed, count) == turn_of(seed, count) for seed in seeds)
+    sigma = math.sqrt(1800 * (count - 1)) / count
+    assert abs(right - 1800 / count) < 4 * sigma
+    guessed = Counter(guess_of(seed, count) for seed in seeds)
+    assert all(abs(guessed[answer] - 1800 / count) < 4 * sigma for answer in range(count))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_chance_is_what_the_page_says(family: str) -> None:
+    """The mean over the test episodes of one divided by the number of possible answers."""
+    chance = np.mean([1 / len(scene.answers) for scene in scenes(family, "test")])
+    rows = re.findall(rf"^\| {family} \| .* \| ([\d.]+%) \|$", PAGE.read_text("utf-8"), re.M)
+    assert rows
+    assert {*rows} == {f"{chance:.1%}"}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_scenes_do_not_depend_on_the_answer_and_differ_by_seed(family: str) -> None:
+    made = family_class(family)
+    one, same, other = (made("hard", RandomState(seed)) for seed in (5, 5, 6))
+    assert list(one.answers) == list(same.answers)
+    assert len(one.answers) > 2
+    assert one.goals() == same.goals()
+    places = [getattr(e, name) for e in (one, other) for name in vars(e) if "spots" in name]
+    assert not places or places[0] != places[-1]
+
+
+@pytest.mark.parametrize("family", ["VideoUnmask", "VideoUnmaskSwap"])
+@pytest.mark.parametrize("difficulty", DIFFICULTIES)
+def test_which_containers_hide_a_cube_tells_nothing(family: str, difficulty: str) -> None:
+    """Give or take four standard deviations, of one in three, and of one in `count`."""
+    drawn = scenes(family, None, difficulty)
+    count = len(drawn[0].spots)
+    rank: Counter[int] = Counter()  # of the right container among those that hide a cube
+    under: Counter[int] = Counter()  # containers of cubes that are not asked for
+    for scene in drawn:
+        covered = scene.covered(scene.right)
+        assert len(set(covered)) == len(scene.colours) == 3
+        assert covered[: len(scene.right)] == list(scene.right)
+        rank[sorted(covered).index(scene.right[0])] += 1
+        under.update(covered[len(scene.right) :])
+    for counted, places in ((rank, 3), (under, count)):
+        total = sum(counted.values())
+        sigma = math.sqrt(total * (places - 1)) / places
+        assert all(abs(counted[n] - total / places) < 4 * sigma for n in range(places)), counted
+
+
+# --- things that change places -----------------------------------------------------------------
+
+HALF = {"VideoUnmaskSwap": SIDE, "VideoRepick": CUBE / 2, "VideoPlaceOrder": RADIUS}
+HALF["VideoPlaceButton"] = RADIUS
+
+
+def spots_of(scene: Any) -> list[Spot]:
+    return list(scene.spots if hasattr(scene, "spots") else scene.target_spots)
+
+
+def ends_of(scene: Any) -> list[int]:
+    """For each thing, the number of the place where it ends."""
+    at = list(range(len(spots_of(scene))))
+    for one, other in scene.swaps:
+        at[one], at[other] = at[other], at[one]
+    return at
+
+
+@pytest.mark.parametrize("family", ["VideoRepick", "VideoPlaceOrder", "VideoPlaceButton"])
+def test_when_hard_everything_that_could_be_asked_for_ends_elsewhere(family: str) -> None:
+    for difficulty in ("easy", "medium"):
+        assert not any(scene.swaps for scene in scenes(family, None, difficulty))
+    for scene in scenes(family, None, "hard"):
+        assert all(end != start for start, end in enumerate(ends_of(scene)))
+
+
+def test_containers_that_change_places_do_not_change_back() -> None:
+    """Of three one stays, the right one in a third of the 34 easy train episodes, give or take."""
+    for level, difficulty in enumerate(DIFFICULTIES):
+        for scene in scenes("VideoUnmaskSwap", None, difficulty):
+            assert len(scene.swaps) == level + 1
+            stay = [n for n, end in enumerate(ends_of(scene)) if n == end]
+            assert len(stay) == (1 if difficulty == "easy" else 0)
+    drawn = scenes("VideoUnmaskSwap", "train", "easy")
+    stays = sum(scene.right[0] not in scene.swaps[0] for scene in drawn)
+    assert abs(stays - 34 / 3) < 2 * math.sqrt(34 * 2) / 3
+
+
+def test_every_thing_can_be_any_of_an_exchange() -> None:
+    """Two and two of four; two, and three in a ring, of five."""
+    assert exchanges(RandomState(1), 3) == [(0, 2)]
+    assert exchanges(RandomState(1), 4) == [(3, 2), (0, 1)]
+    assert exchanges(RandomState(1), 5) == [(2, 1), (4, 0), (4, 3)]
+
+
+def test_a_way_leads_along_its_lane() -> None:
+    """Two things 0.2 m apart, a third one 0.01 m further from the arm, lanes 0.1 m off."""
+    to, back = lanes([(0.0, -0.1), (0.0, 0.1), (0.01, 0.0)], (0, 1), 0.1)
+    assert len(to) == len(back) == 30
+    assert (to[-1], back[-1]) == ((0.0, 0.1), (0.0, -0.1))
+    # Half the time, half the way: 0.11 out of 0.42 m, or 0.1 of 0.4, then along to the middle.
+    assert to[14] == pytest.approx((0.11, 0.0))
+    assert back[14] == pytest.approx((-0.1, 0.0))
+
+
+def apart(one: Spot, other: Spot) -> float:
+    return max(abs(one[0] - other[0]), abs(one[1] - other[1]))
+
+
+@pytest.mark.parametrize("family", HALF)
+def test_nothing_that_moves_comes_within_5_mm_of_anything_else(family: str) -> None:
+    """Discs and boxes alike as squares along the table, so rather too wide than too narrow."""
+    half = HALF[family]
+    for scene in scenes(family):
+        now = spots_of(scene)
+        others = [(spot, CUBE / 2) for spot in getattr(scene, "cube_spots", [])]
+        if hasattr(scene, "button_at"):
+            others.append((scene.button_at, 0.035))
+        for pair in scene.swaps:
+            ways = lanes(now, pair, scene.gap)
+            resting = [(s, half) for n, s in enumerate(now) if n not in pair]
+            for a, b in zip(*ways, strict=True):
+                for mover, (spot, wide) in product((a, b), [*resting, *others]):
+                    assert apart(mover, spot) > half + wide + 0.0005, (scene.swaps, pair)
+                assert apart(a, b) > 2 * half + 0.005
+            for number, way in zip(pair, ways, strict=True):
+                now[number] = way[-1]
+
+
+# --- what the front camera sees ------------------------------------------------------------------
+
+
+def seen_at(points: Any) -> NDArray[np.float64]:
+    """Column and row of points in the front image, and pixels per metre there, `(3, n)`."""
+    ahead = np.subtract(FRONT_TARGET, FRONT_EYE)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    to = np.subtract(np.reshape(points, (-1, 3)), FRONT_EYE)
+    scale = 128 / math.tan(FRONT_VIEW / 2) / (to @ ahead)
+    up = np.cross(right, ahead)
+    return np.stack([128 + scale * (to @ right), 128 - scale * (to @ up), scale])
+
+
+def test_the_camera_looks_at_its_target() -> None:
+    """The middle of the image, and k / distance = 128 / tan 23° / |(1.1, 0, 0.43)| = 255.3."""
+    assert seen_at(FRONT_TARGET)[:, 0] == pytest.approx((128, 128, 255.3), abs=0.1)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_everything_on_the_table_is_in_view_and_large_enough(family: str) -> None:
+    """Whatever lies there, and where it passes as places are exchanged."""
+    spots: list[Any] = []
+    for scene in scenes(family):
+        for name in ("spots", "posts", "target_spots", "cube_spots"):
+            spots += getattr(scene, name, [])
+        for name in ("button_at", "box_at", "cube_at", "target_at"):
+            spots += [getattr(scene, name)] if hasattr(scene, name) else []
+        for pair in getattr(scene, "swaps", []):
+            spots += [spot for way in lanes(spots_of(scene), pair, scene.gap) for spot in way]
+    columns, rows, scale = seen_at([(*spot, 0.0) for spot in spots])
+    assert columns.min() > 0 and columns.max() < 256
+    assert rows.min() > 0 and rows.max() < 256
+    assert CUBE * scale.min() >= 10

@@ -1,0 +1,102 @@
+"""RoboMME's interface without its physics: for the interpreter that the tests make.
+
+Like the real one it returns lists, prints to stdout, in colour, gives another episode at a second
+reset of the same environment, makes environments of episodes that do not exist, and lets an episode
+go on for one step more than it is told.
+"""
+
+import os
+import time
+
+import numpy as np
+
+time.sleep(float(os.environ.get("STAND_IN_IMPORT_SECONDS", "0")))
+
+STICKS = ("PatternLock", "RouteStick")
+ENDS = {45: "success", 46: "fail", 47: "timeout"}
+open_environments = set()
+
+
+class Environment:
+    def __init__(self, family, index, seed, max_steps):
+        open_environments.add(self)
+        self.family, self.index, self.seed, self.max_steps = family, index, seed, max_steps
+        self.resets = 0
+
+    def reset(self):
+        for number in range(100):
+            print(f"\x1b[33mWARN:\x1b[0m planner failure {number}")
+        if self.index == 40:
+            os._exit(7)
+        if self.index == 42:
+            raise RuntimeError("no Vulkan device")
+        self.steps = 0
+        shift = 50 * self.resets
+        self.resets += 1
+        frames = range(shift, shift + self.index % 40 + 2 + 1)
+        joints = [np.float32(t + np.arange(7) / 8) for t in frames]
+        return self._lists(frames, joints, [t / 100 for t in frames]), self._info("ongoing")
+
+    def step(self, action):
+        print("step")
+        if self.index == 41:
+            time.sleep(60)
+        self.steps += 1
+        if self.index == 43 and self.steps == 2:
+            info = {"status": "error", "error_message": "caught: no such joint"}
+            return None, 0.0, True, False, info
+        size = 7 if self.family in STICKS else 8
+        action = np.asarray(action, np.float64).flatten()[:size]
+        assert action.size == size
+        status = "ongoing"
+        if self.steps == 3:
+            status = ENDS.get(self.index, status)
+        if self.steps > self.max_steps:
+            status = "timeout"
+        lists = self._lists([self.steps % 256], [np.float32(action[:7])], [(action[-1] + 1) / 50])
+        return lists, 0.0, status != "ongoing", False, self._info(status)
+
+    def close(self):
+        open_environments.remove(self)
+
+    def _lists(self, frames, joints, grippers):
+        side = 128 if self.index == 44 else 256
+        stick = self.family in STICKS
+        return {
+            "front_rgb_list": [np.full((256, 256, 3), t, np.uint8) for t in frames],
+            "wrist_rgb_list": [np.full((side, side, 3), 100 + t % 100, np.uint8) for t in frames],
+            "joint_state_list": joints,
+            "gripper_state_list": [
+                np.float64([0 if stick else g, 0 if stick else -1]) for g in grippers
+            ],
+        }
+
+    def _info(self, status):
+        goals = ["move the cube as before", "do it again, Schritt für Schritt"]
+        if self.family == "VideoRepick":
+            goals.append(f"open environments: {len(open_environments)}")
+        return {"task_goal": goals, "status": status}
+
+
+class BenchmarkEnvBuilder:
+    def __init__(self, env_id, dataset="test", action_space="joint_angle", max_steps=10000):
+        assert action_space == "joint_angle"
+        self.family, self.max_steps = env_id, max_steps
+        self.rank = ("test", "val", "train").index(dataset)
+
+    @classmethod
+    def get_task_list(cls):
+        return ["MoveCube", "VideoRepick", "PatternLock", "RouteStick"]
+
+    def get_episode_num(self):
+        return 50
+
+    def resolve_episode(self, episode):
+        if episode >= self.get_episode_num():
+            return None, None
+        difficulty = ("easy", "medium", "hard")[episode % 3]
+        return 640_000 + 1000 * self.rank + episode, difficulty
+
+    def make_env_for_episode(self, episode_idx):
+        seed, _ = self.resolve_episode(episode_idx)
+        return Environment(self.family, episode_idx, seed or 0, self.max_steps)

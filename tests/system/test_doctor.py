@@ -1,0 +1,207 @@
+"""What the doctor finds, and what it says of it."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from robomme_interference_data import doctor
+from robomme_interference_data.doctor import Check
+
+OK = Check("fine", True, "1.0")
+ABSENT = Check("optional", None, "not installed", 'pip install "robomme-interference-data[build]"')
+BROKEN = Check("needed", False, "broken", "mend it")
+
+Installed = Callable[[dict[str, tuple[str, list[str]]]], None]
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Installed:
+    """Replace what is installed: name to version and requirements."""
+
+    def replace(distributions: dict[str, tuple[str, list[str]]]) -> None:
+        def look_up(name: str) -> tuple[str, list[str]]:
+            if name not in distributions:
+                raise metadata.PackageNotFoundError(name)
+            return distributions[name]
+
+        monkeypatch.setattr(metadata, "version", lambda name: look_up(name)[0])
+        monkeypatch.setattr(metadata, "requires", lambda name: look_up(name)[1])
+
+    return replace
+
+
+@pytest.mark.parametrize(
+    ("rows", "failed"),
+    [([], False), ([OK, ABSENT], False), ([OK, BROKEN, ABSENT], True)],
+)
+def test_only_what_is_needed_can_fail(rows: list[Check], failed: bool) -> None:
+    assert doctor.any_failed(rows) is failed
+
+
+def test_the_table_shows_state_name_detail_and_the_whole_fix() -> None:
+    lines = doctor.report([OK, ABSENT, BROKEN]).text().splitlines()
+    assert lines[2:] == [
+        "ok      fine      1.0",
+        "absent  optional  not installed",
+        '                  to mend: pip install "robomme-interference-data[build]"',
+        "FAILS   needed    broken",
+        "                  to mend: mend it",
+    ]
+
+
+def test_this_environment_has_all_that_is_needed_and_nothing_heavy_is_imported() -> None:
+    code = (
+        "import sys; from robomme_interference_data.doctor import checks\n"
+        "for row in checks(): print(row.name, row.ok, row.fix, sep='|')\n"
+        "print(sorted({'torch', 'lerobot', 'h5py', 'sapien', 'mani_skill', 'transformers',"
+        " 'matplotlib', 'datasets', 'pandas'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *rows, imported = done.stdout.splitlines()
+    assert imported == "[]"
+    found = [line.split("|") for line in rows]
+    assert [name for name, ok, _ in found if ok == "False"] == []
+    # What works needs no mending.
+    assert {fix for _, ok, fix in found if ok == "True"} == {"None"}
+    # Every extra has a row.
+    extras = metadata.metadata("robomme-interference-data").get_all("Provides-Extra") or ()
+    rows_of_extras = {name.partition("[")[2].strip("]") for name, _, _ in found} - {""}
+    assert rows_of_extras == set(extras) - {"all"}
+
+
+OURS = [
+    "numpy>=2.0",
+    'colorama; sys_platform == "win33"',
+    'lerobot[dataset]<0.7,>=0.6.1; extra == "build"',
+    'h5py>=3.10; extra == "build"',
+]
+LEROBOT = ['datasets<5,>=4.8; extra == "dataset"', 'pygame; extra == "teleop"']
+
+
+@pytest.mark.parametrize(
+    ("others", "core", "build"),
+    [
+        (
+            {"numpy": "2.2.6", "lerobot": "0.6.1", "h5py": "3.16.0", "datasets": "4.8.5"},
+            (True, "numpy 2.2.6"),
+            (True, "lerobot 0.6.1, h5py 3.16.0"),
+        ),
+        (
+            {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"},
+            (False, "numpy 1.26.4 is not >=2.0"),
+            (None, "datasets 5.0.0 is not <5,>=4.8, h5py is not installed"),
+        ),
+    ],
+)
+def test_requirements_of_the_core_and_of_an_extra(
+    installed: Installed,
+    others: dict[str, str],
+    core: tuple[bool, str],
+    build: tuple[bool | None, str],
+) -> None:
+    requirements = {"robomme-interference-data": OURS, "lerobot": LEROBOT}
+    versions = {"robomme-interference-data": "0.1.0", **others}
+    installed({name: (text, requirements.get(name, [])) for name, text in versions.items()})
+
+    row = doctor.check_packages("Core")
+    assert (row.ok, row.detail) == core
+    assert row.fix == (None if core[0] else "pip install --upgrade robomme-interference-data")
+
+    row = doctor.check_packages("Build", "build")
+    assert (row.name, row.ok, row.detail) == ("Build [build]", *build)
+    assert row.fix == (None if build[0] else 'pip install "robomme-interference-data[build]"')
+
+
+def test_a_package_that_is_not_installed_itself(installed: Installed) -> None:
+    installed({})
+    row = doctor.check_packages("Core")
+    assert (row.ok, row.detail) == (False, "robomme-interference-data itself is not installed")
+    assert doctor.check_packages("Simulator", "sim").ok is None
+
+
+def test_a_missing_codec_fails_by_name() -> None:
+    row = doctor.check_video((("libdav1d", "r"), ("libnothing", "w"), ("libdav1d", "w")))
+    assert (row.ok, row.fix is None) == (False, False)
+    assert row.detail.endswith("has no encoder libnothing, encoder libdav1d")
+
+
+def test_absent_shared_ffmpeg_libraries_are_optional() -> None:
+    row = doctor.check_shared_ffmpeg((9999,))
+    assert row.ok is None
+    assert (row.fix or "").endswith("install ffmpeg")
+
+
+@pytest.mark.parametrize(
+    ("packages", "ok"),
+    [
+        ([], None),
+        (["opencv-python-headless"], True),
+        (["opencv-python"], True),
+        (["opencv-python", "opencv-python-headless"], False),
+    ],
+)
+def test_two_opencv_packages_fail(
+    installed: Installed, packages: list[str], ok: bool | None
+) -> None:
+    installed({name: ("4.13.0", []) for name in packages})
+    row = doctor.check_opencv()
+    assert (row.ok, row.fix is not None) == (ok, ok is False)
+
+
+@pytest.mark.parametrize(
+    ("program", "ok", "detail"),
+    [
+        ("print('llvmpipe')", True, "drawn with llvmpipe"),
+        ("import sys; print('chatter', file=sys.stderr); sys.exit('no device')", None, "no device"),
+        ("import os; os.abort()", None, "a driver crashed (exit code -6)"),
+        ("import time; time.sleep(60)", None, "did not answer within 1 s"),
+    ],
+    ids=["draws", "refuses", "crashes", "hangs"],
+)
+def test_the_renderer_is_asked_whatever_its_driver_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, ok: bool | None, detail: str
+) -> None:
+    pytest.importorskip("sapien", reason="needs the extra sim")
+    (tmp_path / "drawing.py").write_text(program, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    row = doctor.check_renderer("drawing", seconds=1 if "sleep" in program else 60)
+    assert row.ok is ok
+    assert detail in row.detail
+    assert (row.fix is None) is (ok is True)
+
+
+def test_robommes_interpreter_is_asked(
+    robomme_python: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = doctor.check_robomme()
+    assert (row.ok, "ROBOMME_PYTHON is not set" in row.detail) == (None, True)
+    for python, ok, detail in (
+        (str(robomme_python), True, "robomme_numpy 1."),
+        (sys.executable, False, "RoboMME needs numpy < 2"),
+        ("/nowhere/python", False, "is not an executable file"),
+    ):
+        monkeypatch.setenv("ROBOMME_PYTHON", python)
+        row = doctor.check_robomme()
+        assert row.ok is ok
+        assert detail in row.detail
+
+
+def test_a_token_is_found_and_never_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor.check_hub_token().ok is None
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: "hf_secret")
+    row = doctor.check_hub_token()
+    assert row.ok is True
+    assert "hf_secret" not in repr(row)
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "new" / "hub"))
+    assert doctor.check_hub_cache().ok is True
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "file" / "hub"))
+    row = doctor.check_hub_cache()
+    assert (row.ok, row.detail) == (None, f"{tmp_path / 'file' / 'hub'} cannot be written")

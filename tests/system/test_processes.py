@@ -1,0 +1,183 @@
+"""Worker processes: outcomes exactly once whatever workers do, and nothing left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
+
+from robomme_interference_data.errors import SimulatorCrashError, WorkerRetiredError
+from robomme_interference_data.execution import Outcome, Processes
+
+pytestmark = pytest.mark.timeout(150)
+
+TESTS = Path(__file__).parent.parent
+
+
+def run(tasks: list[Any], workers: int = 1, **options: Any) -> list[Outcome]:
+    return list(Processes(workers).run(behave, tasks, **options))
+
+
+def script(folder: Path, text: str) -> tuple[list[str], dict[str, str]]:
+    """Return the command that runs a script, and its environment."""
+    path = folder / "script.py"
+    path.write_text("from robomme_interference_data.execution import Processes\n" + text)
+    return [sys.executable, str(path)], {**os.environ, "PYTHONPATH": str(TESTS)}
+
+
+def test_every_task_once_in_other_processes() -> None:
+    """More tasks than workers; outcomes come in any order."""
+    outcomes = run([*[("value", number) for number in range(30)], *[("pid", 0)] * 10], workers=2)
+    values = [outcome.value for outcome in outcomes if outcome.task[0] == "value"]
+    pids = {outcome.value for outcome in outcomes if outcome.task[0] == "pid"}
+    assert sorted(values) == list(range(30))
+    assert all(outcome.attempts == 1 and outcome.error is None for outcome in outcomes)
+    assert os.getpid() not in pids and 1 <= len(pids) <= 2
+    wait_until_gone(list(pids))
+    assert run([]) == []
+
+
+def test_whatever_a_task_does_the_others_are_done(tmp_path: Path) -> None:
+    """Two workers meet every kind of trouble; what raised is final, what died is tried again."""
+    tasks = [
+        ("value", b"much" * 5_000_000),
+        ("raise", "no number"),
+        ("odd", None),
+        ("lock", None),
+        ("exit", 4),
+        ("signal", signal.SIGKILL),
+        ("signal", signal.SIGINT),
+        ("die once", str(tmp_path / "died")),
+    ]
+    outcomes = run(tasks, workers=2)
+    found = {(o.task[0], o.task[1]): o for o in outcomes}
+    assert len(outcomes) == len(tasks)
+    assert found["value", tasks[0][1]].value == tasks[0][1]
+    assert found["die once", tasks[-1][1]].attempts == 2
+    assert found["die once", tasks[-1][1]].error is None
+    assert found["signal", signal.SIGINT].error is None  # Ctrl-C is the parent's to handle
+
+    errors = {key: str(outcome.error) for key, outcome in found.items()}
+    assert errors["raise", "no number"] == "ValueError: no number"
+    assert "raise ValueError" in (found["raise", "no number"].trace or "")
+    # What cannot be sent, or not be read, is an outcome too: the worker lives on.
+    assert "cannot pickle '_thread.lock'" in errors["lock", None]
+    assert "missing 1 required positional argument" in errors["odd", None]
+    for key in (("raise", "no number"), ("lock", None), ("odd", None)):
+        assert (found[key].attempts, type(found[key].error)) == (1, RuntimeError)
+    for key, code in ((("exit", 4), 4), (("signal", signal.SIGKILL), -9)):
+        assert errors[key] == f"the worker process died (exit code {code})"
+        assert found[key].attempts == 2
+
+
+def test_a_task_that_hangs_is_tried_again_and_given_up(tmp_path: Path) -> None:
+    (hung,) = run([("hang", str(tmp_path))], time_limit=3)
+    assert isinstance(hung.error, TimeoutError)
+    assert (str(hung.error), hung.attempts) == ("the task took more than 3 s", 2)
+    wait_until_gone(pids_in(tmp_path, 0), seconds=5)
+
+
+def test_a_part_of_a_task_has_a_limit_of_its_own() -> None:
+    """Though it holds the interpreter's lock, in C, so that nothing in the worker could end it."""
+    hung, fine = run([("hang in a part", 0), ("parts", 0)], attempts=1)
+    assert (type(hung.error), str(hung.error)) == (TimeoutError, "a part took more than 1 s")
+    assert hung.trace is not None and "in behave" in hung.trace
+    assert fine.error is None
+
+
+def test_errors_after_which_a_task_is_started_again() -> None:
+    (outcome,) = run([("crash", 0)], attempts=3, again=(SimulatorCrashError,))
+    assert (type(outcome.error), outcome.attempts) == (SimulatorCrashError, 3)
+
+
+def test_a_worker_that_retires_leaves_its_task_to_the_others() -> None:
+    outcomes = run([("retire", (0,))] * 5, workers=2)
+    assert [(o.value, o.error, o.attempts) for o in outcomes] == [(1, None, 1)] * 5
+    with pytest.raises(WorkerRetiredError, match=r"worker [01] is gone") as raised:
+        run([("retire", (0, 1))] * 5, workers=2)
+    assert raised.value.hint == "Start it."
+
+
+# --- the end -----------------------------------------------------------------------------------
+
+
+def test_work_that_is_given_up_stops_its_workers(tmp_path: Path) -> None:
+    tasks = [("value", 2), *[("hang", str(tmp_path))] * 2]
+    with closing(Processes(3).run(behave, tasks)) as outcomes:
+        assert next(outcomes).value == 2
+        pids = pids_in(tmp_path, 2)
+        assert all(map(is_alive, pids))
+    wait_until_gone(pids, seconds=5)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_workers_and_what_they_started_end_with_their_parent(
+    tmp_path: Path, how: signal.Signals
+) -> None:
+    folder = tmp_path / "pids"
+    folder.mkdir()
+    tasks = [("start", (str(folder), None)), ("hang", str(folder))]
+    command, environment = script(
+        tmp_path,
+        "from support.worker_calls import behave\n"
+        f"if __name__ == '__main__':\n    list(Processes(1).run(behave, {tasks}))\n",
+    )
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as parent:
+        try:
+            pids = pids_in(folder, 2)
+            time.sleep(0.5)  # until the second task hangs
+            assert all(map(is_alive, pids))
+            parent.send_signal(how)
+            parent.wait(30)
+        finally:
+            parent.kill()
+    wait_until_gone(pids, seconds=20)
+
+
+def test_processes_of_a_dead_worker_end_though_they_hold_its_pipe(tmp_path: Path) -> None:
+    (outcome,) = run([("start", (str(tmp_path), 3))], attempts=1)
+    assert str(outcome.error) == "the worker process died (exit code 3)"
+    wait_until_gone(pids_in(tmp_path, 2), seconds=5)
+
+
+def test_workers_close_what_they_hold_and_print_to_stderr(tmp_path: Path) -> None:
+    command, environment = script(
+        tmp_path,
+        "from support.worker_calls import Held\n"
+        "if __name__ == '__main__':\n"
+        "    print([outcome.value for outcome in Processes(1).run(Held(), [1])])\n",
+    )
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "[1]\n"
+    assert done.stderr.split() == ["printed", "1", "echoed", "closed"]
+
+
+@pytest.mark.parametrize("from_stdin", [False, True])
+def test_a_script_that_workers_cannot_import_gets_one_error(
+    tmp_path: Path, from_stdin: bool
+) -> None:
+    """One that starts work at its top, and one that is no file."""
+    text = (
+        "from support.worker_calls import behave\nlist(Processes(2).run(behave, [('pid', 0)] * 2))"
+    )
+    command, environment = script(tmp_path, text)
+    done = subprocess.run(
+        [sys.executable, "-"] if from_stdin else command,
+        input=Path(command[1]).read_text(),
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("errors.WorkerError: ") == 1
+    assert 'if __name__ == "__main__":' in done.stderr.splitlines()[-1]
