@@ -18,9 +18,8 @@ from robomme_interference_data.encode import (
     RECORDING,
     Codec,
     VideoEncoder,
-    get_codec,
 )
-from robomme_interference_data.errors import BuildError, InvalidOptionError
+from robomme_interference_data.errors import BuildError
 from robomme_interference_data.video import iter_frames
 
 LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]
@@ -37,16 +36,6 @@ def write(path: Path, images: NDArray[np.uint8], codec: Codec = LOSSLESS) -> NDA
         encoder.add(image)
     encoder.close()
     return np.stack(list(iter_frames(path, 0, None, 10)))
-
-
-def test_names() -> None:
-    assert get_codec("av1-lossless") is LOSSLESS
-    assert {name: (codec.name, codec.exact) for name, codec in CODECS.items()} == {
-        "av1-lossless": ("av1-lossless", True),
-        "lerobot-default": ("lerobot-default", False),
-    }
-    with pytest.raises(InvalidOptionError, match="'av1-losless'.*\n.*'av1-lossless'"):
-        get_codec("av1-losless")
 
 
 # --- lossless ------------------------------------------------------------------------------------

@@ -77,15 +77,6 @@ def test_path_and_list(hub: HubServer) -> None:
     assert len(hub.requests) == before  # from the cache, without a request
 
 
-def test_models_too(hub: HubServer) -> None:
-    commit = hub.push("someone/model", {"config.json": b"{}"})
-    files = HubFiles("someone/model", repo_type="model")
-    assert files.path("config.json").read_bytes() == b"{}"
-    assert files.commit == commit
-    with pytest.raises(HubError, match="no dataset repository 'someone/model'"):
-        HubFiles("someone/model").path("config.json")
-
-
 def test_a_revision_is_pinned_once(hub: HubServer) -> None:
     first = hub.push(DATASET, FILES)
     files = HubFiles(REPO)
@@ -132,6 +123,7 @@ def test_missing_file(hub: HubServer) -> None:
 )
 def test_refusals(hub: HubServer, repo: str, revision: str, telling: str, hint: str) -> None:
     hub.push(DATASET, FILES)
+    hub.push(REPO, FILES)  # a model of the same name is another repository
     hub.push("datasets/someone/gated", FILES)
     hub.gated.add("datasets/someone/gated")
     with pytest.raises(HubError, match=telling) as caught:

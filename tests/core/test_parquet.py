@@ -51,15 +51,6 @@ def test_groups_without_such_rows_are_not_read(tmp_path: Path) -> None:
         RowSpan(path).scalars("number")
 
 
-def test_values_however_they_are_stored(tmp_path: Path) -> None:
-    for kind in (pa.list_(pa.float32()), pa.list_(pa.float64(), 2), pa.large_list(pa.float32())):
-        path = write(tmp_path / "t", v=pa.array([[0.5, 1], [2, 3], [4, 5]], kind))
-        found = RowSpan(path, 1, 3).vectors("v")
-        assert (found.tolist(), found.dtype) == ([[2, 3], [4, 5]], np.float32)
-    for values in ([True, False], [[1], [0]], pa.array([1, 0], pa.uint64())):
-        assert RowSpan(write(tmp_path / "t", v=values)).scalars("v").tolist() == [1, 0]
-
-
 @pytest.mark.parametrize(
     ("values", "method", "message"),
     [
