@@ -137,8 +137,7 @@ class StageTask:
                     os.fsync(file.fileno())
             partial.rename(place)
         except InterferenceError as error:
-            named = error.message.startswith(str(episode.id))
-            raise error if named else error.about(episode.id) from error
+            raise error.about(episode.id) from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
         return StagedEpisode(staged, place)

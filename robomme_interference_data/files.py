@@ -66,7 +66,7 @@ class LocalFiles:
         # keeps its snapshots' files in.
         root = self.root.resolve()
         store = root.parent.parent / "blobs" if root.parent.name == "snapshots" else root
-        real = path.resolve()
+        real = Path(os.path.realpath(path))  # which a link that goes round does not stop
         if not (real.is_relative_to(root) or real.is_relative_to(store)):
             raise FormatError(
                 f"{relative} in {self.root} is a link that leads out of the folder",

@@ -77,17 +77,11 @@ class HubFiles:
             HubError: The repository or revision is unknown, needs permission, or cannot be
                 reached and is not in the cache.
         """
-        from huggingface_hub import resolve_revision
+        from huggingface_hub import HfApi
 
-        return str(
-            self._asked(
-                None,
-                resolve_revision,
-                self.repo_id,
-                repo_type=self.repo_type,
-                revision=self.revision,
-            ).resolved
-        )
+        resolve, kind = HfApi().resolve_revision, self.repo_type
+        found = self._asked(None, resolve, self.repo_id, repo_type=kind, revision=self.revision)
+        return str(found.resolved)
 
     def path(self, relative: str) -> Path:
         """Return the file's path in the cache, downloading it first if need be; see `Files.path`.

@@ -5,10 +5,7 @@ through it. Tests hold it against lerobot's own.
 """
 
 import json
-import math
-import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -25,57 +22,19 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.files import Files, read_json
+from robomme_interference_data.lerobot_layout import (
+    VERSIONS,
+    EpisodePlace,
+    check_info,
+    place_episode,
+)
 from robomme_interference_data.parquet import RowSpan, open_parquet, reading
 
-__all__ = ["EpisodePlace", "LeRobotFiles", "fill_template"]
-
-VERSIONS = ("v3.0", "v2.1")
+__all__ = ["LeRobotFiles"]
 
 _V21_EPISODES = "meta/episodes.jsonl"
 _V21_TASKS = "meta/tasks.jsonl"
-
-_MAX_VALUES = 1 << 28
-"""Values in one frame of a feature, at most: nothing is allocated for a shape beyond."""
-
-_MAX_EPISODES = 10_000_000
-_FIELD = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
 _ROWS_KEPT = 1024
-
-
-@dataclass(frozen=True)
-class EpisodePlace:
-    """Where an episode lies in its dataset.
-
-    Attributes:
-        index: Number of the episode in the dataset.
-        length: Frames.
-        data: Relative path of the parquet file with its rows.
-        videos: Column to `(relative path, number of the first frame in that file)`.
-    """
-
-    index: int
-    length: int
-    data: str
-    videos: dict[str, tuple[str, int]]
-
-
-def fill_template(template: str, where: object, **values: str | int) -> str:
-    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else.
-
-    Raises:
-        FormatError: The template holds anything else in braces.
-    """
-
-    def value(match: re.Match[str]) -> str:
-        found = values.get(match[1])
-        if found is None or (match[2] and not isinstance(found, int)):
-            raise FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
-        return f"{found:0{match[2]}d}" if match[2] else str(found)
-
-    filled = _FIELD.sub(value, template)
-    if "{" in filled or "}" in filled:
-        raise FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
-    return filled
 
 
 class LeRobotFiles:
@@ -108,7 +67,7 @@ class LeRobotFiles:
                 "Convert it with LeRobot's own scripts (lerobot.scripts."
                 "convert_dataset_v21_to_v30 and its predecessors).",
             )
-        _check_info(self.info, path)
+        check_info(self.info, path)
 
     @property
     def fps(self) -> float:
@@ -142,7 +101,8 @@ class LeRobotFiles:
         table = self._v30_table() if self.version == "v3.0" else self._v21_table()
         where = self.files.describe()
         for name in ("episode_index", "length"):
-            if name not in table.column_names or not pa.types.is_integer(table[name].type):
+            column = table[name] if name in table.column_names else pa.nulls(1)
+            if column.null_count or not pa.types.is_integer(column.type):
                 raise FormatError.damaged(where, f"its episodes have no whole numbers {name!r}")
         table = table.sort_by("episode_index")
         if not np.array_equal(table["episode_index"].to_numpy(), np.arange(len(self))):
@@ -187,39 +147,7 @@ class LeRobotFiles:
         Raises:
             FormatError: The metadata does not say it as LeRobot does.
         """
-        row, info, where = self.row(index), self.info, self.files.describe()
-        videos = [name for name, f in self.features.items() if f["dtype"] == "video"]
-        length = _whole(row, "length", where)
-        if self.version == "v2.1":
-            chunk = index // int(info.get("chunks_size") or 1000)
-            named: dict[str, str | int] = {"episode_chunk": chunk, "episode_index": index}
-            data = fill_template(info["data_path"], where, **named)
-            paths = {
-                name: (fill_template(info["video_path"], where, video_key=name, **named), 0)
-                for name in videos
-            }
-            return EpisodePlace(index, length, data, paths)
-        data = fill_template(
-            info["data_path"],
-            where,
-            chunk_index=_whole(row, "data/chunk_index", where),
-            file_index=_whole(row, "data/file_index", where),
-        )
-        paths = {}
-        for name in videos:
-            key = f"videos/{name}/"
-            path = fill_template(
-                info["video_path"],
-                where,
-                video_key=name,
-                chunk_index=_whole(row, key + "chunk_index", where),
-                file_index=_whole(row, key + "file_index", where),
-            )
-            start = row.get(key + "from_timestamp")
-            if not isinstance(start, int | float) or not 0 <= start < 1e9:
-                raise FormatError.damaged(where, f"{key}from_timestamp is {start!r}")
-            paths[name] = (path, round(start * self.fps))
-        return EpisodePlace(index, length, data, paths)
+        return place_episode(self.info, index, self.row(index), self.files.describe())
 
     def rows(self, index: int) -> RowSpan:
         """Return the rows of an episode in its data file.
@@ -234,8 +162,11 @@ class LeRobotFiles:
         found = np.flatnonzero(whole.scalars("episode_index") == index)
         start = int(found[0]) if len(found) else 0
         rows = whole.part(start, start + len(found))
-        if not np.array_equal(found, np.arange(start, start + place.length)) or not np.array_equal(
-            rows.scalars("frame_index"), np.arange(place.length)
+        numbers = np.arange(len(found))  # as many as there are, whatever length the metadata says
+        if (
+            len(found) != place.length
+            or (found != start + numbers).any()
+            or (rows.scalars("frame_index") != numbers).any()
         ):
             raise TruncatedVideoError(
                 f"{path} holds {len(found)} rows of episode {index}; {place.length}, one after the "
@@ -330,39 +261,3 @@ class LeRobotFiles:
                 if not isinstance(row, dict):
                     raise FormatError.damaged(f"{path}, line {number}", "no JSON object")
                 yield row
-
-
-def _check_info(info: dict[str, Any], path: object) -> None:
-    """Check what is read of `info.json`: types and sizes, before anything is allocated.
-
-    Raises:
-        FormatError: Something is not as LeRobot writes it.
-    """
-
-    def check(holds: bool, name: str) -> None:
-        if not holds:
-            shown = repr(info.get(name))
-            raise FormatError.damaged(path, f"{name} is {shown[:200]}")
-
-    fps, total = info.get("fps"), info.get("total_episodes")
-    check(isinstance(fps, int | float) and 0 < fps <= 1e6, "fps")
-    check(isinstance(total, int) and 0 <= total <= _MAX_EPISODES, "total_episodes")
-    check(isinstance(info.get("data_path"), str), "data_path")
-    features = info.get("features")
-    check(isinstance(features, dict) and bool(features), "features")
-    for feature in features.values() if isinstance(features, dict) else ():
-        shape = feature.get("shape") if isinstance(feature, dict) else None
-        sized = isinstance(shape, list | tuple) and all(
-            isinstance(side, int) and side > 0 for side in shape
-        )
-        check(sized and math.prod(shape or ()) <= _MAX_VALUES, "features")
-        check(isinstance(feature.get("dtype"), str), "features")
-        if feature["dtype"] == "video":
-            check(isinstance(info.get("video_path"), str), "video_path")
-
-
-def _whole(row: dict[str, Any], name: str, where: str) -> int:
-    value = row.get(name)
-    if not isinstance(value, int) or value < 0:
-        raise FormatError.damaged(where, f"{name} of an episode is {value!r}")
-    return value

@@ -32,7 +32,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except InterferenceError:
         raise
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, UnicodeError, OverflowError) as error:
         text = str(error).partition("\n")[0]
         raise FormatError.damaged(path, f"cannot be read: {text}") from None
 
@@ -110,7 +110,8 @@ class RowSpan:
                 f"{self.path}: {what} is of type {kind} with {column.null_count} empty values; "
                 "expected booleans or integers, none empty"
             )
-        return np.asarray(pc.cast(column, pa.int64()).to_numpy())
+        with reading(self.path):  # a number too large
+            return np.asarray(pc.cast(column, pa.int64()).to_numpy())
 
     def vectors(self, name: str) -> NDArray[np.float32]:
         """Return a column of lists of numbers as `(T, D) float32`."""
@@ -136,7 +137,8 @@ class RowSpan:
         most the encoded bytes of one row group are held, and less where the writer allows it.
         """
         kind = self._type(name)
-        if not pa.types.is_struct(kind) or kind.get_field_index("bytes") < 0:
+        stored = pa.types.is_struct(kind) and kind.get_field_index("bytes") >= 0
+        if not stored or not pa.types.is_binary(kind.field("bytes").type):
             raise FormatError(
                 f"{self.path}: column {name!r} is of type {kind}; expected images as "
                 "struct<bytes, path>"

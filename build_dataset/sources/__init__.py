@@ -67,14 +67,14 @@ def _sample(location: str, options: OpenOptions) -> Source:
 
 
 KINDS: dict[str, tuple[str, Callable[[str, OpenOptions], Source]]] = {
-    "robomme-h5": ("FOLDER", _robomme_h5),
-    "lerobot": ("FOLDER or NAMESPACE/NAME[@REVISION]", _lerobot),
-    "frames": ("FOLDER", _frames),
-    "tabletop": ("", _tabletop),
-    "robomme": ("", _robomme),
-    "sample": ("[FAMILY,…]", _sample),
+    "robomme-h5": ("robomme-h5:FOLDER", _robomme_h5),
+    "lerobot": ("lerobot:FOLDER or lerobot:NAMESPACE/NAME[@REVISION]", _lerobot),
+    "frames": ("frames:FOLDER", _frames),
+    "tabletop": ("tabletop", _tabletop),
+    "robomme": ("robomme", _robomme),
+    "sample": ("sample[:FAMILY,…]", _sample),
 }
-"""Kind of source to what stands behind its colon, and the function that opens one."""
+"""Kind of source to how it is written, and what opens one by what follows the colon."""
 
 
 def open_source(specification: str, options: OpenOptions | None = None) -> Source:
@@ -90,15 +90,15 @@ def open_source(specification: str, options: OpenOptions | None = None) -> Sourc
         MissingExtraError: The kind needs an extra that is not installed.
     """
     kind, colon, location = specification.partition(":")
-    expected = KINDS[kind][0] if kind in KINDS else None
-    needs = expected is not None and expected != "" and not expected.startswith("[")
-    if expected is None or (needs and not location) or (expected == "" and colon):
+    usage, open_kind = KINDS.get(kind, ("", None))
+    incomplete = usage.startswith(f"{kind}:") and not location
+    if open_kind is None or incomplete or (colon and ":" not in usage):
         raise InvalidOptionError(
             f"--source {specification!r} is not one of "
-            + ", ".join(f"{name}:{what}" if what else name for name, (what, _) in KINDS.items()),
+            + ", ".join(usage for usage, _ in KINDS.values()),
             nearest(kind, KINDS, more=""),
         )
-    return KINDS[kind][1](location, options or OpenOptions())
+    return open_kind(location, options or OpenOptions())
 
 
 def _folder(location: str) -> Path:

@@ -1,16 +1,26 @@
 """What every source of recorded episodes serves."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.errors import InvalidOptionError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["Frame", "Recording", "Source", "SourceEpisode", "choose_cameras"]
+__all__ = [
+    "Frame",
+    "Recording",
+    "Source",
+    "SourceEpisode",
+    "choose_cameras",
+    "compose",
+    "demonstration_length",
+]
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,9 @@ class Recording:
         exact: False if the frames were lossily compressed before they came here.
         frames: The frames in order, a bounded number in memory at a time. Closing it early
             releases the files.
+
+    Raises:
+        SourceError: There is no goal, or no such difficulty.
     """
 
     goals: tuple[str, ...]
@@ -67,6 +80,18 @@ class Recording:
     simulator: str | None
     exact: bool
     frames: Generator[Frame]
+
+    def __post_init__(self) -> None:
+        if not self.goals or not all(goal.strip() for goal in self.goals):
+            raise SourceError(
+                f"the goal is {' and '.join(map(repr, self.goals)) or 'missing'}",
+                "Say it in words.",
+            )
+        if self.difficulty not in (None, *DIFFICULTIES):
+            raise SourceError(
+                f"the difficulty is {self.difficulty!r}; expected one of {', '.join(DIFFICULTIES)}",
+                nearest(self.difficulty, DIFFICULTIES, more=""),
+            )
 
 
 class Source(Protocol):
@@ -104,7 +129,9 @@ class Source(Protocol):
 
         Raises:
             InvalidOptionError: The episode has no such camera.
-            SourceError: The recording cannot be read, or, while it is read, breaks off.
+            SourceError, MissingFileError, FormatError, TruncatedVideoError, HubError: The
+                recording cannot be read, or, while it is read, breaks off. Which episode it is
+                need not be said.
         """
         ...
 
@@ -113,15 +140,62 @@ class Source(Protocol):
         ...
 
 
-def choose_cameras(
-    wanted: tuple[str, ...] | None, there: tuple[str, ...], what: object
-) -> tuple[str, ...]:
+def choose_cameras(wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:
     """Return the cameras that are wanted of those that are there, sorted.
 
     Raises:
-        InvalidOptionError: One is not there; `what` says where.
+        InvalidOptionError: One is not there.
     """
     for camera in wanted or ():
         if camera not in there:
-            raise InvalidOptionError.one_of(f"{what}: camera", camera, there)
+            raise InvalidOptionError.one_of("camera", camera, there)
     return tuple(sorted(there if wanted is None else set(wanted)))
+
+
+def demonstration_length(flags: ArrayLike, what: str) -> int:
+    """Return the number of demonstration frames of an episode.
+
+    Args:
+        flags: Whether each frame belongs to the demonstration, `(T,) bool`.
+        what: What says so, for the message.
+
+    Raises:
+        SourceError: The demonstration does not come first and in one piece.
+    """
+    shown = np.asarray(flags, bool)
+    length = int(shown.sum())
+    if shown[length:].any():
+        raise SourceError(
+            f"{what} is true in {length} frames, not all of them at the beginning",
+            "A demonstration comes first and in one piece: mend the recording, or leave it out.",
+        )
+    return length
+
+
+def compose(
+    streams: Mapping[str, Generator[NDArray[np.uint8]]],
+    states: NDArray[np.float32],
+    actions: NDArray[np.float32] | None,
+    lesson: int | None,
+) -> Generator[Frame]:
+    """Yield the frames of an episode whose images and vectors lie apart.
+
+    Args:
+        streams: Camera name to its images in order; each is exhausted after the last frame, so
+            that it may tell that it had more, and is closed however the reading ends.
+        states: `(T, S) float32`.
+        actions: `(T, A) float32`, or None if not recorded.
+        lesson: Number of demonstration frames; None if the source does not say.
+    """
+    with ExitStack() as stack:
+        for stream in streams.values():
+            stack.enter_context(closing(stream))
+        for number, state in enumerate(states):
+            yield Frame(
+                images={camera: next(stream) for camera, stream in streams.items()},
+                state=state,
+                action=None if actions is None else actions[number],
+                is_demonstration=None if lesson is None else number < lesson,
+            )
+        for stream in streams.values():
+            next(stream, None)

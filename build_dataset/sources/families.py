@@ -3,15 +3,14 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from robomme_interference_data.errors import InvalidIdError, SourceError, nearest
+from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["BLOCK_EPISODES", "BLOCK_FAMILIES", "ids_by_block", "ids_by_columns", "ids_by_file"]
+__all__ = ["BLOCK_FAMILIES", "ids_by_block", "ids_by_columns", "ids_by_file"]
 
 BLOCK_FAMILIES = (
     "PatternLock",
@@ -34,31 +33,34 @@ BLOCK_FAMILIES = (
 """Families of RoboMME's LeRobot datasets, which have no family column: 100 episodes of each, in
 this order (`lerobot/robomme`, `Yinpei/robomme_data_lerobot`)."""
 
-BLOCK_EPISODES = 100
+_BLOCK = 100
+_CSV = ("episode_index,family on the first line, and split and index if wanted", "0,MoveCube")
+_JSON = ("one object, episode index to family", '{"0": "MoveCube", "1": "InsertPeg"}')
 
-_COLUMNS = ("episode_index", "family", "split", "index")
-_EXAMPLE = "For example: episode_index,family on the first line, then 0,MoveCube and so on."
+
+class _Told(NamedTuple):
+    """What is said of an episode, where, and of which."""
+
+    where: str
+    episode: int
+    values: Mapping[str, Any]
 
 
-def ids_by_block(episodes: Sequence[int], split: str) -> dict[int, EpisodeId]:
+def ids_by_block() -> dict[int, EpisodeId]:
     """Name the episodes 0 to 1,599 by their block of 100."""
     return {
-        episode: EpisodeId(
-            BLOCK_FAMILIES[episode // BLOCK_EPISODES], split, episode % BLOCK_EPISODES
-        )
-        for episode in episodes
+        _BLOCK * block + index: EpisodeId(family, "train", index)
+        for block, family in enumerate(BLOCK_FAMILIES)
+        for index in range(_BLOCK)
     }
 
 
-def ids_by_columns(
-    rows: Mapping[int, Mapping[str, Any]], split: str, place: str
-) -> dict[int, EpisodeId] | None:
+def ids_by_columns(rows: Sequence[Mapping[str, Any]], place: str) -> dict[int, EpisodeId] | None:
     """Name the episodes by per-episode columns.
 
     Args:
-        rows: Episode index to its row of `meta/episodes`: `episode_id`, or `family` and, if
-            there, `split` and `source_episode` (a number).
-        split: Split of episodes without one.
+        rows: Row of `meta/episodes` by episode index: `episode_id`, or `family` and, if there,
+            `split` and `index` (a number).
         place: The dataset in words, for messages.
 
     Returns:
@@ -67,157 +69,110 @@ def ids_by_columns(
     Raises:
         SourceError: A value is not valid, or two episodes have the same id.
     """
-    if not all("episode_id" in row or "family" in row for row in rows.values()):
+    if not rows or not {"episode_id", "family"} & set(rows[0]):
         return None
-    wanted = []
-    for episode, row in rows.items():
-        where = f"{place}: meta/episodes, episode {episode}"
-        if "episode_id" in row:
-            try:
-                found = EpisodeId.parse(str(row["episode_id"]))
-            except InvalidIdError as error:
-                raise SourceError(f"{where}: {error.message}", error.hint) from None
-            wanted.append(_Wanted(where, episode, found.family, found.split, found.index))
-        else:
-            number = row.get("index")
-            if number is not None and not isinstance(number, int):
-                raise SourceError(f"{where}: index is {number!r}; expected a number")
-            wanted.append(
-                _Wanted(where, episode, str(row["family"]), row.get("split") or split, number)
-            )
-    return _name(wanted)
+    where = f"{place}: meta/episodes, episode"
+    return _name(_Told(f"{where} {index}", index, row) for index, row in enumerate(rows))
 
 
-def ids_by_file(path: Path, episodes: Sequence[int], split: str) -> dict[int, EpisodeId]:
+def ids_by_file(path: Path, count: int) -> dict[int, EpisodeId]:
     """Name the episodes by a families file; `docs/sources.md` describes it.
 
     Args:
         path: A `.json` file (episode index to family), or a CSV file with the columns
             `episode_index`, `family` and, optionally, `split` and `index`.
-        episodes: Indices of the dataset's episodes; all must be named.
-        split: Split of episodes without one.
+        count: Number of the dataset's episodes; all must be named.
 
     Raises:
         SourceError: The file cannot be read, or a line of it is wrong; says which.
     """
+    read, (expected, example) = (_csv, _CSV) if path.suffix != ".json" else (_json, _JSON)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"families file {path} cannot be read: {error}", _EXAMPLE) from None
-    read = _read_json if path.suffix == ".json" else _read_csv
-    wanted = read(path, text, split)
+        told = list(read(path, path.read_text(encoding="utf-8-sig")))
+    except SourceError:
+        raise
+    except (OSError, ValueError, csv.Error, RecursionError) as error:
+        raise SourceError(
+            f"families file {path} cannot be read: {error}",
+            f"Expected {expected}. For example: {example}",
+        ) from None
     seen: dict[int, str] = {}
-    known = set(episodes)
-    for row in wanted:
-        if row.episode not in known:
+    for where, episode, _ in told:
+        if episode >= count:
+            raise SourceError(f"{where}: the dataset has no episode {episode}; it has {count}")
+        if episode in seen:
             raise SourceError(
-                f"{row.where}: the dataset has no episode {row.episode}; it has "
-                f"{len(known)} episodes, {min(known)} to {max(known)}"
-            )
-        if row.episode in seen:
-            raise SourceError(
-                f"{row.where}: episode {row.episode} was named before, in {seen[row.episode]}",
+                f"{where}: episode {episode} was named before, in {seen[episode]}",
                 "Keep one of the two.",
             )
-        seen[row.episode] = row.where
-    missing = sorted(known - seen.keys())
+        seen[episode] = where
+    missing = [episode for episode in range(count) if episode not in seen]
     if missing:
         first = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
         raise SourceError(
-            f"{path} names {len(seen)} of {len(known)} episodes; missing: {first}",
+            f"{path} names {len(seen)} of {count} episodes; missing: {first}",
             "Add a line for each of them.",
         )
-    return _name(sorted(wanted, key=lambda row: row.episode))
+    return _name(sorted(told, key=lambda one: one.episode))
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """What an episode is to be called; index None means the next free one of its family."""
-
-    where: str
-    episode: int
-    family: str
-    split: str
-    index: int | None
-
-
-def _name(wanted: Sequence[_Wanted]) -> dict[int, EpisodeId]:
+def _name(told: Iterable[_Told]) -> dict[int, EpisodeId]:
+    """Make ids of what is said; without an index, the next one of its family and split."""
     ids: dict[int, EpisodeId] = {}
     places: dict[EpisodeId, str] = {}
-    ranks: Counter[tuple[str, str]] = Counter()
-    for row in wanted:
-        index = ranks[row.family, row.split] if row.index is None else row.index
-        ranks[row.family, row.split] += 1
+    ranks: Counter[EpisodeId] = Counter()
+    for where, episode, values in told:
         try:
-            found = EpisodeId(row.family, row.split, index)
+            if "episode_id" in values:
+                found = EpisodeId.parse(values["episode_id"])
+            else:
+                family: Any = values.get("family")  # ids check themselves, also what is no text
+                first = EpisodeId(family, values.get("split") or "train", 0)
+                index = values.get("index")
+                index = ranks[first] if index is None else index
+                found = EpisodeId(first.family, first.split, index)
+                ranks[first] += 1
         except InvalidIdError as error:
-            raise SourceError(f"{row.where}: {error.message}", error.hint) from None
+            raise SourceError(f"{where}: {error.message}", error.hint) from None
         if found in places:
             raise SourceError(
-                f"{row.where}: {found} is already the name of {places[found]}",
+                f"{where}: {found} is already the name of {places[found]}",
                 "Every episode needs a name of its own.",
             )
-        places[found] = row.where
-        ids[row.episode] = found
+        places[found] = where
+        ids[episode] = found
     return ids
 
 
-def _read_csv(path: Path, text: str, split: str) -> list[_Wanted]:
+def _csv(path: Path, text: str) -> Iterator[_Told]:
     lines = csv.reader(text.splitlines())
     header = [name.strip() for name in next(lines, [])]
-    for name in header:
-        if name not in _COLUMNS:
-            raise SourceError(
-                f"{path}, line 1: unknown column {name!r}; expected episode_index,family and, if "
-                "wanted, split and index",
-                nearest(name, _COLUMNS),
-            )
-    doubled = [name for name, count in Counter(header).items() if count > 1]
-    lacking = [name for name in _COLUMNS[:2] if name not in header]
-    if doubled or lacking:
-        problem = f"column {doubled[0]!r} comes twice" if doubled else f"no column {lacking[0]!r}"
-        raise SourceError(f"{path}, line 1: {problem}", _EXAMPLE)
-    wanted = []
+    needed, known = {"episode_index", "family"}, {"episode_index", "family", "split", "index"}
+    if len(set(header)) != len(header) or not needed <= set(header) <= known:
+        raise ValueError(f"its first line is {','.join(header)!r}")
     for cells in lines:
         where = f"{path}, line {lines.line_num}"
         if not any(cell.strip() for cell in cells):
             continue
         if len(cells) != len(header):
             raise SourceError(f"{where}: {len(cells)} values; the first line has {len(header)}")
-        row = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-        wanted.append(
-            _Wanted(
-                where,
-                _number(where, "episode_index", row["episode_index"]),
-                row["family"],
-                row.get("split", split),
-                _number(where, "index", row["index"]) if "index" in row else None,
-            )
-        )
-    return wanted
+        values: dict[str, Any] = dict(zip(header, map(str.strip, cells), strict=True))
+        if "index" in values:
+            values["index"] = _number(where, "index", values["index"])
+        yield _Told(where, _number(where, "episode_index", values["episode_index"]), values)
 
 
-def _read_json(path: Path, text: str, split: str) -> list[_Wanted]:
-    try:
-        # As pairs, so that a key that comes twice is seen.
-        pairs = json.loads(text, object_pairs_hook=list)
-    except ValueError as error:
-        raise SourceError(f"{path} is not JSON: {error}") from None
-    if not text.lstrip().startswith("{"):
-        raise SourceError(
-            f"{path} holds no JSON object",
-            'Expected episode index to family: {"0": "MoveCube", "1": "InsertPeg"}',
-        )
-    wanted = []
+def _json(path: Path, text: str) -> Iterator[_Told]:
+    # As pairs, so that a key that comes twice is seen.
+    pairs = json.loads(text, object_pairs_hook=tuple)
+    if not isinstance(pairs, tuple):
+        raise ValueError("it holds no JSON object")
     for key, family in pairs:
         where = f"{path}, key {key!r}"
-        if not isinstance(family, str):
-            raise SourceError(f"{where}: the family is {family!r}; expected text")
-        wanted.append(_Wanted(where, _number(where, "episode_index", key), family, split, None))
-    return wanted
+        yield _Told(where, _number(where, "episode_index", key), {"family": family})
 
 
 def _number(where: str, name: str, text: str) -> int:
-    if not text.isascii() or not text.isdigit():
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise SourceError(f"{where}: {name} is {text!r}; expected a number from 0 on")
     return int(text)

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.build_dataset.sources.base import demonstration_length
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan, is_listed
@@ -30,18 +30,24 @@ class EpisodeRows:
     Attributes:
         start: Its first row.
         length: Its rows, which are its frames.
-        goal: The goal in words.
-        demonstration_length: Frames with `is_demo`; None if the table has no such column.
+        lesson: Frames with `is_demo`; None if the table has no such column.
         actions: Whether the table has actions.
-        values: `seed`, `difficulty`, `simulator` and `exact`; None where not told.
+        goal: The goal in words.
+        seed: Seed of the simulator, or None.
+        difficulty: `easy`, `medium`, `hard`, or None.
+        simulator: Its name, or None.
+        exact: Whether the frames are the recorded pixels; None if not told.
     """
 
     start: int
     length: int
-    goal: str
-    demonstration_length: int | None
+    lesson: int | None
     actions: bool
-    values: dict[str, Any]
+    goal: str
+    seed: int | None
+    difficulty: str | None
+    simulator: str | None
+    exact: bool | None
 
 
 def _is_text(kind: pa.DataType) -> bool:
@@ -74,13 +80,10 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
     """Read and check the table of a frames folder.
 
     Raises:
-        SourceError: It is missing or malformed; says which episode and row, and what to do.
+        SourceError: It is malformed; says which episode and row, and what to do.
     """
-    if not path.is_file():
-        raise SourceError(f"{path} is missing", _SEE)
     try:
-        rows = RowSpan(path)
-        table = rows.table()
+        table = RowSpan(path).table()
     except FormatError as error:
         raise SourceError(error.message, _SEE) from None
     _check_columns(path, table)
@@ -97,16 +100,18 @@ def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
                 f"{path}: the rows of {name} are not together: they go on in row {start}",
                 "Sort the table by episode_id and frame_index before it is written.",
             )
-        found[name] = _episode(path, table.slice(start, stop - start), name, start)
+        found[name] = _episode(f"{path}: {name}", table.slice(start, stop - start), start)
     return found
 
 
 def _check_columns(path: Path, table: pa.Table) -> None:
+    if not table.num_rows:
+        raise SourceError(f"{path} has no rows", _SEE)
     for name in table.column_names:
         if name not in _COLUMNS:
             raise SourceError(
                 f"{path}: unknown column {name!r}; known are {', '.join(_COLUMNS)}",
-                f"Leave it out or rename it. {nearest(name, _COLUMNS)}",
+                f"Leave it out or rename it. {nearest(name, _COLUMNS, more='')}",
             )
     for name, (fits, expected) in _COLUMNS.items():
         if name not in table.column_names:
@@ -119,16 +124,14 @@ def _check_columns(path: Path, table: pa.Table) -> None:
         if table[name].null_count and name not in _MAY_BE_EMPTY:
             row = pc.index(pc.is_null(table[name]), True).as_py()
             raise SourceError(f"{path}: column {name!r} has no value in row {row}", _SEE)
-    if not table.num_rows:
-        raise SourceError(f"{path} has no rows", _SEE)
 
 
-def _episode(path: Path, rows: pa.Table, name: EpisodeId, start: int) -> EpisodeRows:
+def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
     numbers = rows["frame_index"].to_numpy()
     wrong = np.flatnonzero(numbers != np.arange(len(rows)))
     if len(wrong):
         raise SourceError(
-            f"{path}, row {start + int(wrong[0])}: frame_index of {name} is {numbers[wrong[0]]}; "
+            f"{where}: frame_index in row {start + int(wrong[0])} is {numbers[wrong[0]]}; "
             f"expected {wrong[0]}, for it counts from 0 without gaps",
             "Sort the table by episode_id and frame_index, and add the frames that are missing "
             "or number them again.",
@@ -138,28 +141,10 @@ def _episode(path: Path, rows: pa.Table, name: EpisodeId, start: int) -> Episode
         found = pc.unique(rows[column]).to_pylist() if column in rows.column_names else [None]
         if len(found) != 1:
             raise SourceError(
-                f"{path}: {name} has several values of {column!r}: "
-                f"{', '.join(map(repr, found[:3]))}",
+                f"{where} has several values of {column!r}: {', '.join(map(repr, found[:3]))}",
                 "Give all rows of an episode the same one, or make two episodes of it.",
             )
         values[column] = found[0]
-    goal = values.pop("goal")
-    if not goal.strip():
-        raise SourceError(f"{path}: the goal of {name} is empty", "Say it in words.")
-    if values["difficulty"] not in (None, *DIFFICULTIES):
-        raise SourceError(
-            f"{path}: the difficulty of {name} is {values['difficulty']!r}; expected one of "
-            f"{', '.join(DIFFICULTIES)}",
-            nearest(values["difficulty"], DIFFICULTIES),
-        )
-    length = None
-    if "is_demo" in rows.column_names:
-        flags = rows["is_demo"].to_numpy()
-        length = int(flags.sum())
-        if flags[length:].any():
-            raise SourceError(
-                f"{path}: is_demo of {name} is true in {length} frames, not all of them at the "
-                "beginning",
-                "A demonstration comes first and in one piece.",
-            )
-    return EpisodeRows(start, len(rows), goal, length, "action" in rows.column_names, values)
+    marked, actions = "is_demo" in rows.column_names, "action" in rows.column_names
+    lesson = demonstration_length(rows["is_demo"], f"{where}: is_demo") if marked else None
+    return EpisodeRows(start, len(rows), lesson, actions, **values)

@@ -19,8 +19,9 @@ from robomme_interference_data.build_dataset.sources.base import (
     Recording,
     SourceEpisode,
     choose_cameras,
+    demonstration_length,
 )
-from robomme_interference_data.errors import MissingExtraError, SourceError
+from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
 from robomme_interference_data.ids import EpisodeId
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ class H5Source:
         """List all episodes; see `Source.episodes`."""
         found = []
         for family, path in self._files.items():
-            with _reading(path) as file:
+            with _opened(path) as file:
                 numbers = _numbers(file, "episode_")
                 if not numbers:
                     raise SourceError(f"{path} holds no episode_<N> group", _AGAIN)
@@ -136,69 +137,73 @@ class H5Source:
         """Open an episode; see `Source.read`."""
         path, number, _ = episode.key
         where = f"{path}: episode_{number}"
-        with _reading(path) as file:
+        with _opened(path) as file, _complete(where):
             group = file[f"episode_{number}"]
             steps = _numbers(group, "timestep_")
             if not steps or steps != list(range(steps[0], steps[0] + len(steps))):
                 raise SourceError(f"{where} does not hold consecutive timestep_<T> groups", _AGAIN)
+            flags = [bool(group[f"timestep_{step}/info/is_video_demo"][()]) for step in steps]
+            lesson = demonstration_length(flags, f"is_video_demo in {where}")
             setup, first = group["setup"], group[f"timestep_{steps[0]}/obs"]
-            goals = tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()]))
             there = tuple(camera for camera, name in _CAMERAS.items() if name in first)
-            if not goals or not there:
-                missing = " or ".join(_CAMERAS.values()) if goals else "task_goal"
-                raise SourceError(f"{where} has no {missing}", _AGAIN)
-            chosen = choose_cameras(cameras, there, episode.id)
-            difficulty = _text(setup["difficulty"][()]) if "difficulty" in setup else None
-            seed = _seed(group)
-        frames = _frames(path, number, steps, chosen)
-        return Recording(goals, seed, difficulty, "robomme", True, frames)
+            if not there:
+                raise SourceError(f"{where} has no {' or '.join(_CAMERAS.values())}", _AGAIN)
+            chosen = choose_cameras(cameras, there)
+            return Recording(
+                goals=tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()])),
+                seed=_seed(group),
+                difficulty=_text(setup["difficulty"][()]) if "difficulty" in setup else None,
+                simulator="robomme",
+                exact=True,
+                frames=_frames(path, number, steps, lesson, chosen),
+            )
 
     def close(self) -> None:
         """Nothing is held."""
 
 
 @contextmanager
-def _reading(path: str | Path) -> Iterator["h5py.File"]:
+def _complete(where: object) -> Iterator[None]:
+    """Turn what h5py raises about something missing or damaged into one clear error.
+
+    Raises:
+        SourceError: The recording is not complete.
+    """
+    try:
+        yield
+    except InterferenceError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise SourceError(f"{where} is not a complete RoboMME recording: {error}", _AGAIN) from None
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator["h5py.File"]:
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, KeyError, ValueError, UnicodeDecodeError) as error:
-        if isinstance(error, SourceError):
-            raise
-        raise SourceError(f"{path} is not a complete RoboMME recording: {error}", _AGAIN) from None
+    with _complete(path), h5py.File(path, "r") as file:
+        yield file
 
 
-def _frames(path: str, number: int, steps: list[int], cameras: tuple[str, ...]) -> Generator[Frame]:
-    live = False
-    with _reading(path) as file:
-        for step in steps:
+def _frames(
+    path: str, number: int, steps: list[int], lesson: int, cameras: tuple[str, ...]
+) -> Generator[Frame]:
+    with _opened(path) as file:
+        for count, step in enumerate(steps):
             place = f"episode_{number}/timestep_{step}"
-            if place not in file:
-                raise SourceError(f"{path} has no {place}", _AGAIN)
-            frame = _frame(file[place], cameras)
-            if live and frame.is_demonstration:
-                raise SourceError(
-                    f"{path}: {place} is a demonstration frame after live ones",
-                    "Only recordings that begin with their demonstration can be used.",
+            with _complete(f"{path}: {place}"):
+                observation = file[f"{place}/obs"]
+                # The gripper has two fingers that move alike; RoboMME's own loaders keep the
+                # first. `gripper_state` is float64 for some families, `joint_action` for all.
+                gripper = np.atleast_1d(observation["gripper_state"][()])[:1]
+                state = np.concatenate([observation["joint_state"][()][:7], gripper])
+                frame = Frame(
+                    images={camera: observation[_CAMERAS[camera]][()] for camera in cameras},
+                    state=state.astype(np.float32),
+                    action=file[f"{place}/action/joint_action"][()].astype(np.float32),
+                    is_demonstration=count < lesson,
                 )
-            live = not frame.is_demonstration
             yield frame
-
-
-def _frame(step: "h5py.Group", cameras: tuple[str, ...]) -> Frame:
-    observation = step["obs"]
-    # The gripper has two fingers that move alike; RoboMME's own loaders keep the first.
-    # `gripper_state` is float64 for some families, `joint_action` for all.
-    gripper = np.atleast_1d(observation["gripper_state"][()])[:1]
-    state = np.concatenate([observation["joint_state"][()][:7], gripper])
-    return Frame(
-        images={camera: observation[_CAMERAS[camera]][()] for camera in cameras},
-        state=state.astype(np.float32),
-        action=step["action/joint_action"][()].astype(np.float32),
-        is_demonstration=bool(step["info/is_video_demo"][()]),
-    )
 
 
 def _numbers(group: "h5py.Group", prefix: str) -> list[int]:

@@ -1,15 +1,87 @@
-"""Decode single images: PNG, which keeps every pixel, and JPEG, which does not."""
+"""Images of recordings: which kept every pixel, and how single ones are decoded.
+
+A recording counts as exact only where that is certain: PNG images, or video of RGB pixels with a
+codec, or options, that lose nothing. Converting to YUV alone already changes 8-bit RGB values.
+"""
+
+from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, SourceError
 
-__all__ = ["decode_image", "is_png"]
+__all__ = ["decode_image", "info_is_exact", "is_png", "probe_video"]
 
+_RGB_FORMATS = (
+    *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
+    *("rgba", "bgra", "argb", "abgr", "gbrap"),
+)
+_LOSSLESS_CODECS = ("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle")
+_TRUE = ("1", "true", "yes")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
+
+
+def probe_video(path: Path) -> tuple[float, bool]:
+    """Read the header of a video file.
+
+    Returns:
+        Frames per second, and whether codec and pixel format alone make the video exact.
+
+    Raises:
+        SourceError: It is not a video, or does not say its frame rate.
+    """
+    hint = "Write it again with a constant frame rate, for example with codec ffv1 in a .mkv file."
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            if stream.codec_context is None:  # a header cut short; PyAV would crash the process
+                raise ValueError("its codec is not known")
+            rate = stream.average_rate or stream.base_rate
+            lossless = stream.codec.canonical_name in _LOSSLESS_CODECS
+            exact = lossless and stream.pix_fmt in _RGB_FORMATS
+    except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
+        raise SourceError(f"{path} is not a readable video: {error}", hint) from None
+    if not rate:
+        raise SourceError(f"{path} does not say its frame rate", hint)
+    return float(rate), exact
+
+
+def info_is_exact(info: dict[str, Any]) -> bool:
+    """Tell whether a video is exact by what LeRobot's `info.json` says of it.
+
+    Args:
+        info: The feature's `info`: `video.codec`, `video.pix_fmt` and, since LeRobot 0.4, the
+            encoder's options (`video.crf`, `video.extra_options`).
+    """
+    if info.get("video.pix_fmt") not in _RGB_FORMATS:
+        return False
+    codec = info.get("video.codec")
+    if codec in _LOSSLESS_CODECS:
+        return True
+    extra = info.get("video.extra_options")
+    options = _options(extra) if isinstance(extra, dict) else {}
+    if options.get("lossless") in _TRUE:
+        return True
+    # x264 in RGB is lossless at quantizer 0; no other encoder promises that.
+    quality = options.get("qp", options.get("crf", str(info.get("video.crf"))))
+    return codec == "h264" and quality in ("0", "0.0")
+
+
+def _options(extra: dict[str, Any]) -> dict[str, str]:
+    """Return all encoder options as one map; `aom-params` and the like are `a=1:b=2` lists."""
+    found: dict[str, str] = {}
+    for name, value in extra.items():
+        text = str(value).lower()
+        if name.endswith("-params"):
+            parts = (part.partition("=") for part in text.split(":"))
+            found.update((key, setting) for key, _, setting in parts)
+        else:
+            found[name] = text
+    return found
 
 
 def is_png(data: bytes) -> bool:

@@ -3,8 +3,8 @@
 Read with pyarrow and PyAV alone. `docs/sources.md` describes the column map and the families file.
 """
 
-from collections.abc import Generator, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Generator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,35 +13,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.sources.base import (
-    Frame,
     Recording,
     SourceEpisode,
     choose_cameras,
+    compose,
+    demonstration_length,
 )
-from robomme_interference_data.build_dataset.sources.columns import ColumnMap, resolve_columns
-from robomme_interference_data.build_dataset.sources.exactness import info_is_exact
+from robomme_interference_data.build_dataset.sources.columns import CAMERAS, resolve_columns
 from robomme_interference_data.build_dataset.sources.families import (
-    BLOCK_EPISODES,
     BLOCK_FAMILIES,
     ids_by_block,
     ids_by_columns,
     ids_by_file,
 )
 from robomme_interference_data.build_dataset.sources.goals import families_for_goal, goal_fits
-from robomme_interference_data.build_dataset.sources.images import decode_image, is_png
-from robomme_interference_data.constants import IDENTITY_PATH, SPLITS
-from robomme_interference_data.errors import (
-    FormatError,
-    InvalidOptionError,
-    MissingFileError,
-    SourceError,
-    TruncatedVideoError,
+from robomme_interference_data.build_dataset.sources.images import (
+    decode_image,
+    info_is_exact,
+    is_png,
 )
-from robomme_interference_data.files import read_json
+from robomme_interference_data.errors import FormatError, MissingFileError, SourceError
 from robomme_interference_data.hub import HubFiles, locate
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.parquet import RowSpan
+from robomme_interference_data.rows import from_dict
 
 __all__ = ["LeRobotSource"]
 
@@ -53,19 +49,36 @@ _MEND_FAMILIES = (
 )
 
 
+@dataclass(frozen=True)
+class _Told:
+    """What the per-episode columns of a dataset may say; None where they do not."""
+
+    tasks: tuple[str, ...] | None
+    goals: tuple[str, ...] | None
+    seed: int | None
+    difficulty: str | None
+    simulator: str | None
+    exact: bool | None
+    exec_start_idx: int | None
+
+    @property
+    def wordings(self) -> tuple[str, ...]:
+        """All wordings of the goal."""
+        return self.goals or self.tasks or ()
+
+
 class LeRobotSource:
     """Episodes of a LeRobot dataset.
 
     Args:
         location: A folder, or a dataset repository on the Hub, as `hub.locate` reads it.
-        split: Split of episodes that do not say it themselves.
         columns: Logical name (`front`, `wrist`, `state`, `action`, `is_demo`, `exec_start_idx`)
             to the dataset's column, where that is not named as usual.
         families_file: File that names the family of every episode, see `docs/sources.md`.
 
     Raises:
-        InvalidOptionError: The location is neither, or the split is unknown.
-        MissingFileError, HubError, FormatError: Its `meta/info.json` cannot be had or read.
+        InvalidOptionError: The location is neither.
+        HubError: The repository or its revision is unknown, or cannot be reached.
     """
 
     time_limit = 1800.0
@@ -75,14 +88,10 @@ class LeRobotSource:
         self,
         location: str,
         *,
-        split: str = "train",
         columns: dict[str, str] | None = None,
         families_file: Path | None = None,
     ):
-        if split not in SPLITS:
-            raise InvalidOptionError.one_of("split", split, SPLITS)
         self._files = locate(location)
-        self._split = split
         self._given_columns = columns
         self._families_file = families_file
         self.provenance: dict[str, Any] = {"kind": "lerobot"}
@@ -90,7 +99,7 @@ class LeRobotSource:
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_lerobot", "_columns", "_identity")
+        lazy = ("_lerobot", "_columns")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     def episodes(self) -> list[SourceEpisode]:
@@ -102,38 +111,44 @@ class LeRobotSource:
             UnknownNameError, InvalidOptionError: The column map does not fit.
             SourceError: The dataset cannot be used; says which episode, why and what to do.
         """
+        columns = set(self._columns.values())
         rows, known = self._lerobot.all_rows(), self._lerobot.tasks
-        ids = self._ids(rows)
+        ids, simulator = self._ids(rows)
+        found = []
         for index, name in ids.items():
-            row = rows[index]
-            goals = self._goals(row)
-            for task in row.get("tasks") or ():
+            told = self._told(index, rows[index])
+            for task in told.tasks or ():
                 if task not in known:
                     raise FormatError.damaged(
                         self._where, f"episode {index}: unknown task {task!r}"
                     )
-            if self._simulator(row) in (None, "robomme"):
-                self._check_goals(index, name, goals)
-        found = [SourceEpisode(one, (i, self._state(i))) for i, one in ids.items()]
+            played = simulator or told.simulator
+            if played in (None, "robomme"):
+                self._check_goals(index, name, told.wordings)
+            found.append(SourceEpisode(name, (index, played, self._state(index, columns))))
         return sorted(found, key=lambda episode: episode.id)
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Open an episode; see `Source.read`."""
-        index = episode.key[0]
-        columns, row = self._columns, self._lerobot.row(index)
-        chosen = choose_cameras(cameras, tuple(columns.cameras), episode.id)
-        with _naming(episode.id):
-            rows = self._lerobot.rows(index)
-            start = _demonstration_length(rows, columns, row.get("exec_start_idx"))
-            states = self._lerobot.vectors(index, columns.state)
-            actions = self._lerobot.vectors(index, columns.action) if columns.action else None
-            exact = row.get("exact")
-            if exact is None:
-                exact = all(self._is_exact(rows, columns.cameras[camera]) for camera in chosen)
-        frames = self._frames(episode, rows, states, actions, start, chosen, bool(exact))
-        difficulty, seed = row.get("difficulty"), row.get("seed")
-        goals = self._goals(row)
-        return Recording(goals, seed, difficulty, self._simulator(row), bool(exact), frames)
+        index, simulator, _ = episode.key
+        columns, told = self._columns, self._told(index, self._lerobot.row(index))
+        chosen = choose_cameras(cameras, tuple(name for name in CAMERAS if name in columns))
+        rows = self._lerobot.rows(index)
+        states = self._lerobot.vectors(index, columns["state"])
+        actions = self._lerobot.vectors(index, columns["action"]) if "action" in columns else None
+        lesson = _lesson(rows, columns, told.exec_start_idx)
+        exact = told.exact
+        if exact is None:
+            exact = all(self._is_exact(rows, columns[camera]) for camera in chosen)
+        streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
+        return Recording(
+            goals=told.wordings,
+            seed=told.seed,
+            difficulty=told.difficulty,
+            simulator=simulator,
+            exact=exact,
+            frames=compose(streams, states, actions, lesson),
+        )
 
     def close(self) -> None:
         """Nothing is held."""
@@ -143,46 +158,15 @@ class LeRobotSource:
         return LeRobotFiles(self._files)
 
     @cached_property
-    def _columns(self) -> ColumnMap:
+    def _columns(self) -> dict[str, str]:
         return resolve_columns(self._lerobot.features, self._given_columns, self._where)
-
-    @cached_property
-    def _identity(self) -> dict[str, Any]:
-        try:
-            return read_json(self._files.path(IDENTITY_PATH))
-        except MissingFileError:
-            return {}
 
     @property
     def _where(self) -> str:
         return self._files.describe()
 
-    def _frames(
-        self,
-        episode: SourceEpisode,
-        rows: RowSpan,
-        states: NDArray[np.float32],
-        actions: NDArray[np.float32] | None,
-        start: int | None,
-        cameras: tuple[str, ...],
-        exact: bool,
-    ) -> Generator[Frame]:
-        with _naming(episode.id), ExitStack() as stack:
-            images = {
-                camera: stack.enter_context(
-                    closing(
-                        self._images(episode.key[0], rows, self._columns.cameras[camera], exact)
-                    )
-                )
-                for camera in cameras
-            }
-            for number, state in enumerate(states):
-                yield Frame(
-                    images={camera: next(stream) for camera, stream in images.items()},
-                    state=state,
-                    action=None if actions is None else actions[number],
-                    is_demonstration=None if start is None else number < start,
-                )
+    def _told(self, index: int, row: dict[str, Any]) -> _Told:
+        return from_dict(_Told, row, f"{self._where}: episode {index}")
 
     def _images(
         self, index: int, rows: RowSpan, column: str, exact: bool
@@ -193,64 +177,41 @@ class LeRobotSource:
             return
         shape = self._lerobot.shape(column)
         for number, data in enumerate(rows.images(column)):
+            where = f"frame {number} of column {column!r}"
             if exact and not is_png(data):
-                raise SourceError(
-                    f"frame {number} of column {column!r} is a JPEG, the first one a PNG",
-                    "Convert the dataset to PNG throughout, or leave the episode out.",
-                )
+                raise SourceError(f"{where} is a JPEG, although the episode counts as exact", _MEND)
             image = decode_image(data)
             if image.shape != shape:
                 raise SourceError(
-                    f"frame {number} of column {column!r} has the shape {image.shape}; info.json "
-                    f"says {shape}",
-                    _MEND,
+                    f"{where} has the shape {image.shape}; info.json says {shape}", _MEND
                 )
             yield image
 
     def _is_exact(self, rows: RowSpan, column: str) -> bool:
         """Tell whether images are exact, by their codec or by the first one stored in parquet."""
         feature = self._lerobot.features[column]
-        if feature["dtype"] == "video":
-            return info_is_exact(
-                {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
-            )
-        return is_png(next(rows.images(column)))
+        if feature["dtype"] != "video":
+            return is_png(next(rows.images(column)))
+        return info_is_exact((feature.get("video_info") or {}) | (feature.get("info") or {}))
 
-    def _ids(self, rows: list[dict[str, Any]]) -> dict[int, EpisodeId]:
-        indices = list(range(len(rows)))
+    def _ids(self, rows: list[dict[str, Any]]) -> tuple[dict[int, EpisodeId], str | None]:
+        """Return the episodes' ids, and the simulator where the dataset need not say it."""
+        hub = isinstance(self._files, HubFiles) and self._files.repo_id in _ROBOMME_REPOS
+        simulator = "robomme" if hub else None
         if self._families_file is not None:
-            return ids_by_file(self._families_file, indices, self._split)
-        named = ids_by_columns(dict(enumerate(rows)), self._split, self._where)
+            return ids_by_file(self._families_file, len(rows)), simulator
+        named = ids_by_columns(rows, self._where)
         if named is not None:
-            return named
-        if self._by_block:
-            return ids_by_block(indices, self._split)
+            return named, simulator
+        blocks = ids_by_block()
+        if len(rows) == len(blocks):
+            return blocks, "robomme"
         raise SourceError(
-            f"{self._where} does not say of what family its {len(indices)} episodes are: it has no "
+            f"{self._where} does not say of what family its {len(rows)} episodes are: it has no "
             "per-episode column episode_id or family, and is not one of RoboMME's with "
-            f"{len(BLOCK_FAMILIES) * BLOCK_EPISODES}",
+            f"{len(blocks)} of {len(BLOCK_FAMILIES)} families",
             _MEND_FAMILIES,
         )
-
-    @property
-    def _by_block(self) -> bool:
-        """Whether it is laid out as RoboMME's datasets, which have no family column."""
-        own = {"episode_id", "family"} & set(self._lerobot.table.column_names)
-        total = len(BLOCK_FAMILIES) * BLOCK_EPISODES
-        return not own and self._families_file is None and len(self._lerobot) == total
-
-    def _simulator(self, row: dict[str, Any]) -> str | None:
-        known = isinstance(self._files, HubFiles) and self._files.repo_id in _ROBOMME_REPOS
-        if self._by_block or known:
-            return "robomme"
-        said = row.get("simulator") or self._identity.get("simulator")
-        return said or self._lerobot.info.get("simulator")
-
-    def _goals(self, row: dict[str, Any]) -> tuple[str, ...]:
-        goals = tuple(row.get("goals") or row.get("tasks") or ())
-        if not goals or not all(isinstance(goal, str) and goal for goal in goals):
-            raise FormatError.damaged(self._where, "an episode without a task text")
-        return goals
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
         for goal in goals:
@@ -262,34 +223,23 @@ class LeRobotSource:
                     _MEND_FAMILIES,
                 )
 
-    def _state(self, index: int) -> tuple[Any, ...]:
-        """Return what changes when the episode's files do: the commit, or times and sizes."""
+    def _state(self, index: int, columns: set[str]) -> tuple[Any, ...]:
+        """Return what changes when the episode's files do: times and sizes; the commit is known."""
         if isinstance(self._files, HubFiles):
-            return (self._files.commit,)
+            return ()
         place = self._lerobot.place(index)
         states: list[Any] = []
-        for relative in (place.data, *(path for path, _ in place.videos.values())):
-            path = self._files.root / relative
-            # A part of a dataset may be here only; what is missing is missed when it is read.
-            status = path.stat() if path.is_file() else None
-            states.append(status and (status.st_mtime_ns, status.st_size))
+        videos = [path for name, (path, _) in place.videos.items() if name in columns]
+        for relative in (place.data, *videos):
+            try:
+                status = self._files.path(relative).stat()
+                states.append((status.st_mtime_ns, status.st_size))
+            except MissingFileError:  # a part of a dataset may be here only; missed when read
+                states.append(None)
         return tuple(states)
 
 
-@contextmanager
-def _naming(what: object) -> Iterator[None]:
-    """Put an episode's name in front of what goes wrong with its files.
-
-    Raises:
-        SourceError: A file is missing or damaged, or does not fit the metadata.
-    """
-    try:
-        yield
-    except (MissingFileError, FormatError, TruncatedVideoError, SourceError) as error:
-        raise SourceError(f"{what}: {error.message}", error.hint) from error
-
-
-def _demonstration_length(rows: RowSpan, columns: ColumnMap, said: int | None) -> int | None:
+def _lesson(rows: RowSpan, columns: dict[str, str], said: int | None) -> int | None:
     """Return the number of demonstration frames of an episode; None if nothing marks them.
 
     Args:
@@ -301,24 +251,19 @@ def _demonstration_length(rows: RowSpan, columns: ColumnMap, said: int | None) -
         SourceError: A column is not as it should be, or two do not agree.
     """
     found = {} if said is None else {"meta/": said}
-    if columns.is_demo is not None:
-        flags = rows.scalars(columns.is_demo) != 0
-        found[columns.is_demo] = count = int(flags.sum())
-        if flags[count:].any():
-            raise SourceError(
-                f"column {columns.is_demo!r} is true in {count} frames, not all of them at the "
-                "beginning; a demonstration comes first and in one piece",
-                _MEND,
-            )
-    if columns.exec_start_idx is not None:
-        values = np.unique(rows.scalars(columns.exec_start_idx))
+    if "is_demo" in columns:
+        name = columns["is_demo"]
+        found[name] = demonstration_length(rows.scalars(name), f"column {name!r}")
+    if "exec_start_idx" in columns:
+        name = columns["exec_start_idx"]
+        values = np.unique(rows.scalars(name)).tolist()
         if len(values) != 1 or not 0 <= values[0] <= len(rows):
             raise SourceError(
-                f"column {columns.exec_start_idx!r} holds {', '.join(map(str, values[:5]))}; "
-                f"expected one number from 0 to {len(rows)} in all frames",
+                f"column {name!r} holds {', '.join(map(str, values[:5]))}; expected one number "
+                f"from 0 to {len(rows)} in all frames",
                 _MEND,
             )
-        found[columns.exec_start_idx] = int(values[0])
+        found[name] = values[0]
     if len(set(found.values())) > 1:
         told = " and ".join(f"{start} by {name}" for name, start in found.items())
         raise SourceError(f"the number of demonstration frames is not clear: {told}", _MEND)

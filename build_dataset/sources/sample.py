@@ -54,15 +54,16 @@ class SampleSource:
             for split, count in _EPISODES.items()
             for index in range(count)
         ]
-        return [SourceEpisode(one) for one in sorted(ids)]
+        # The same episode of another place among the families looks different.
+        return [SourceEpisode(one, self._families.index(one.family)) for one in sorted(ids)]
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Make an episode up; see `Source.read`."""
         name = episode.id
-        number = self._families.index(name.family)
+        number = episode.key
         scene = _Scene(name, number, self._size)
         short = (number, name.split, name.index) == (0, "train", 1)
-        chosen = choose_cameras(cameras, ("front", "wrist"), name)
+        chosen = choose_cameras(cameras, ("front", "wrist"))
         frames = scene.frames(_SHORT if short else _FRAMES, 48 + 16 * (name.index % 2), chosen)
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]
@@ -103,11 +104,11 @@ class _Scene:
     def front(self, step: int) -> NDArray[np.uint8]:
         """Draw the front view, `(size, size, 3) uint8`."""
         image: NDArray[np.uint8] = self._table.astype(np.uint8)
-        for (column, row), colour in zip(self._cubes, _CUBES, strict=True):
-            self._box(image, column, row, 12, 12, colour)
+        for place, colour in zip(self._cubes, _CUBES, strict=True):
+            self._box(image, place, (12, 12), colour)
         column, row = self._gripper(step)
-        self._box(image, column, row // 2, 5, row // 2, (235, 235, 235))
-        self._box(image, column, row, 14, 6, (60, 60, 70))
+        self._box(image, (column, row // 2), (5, row // 2), (235, 235, 235))
+        self._box(image, (column, row), (14, 6), (60, 60, 70))
         return image
 
     def wrist(self, step: int) -> NDArray[np.uint8]:
@@ -125,21 +126,14 @@ class _Scene:
     def _box(
         self,
         image: NDArray[np.uint8],
-        column: int,
-        row: int,
-        half_width: int,
-        half_height: int,
+        centre: tuple[int, int],
+        half: tuple[int, int],
         colour: tuple[int, int, int],
     ) -> None:
-        top, bottom, left, right = (
-            max(0, value * self.size // 256)
-            for value in (
-                row - half_height,
-                row + half_height,
-                column - half_width,
-                column + half_width,
-            )
-        )
+        """Fill a box: column and row of its centre, and half its width and height."""
+        (column, row), (width, height) = centre, half
+        edges = (row - height, row + height, column - width, column + width)
+        top, bottom, left, right = (max(0, edge * self.size // 256) for edge in edges)
         image[top:bottom, left:right] = colour
 
 

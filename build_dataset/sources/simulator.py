@@ -64,7 +64,7 @@ class SimulatorSource:
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Begin to play an episode; see `Source.read`."""
-        simulator = self._open(choose_cameras(cameras, CAMERAS, self.name))
+        simulator = self._open(choose_cameras(cameras, CAMERAS))
         lesson, first, info = simulator.reset(str(episode.id))
         act = (lambda: simulator.act("oracle")) if self.whole else None
         frames = _play(simulator, lesson, first, act)

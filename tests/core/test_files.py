@@ -83,7 +83,9 @@ def test_written_json_is_read_back(tmp_path: Path) -> None:
     assert read_json(path) == {"a": "ä", "b": [1]}
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"not json", b'{"a": 1', b"\xff\xfe\x00", b"{} {}"])
+@pytest.mark.parametrize(
+    "data", [b"", b"{", b"not json", b'{"a": 1', b"\xff\xfe\x00", b"{} {}", b"[" * 10**5]
+)
 def test_not_json(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "info.json"
     path.write_bytes(data)

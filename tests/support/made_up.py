@@ -108,7 +108,7 @@ class MadeUpSource:
         )
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        chosen = choose_cameras(cameras, self.cameras, episode.id)
+        chosen = choose_cameras(cameras, self.cameras)
         frames = self._frames(str(episode.id), chosen)
         return Recording((f"do {episode.id}",), 7, "easy", "made-up", True, frames)
 

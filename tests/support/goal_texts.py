@@ -3,7 +3,7 @@
 UNMASK = ("VideoUnmask", "VideoUnmaskSwap")
 
 # Our own sentences, each said as a person could say it.
-GOALS = {
+GOALS: dict[str, tuple[str, ...]] = {
     "Put 2 red cubes and one teal cube into the bin and press the button.": ("BinFill",),
     "pick up the violet cube and place it on the target five times": ("PickXtimes",),
     "Take the cube to the right-side target, next to the left-side target.": ("SwingXtimes",),

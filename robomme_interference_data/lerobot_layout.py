@@ -1,0 +1,130 @@
+"""Where LeRobot datasets keep what, v3.0 and v2.1: their `info.json` and path templates, pure."""
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from robomme_interference_data.errors import FormatError
+
+__all__ = ["VERSIONS", "EpisodePlace", "check_info", "fill_template", "place_episode"]
+
+VERSIONS = ("v3.0", "v2.1")
+
+_MAX_VALUES = 1 << 28
+"""Values in one frame of a feature, at most: nothing is allocated for a shape beyond."""
+
+_MAX_EPISODES = 10_000_000
+_FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
+
+
+@dataclass(frozen=True)
+class EpisodePlace:
+    """Where an episode lies in its dataset.
+
+    Attributes:
+        index: Number of the episode in the dataset.
+        length: Frames.
+        data: Relative path of the parquet file with its rows.
+        videos: Column to `(relative path, number of the first frame in that file)`.
+    """
+
+    index: int
+    length: int
+    data: str
+    videos: dict[str, tuple[str, int]]
+
+
+def check_info(info: dict[str, Any], path: object) -> None:
+    """Check what is read of `info.json`: types and sizes, before anything is allocated.
+
+    Raises:
+        FormatError: Something is not as LeRobot writes it.
+    """
+
+    def check(holds: bool, name: str) -> None:
+        if not holds:
+            raise FormatError.damaged(path, f"{name} is {repr(info.get(name))[:200]}")
+
+    fps, total, chunk = info.get("fps"), info.get("total_episodes"), info.get("chunks_size", 1000)
+    check(isinstance(fps, int | float) and 0 < fps <= 1e6, "fps")
+    check(isinstance(total, int) and 0 <= total <= _MAX_EPISODES, "total_episodes")
+    check(isinstance(chunk, int) and chunk > 0, "chunks_size")
+    check(isinstance(info.get("data_path"), str), "data_path")
+    features = info.get("features")
+    check(isinstance(features, dict) and bool(features), "features")
+    for feature in features.values() if isinstance(features, dict) else ():
+        check(isinstance(feature, dict) and isinstance(feature.get("dtype"), str), "features")
+        shape = feature.get("shape")
+        sized = isinstance(shape, list) and all(isinstance(n, int) and n > 0 for n in shape)
+        check(sized and math.prod(shape) <= _MAX_VALUES, "features")
+        described = (feature.get("info", {}), feature.get("video_info", {}))
+        check(all(one is None or isinstance(one, dict) for one in described), "features")
+        if feature["dtype"] == "video":
+            check(isinstance(info.get("video_path"), str), "video_path")
+
+
+def fill_template(template: str, where: object, **values: str | int) -> str:
+    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else.
+
+    Raises:
+        FormatError: The template holds anything else in braces.
+    """
+    refused = FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
+
+    def value(match: re.Match[str]) -> str:
+        found = values.get(match[1])
+        if found is None or (match[2] and not isinstance(found, int)):
+            raise refused
+        return f"{found:0{match[2]}d}" if match[2] else str(found)
+
+    filled = _FIELD.sub(value, template)
+    if "{" in filled or "}" in filled:
+        raise refused
+    return filled
+
+
+def place_episode(
+    info: dict[str, Any], index: int, row: dict[str, Any], where: str
+) -> EpisodePlace:
+    """Return where an episode lies.
+
+    Args:
+        info: The dataset's `info.json`, checked.
+        index: Number of the episode.
+        row: Its per-episode columns.
+        where: The dataset in words, for messages.
+
+    Raises:
+        FormatError: The metadata does not say it as LeRobot does.
+    """
+
+    def whole(name: str) -> int:
+        value = row.get(name)
+        if not isinstance(value, int) or value < 0:
+            raise FormatError.damaged(where, f"{name} of episode {index} is {value!r}")
+        return value
+
+    def path(template: str, key: str, **more: str) -> str:
+        if info["codebase_version"] == "v2.1":
+            chunk = index // info.get("chunks_size", 1000)
+            return fill_template(template, where, episode_chunk=chunk, episode_index=index, **more)
+        chunk, file = whole(f"{key}/chunk_index"), whole(f"{key}/file_index")
+        return fill_template(template, where, chunk_index=chunk, file_index=file, **more)
+
+    videos = {}
+    for name, feature in info["features"].items():
+        if feature["dtype"] != "video":
+            continue
+        key = f"videos/{name}"
+        start: Any = 0.0
+        if info["codebase_version"] != "v2.1":
+            start = row.get(f"{key}/from_timestamp")
+            if not isinstance(start, int | float) or not 0 <= start < 1e9:
+                raise FormatError.damaged(where, f"{key}/from_timestamp is {start!r}")
+        first = round(start * info["fps"])
+        if abs(first - start * info["fps"]) > 0.1:
+            what = f"{key}/from_timestamp {start!r} lies between two frames"
+            raise FormatError.damaged(where, what)
+        videos[name] = (path(info["video_path"], key, video_key=name), first)
+    return EpisodePlace(index, whole("length"), path(info["data_path"], "data"), videos)

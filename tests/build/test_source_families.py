@@ -1,0 +1,165 @@
+"""How the episodes of a LeRobot dataset get their ids, and which goals fit which family."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.goal_texts import GOALS, UNMASK
+
+from robomme_interference_data.build_dataset.sources.families import (
+    BLOCK_FAMILIES,
+    ids_by_block,
+    ids_by_columns,
+    ids_by_file,
+)
+from robomme_interference_data.build_dataset.sources.goals import (
+    GOAL_FAMILIES,
+    families_for_goal,
+    goal_fits,
+)
+from robomme_interference_data.errors import SourceError
+
+
+def written(folder: Path, text: str, name: str = "families.csv") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def names(ids: dict | None) -> dict[int, str]:
+    return {index: str(name) for index, name in (ids or {}).items()}
+
+
+def test_block() -> None:
+    ids = names(ids_by_block())
+    assert list(ids) == list(range(1600))
+    assert len(set(ids.values())) == 1600
+    assert (ids[0], ids[99]) == ("PatternLock/train/0", "PatternLock/train/99")
+    assert (ids[345], ids[1599]) == ("VideoPlaceButton/train/45", "VideoUnmask/train/99")
+
+
+# --- the families file ---------------------------------------------------------------------------
+
+
+def test_a_csv_file_in_any_form(tmp_path: Path) -> None:
+    lines = ["episode_index, family, split", "2,InsertPeg,val", "", "0,MoveCube,"]
+    path = written(tmp_path, "\n".join([*lines, "3,MoveCube,train", "1,MoveCube,val"]))
+    expected = ["MoveCube/train/0", "MoveCube/val/0", "InsertPeg/val/0", "MoveCube/train/1"]
+    assert names(ids_by_file(path, 4)) == dict(enumerate(expected))
+    path = written(tmp_path, "\ufefffamily,index,episode_index\r\nA,7,0\r\nA,3,1\r\n")
+    assert names(ids_by_file(path, 2)) == {0: "A/train/7", 1: "A/train/3"}
+
+
+@given(st.lists(st.sampled_from(["A", "B", "MoveCube"]), min_size=1, max_size=20), st.randoms())
+def test_order_and_kind_of_file_do_not_matter(tmp_path_factory, families, random) -> None:
+    folder = tmp_path_factory.mktemp("families")
+    lines = [f"{index},{family}" for index, family in enumerate(families)]
+    random.shuffle(lines)
+    path = written(folder, "episode_index,family\n" + "\n".join(lines))
+    as_json = written(folder, json.dumps(dict(map(str, p) for p in enumerate(families))), "f.json")
+    ids = ids_by_file(path, len(families))
+    assert ids == ids_by_file(as_json, len(families))
+    assert [name.family for name in ids.values()] == families
+    for family in set(families):
+        mine = [name.index for name in ids.values() if name.family == family]
+        assert mine == list(range(len(mine)))
+
+
+HEADER = "episode_index,family"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "first line is ''(.|\n)*episode_index,family"),
+        ("episode_index,famly\n0,A\n", "first line is 'episode_index,famly'"),
+        (f"{HEADER},family\n0,A,A\n", "first line is"),
+        (f"{HEADER}\n0,A\n1\n", "line 3: 1 values; the first line has 2"),
+        (f"{HEADER}\n0,A\n-1,A\n", "line 3: episode_index is '-1'"),
+        (f"{HEADER}\n0,A\n{'9' * 5000},A\n", "line 3: episode_index is '999"),
+        (f"{HEADER}\n0,A\n2,A\n", "line 3: the dataset has no episode 2; it has 2"),
+        (f"{HEADER}\n0,A\n\n0,B\n", "line 4: episode 0 was named before, in .* line 2"),
+        (f"{HEADER}\n0,A\n", "names 1 of 2 episodes; missing: 1"),
+        (f"{HEADER}\n0,A\n1,9lives\n", "line 3: '9lives' is not a family name"),
+        (f"{HEADER},split\n0,A,train\n1,A,trian\n", "line 3: 'trian' is not a split"),
+        (f"{HEADER},index\n0,A,0\n1,A,0\n", "line 3: A/train/0 is already the name of"),
+        (f"{HEADER},index\n0,A,0\n1,A,one\n", "line 3: index is 'one'"),
+        (f"{HEADER}\n0,{'A' * 200_000}\n", "cannot be read"),
+        ("{", "cannot be read"),
+        ("[" * 100_000, "cannot be read"),
+        ('["A", "B"]', "no JSON object"),
+        ('{"0": "A", "1": 2}', "key '1': 2 is not a family name"),
+        ('{"0": "A", "1": {"a": []}}', "key '1': .*is not a family name"),
+        ('{"0": "A", "one": "B"}', "key 'one': episode_index is 'one'"),
+        ('{"0": "A", "0": "B"}', "key '0': episode 0 was named before"),
+    ],
+)
+def test_problems_are_named_with_their_place(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, text, "f.json" if text[:1] in ("{", "[") else "f.csv")
+    with pytest.raises(SourceError, match=message) as caught:
+        ids_by_file(path, 2)
+    assert str(path) in caught.value.message
+
+
+def test_a_file_that_cannot_be_read_says_what_it_should_hold(tmp_path: Path) -> None:
+    (tmp_path / "latin.csv").write_bytes("episode_index,famílie\n".encode("latin1"))
+    for name in ("none.csv", "latin.csv"):
+        with pytest.raises(SourceError, match=r"cannot be read(.|\n)*episode_index,family"):
+            ids_by_file(tmp_path / name, 1)
+
+
+# --- per-episode columns -------------------------------------------------------------------------
+
+ROWS: list[tuple[list[dict[str, Any]], list[str] | str]] = [
+    (
+        [{"episode_id": "MoveCube/val/3"}, {"episode_id": "A/test/0"}],
+        ["MoveCube/val/3", "A/test/0"],
+    ),
+    ([{"family": "A", "split": "val", "index": 12}, {"family": "A"}], ["A/val/12", "A/train/0"]),
+    ([{"family": "A", "split": None}, {"family": "A", "index": None}], ["A/train/0", "A/train/1"]),
+    ([{"tasks": ["x"], "index": 3}], []),
+    ([], []),
+    ([{"episode_id": "MoveCube"}], "here: meta/episodes, episode 0: 'MoveCube' is not"),
+    ([{"episode_id": None}], "episode 0: None is not an episode id"),
+    ([{"family": "A", "index": "7"}], "episode 0: '7' is not an episode index"),
+    ([{"family": "A"}, {"family": None}], "episode 1: None is not a family"),
+    ([{"family": ["A"]}], "is not a family"),
+    ([{"episode_id": "A/val/1"}] * 2, "episode 1: A/val/1 is already the name of .*episode 0"),
+]
+
+
+@pytest.mark.parametrize(("rows", "expected"), ROWS)
+def test_columns(rows: list[dict[str, Any]], expected: list[str] | str) -> None:
+    if isinstance(expected, list):
+        assert names(ids_by_columns(rows, "here")) == dict(enumerate(expected))
+        return
+    with pytest.raises(SourceError, match=expected):
+        ids_by_columns(rows, "here")
+
+
+# --- goals ---------------------------------------------------------------------------------------
+
+
+def test_every_goal_fits_its_families_and_no_others() -> None:
+    for goal, families in GOALS.items():
+        for text in (goal, goal.upper(), f" {goal.title().replace(' ', '  ')}\n"):
+            assert families_for_goal(text) == families
+            assert [family for family in GOAL_FAMILIES if goal_fits(family, text)] == [*families]
+        assert goal_fits("OpenDrawer", goal)  # no rule: any goal
+    assert sorted(GOAL_FAMILIES) == sorted(BLOCK_FAMILIES)
+    assert {family for families in GOALS.values() for family in families} == set(GOAL_FAMILIES)
+
+
+def test_real_goals(shared_data: Path) -> None:
+    files = sorted((shared_data / "lessons").glob("*.npz"))
+    assert len(files) == 9
+    for file in files:
+        with np.load(file) as lesson:
+            family = str(lesson["env_id"])
+            for goal in lesson["task_goal"]:
+                expected = UNMASK if family in UNMASK else (family,)
+                assert families_for_goal(str(goal)) == expected

@@ -1,0 +1,213 @@
+"""Frames folders: recordings of any robot, and folders that are not as described."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.recordings import (
+    Rows,
+    check_recording,
+    encode_image,
+    make_episode,
+    rows_of,
+    write_images,
+    write_table,
+    write_video,
+)
+
+from robomme_interference_data.build_dataset.sources.frames import FramesSource
+from robomme_interference_data.errors import InterferenceError
+
+DRAWER, MOVE = "OpenDrawer/train/0", "MoveCube/val/2"
+FOUR = make_episode(4, 4, "open it", cameras=("front",))
+FRONT = FOUR.images["front"]
+DOCS = Path(__file__).parents[2] / "docs" / "sources.md"
+
+
+def place(folder: Path, name: str = DRAWER, kind: str = "images", camera: str = "front") -> Path:
+    return folder / kind / camera / (f"{name}.mkv" if kind == "videos" else name)
+
+
+def write(folder: Path, rows: Rows | None = None) -> Path:
+    """Write a folder with one episode of four images; returns the folder of the images."""
+    write_table(folder, rows_of(DRAWER, FOUR) if rows is None else rows)
+    return write_images(place(folder), FRONT)
+
+
+# --- what is read --------------------------------------------------------------------------------
+
+
+def test_actions_and_marks_may_be_missing(tmp_path: Path) -> None:
+    silent = make_episode(4, 4, "open it", cameras=("front",), actions=False)
+    write(tmp_path, rows_of(DRAWER, silent))
+    source = FramesSource(tmp_path)
+    check_recording(source.read(source.episodes()[0], None), silent, marked=False)
+
+
+@pytest.mark.parametrize(
+    ("codec", "pix_fmt", "declared", "exact"),
+    [
+        ("ffv1", "bgr0", None, True),
+        ("ffv1", "bgr0", False, False),
+        ("ffv1", "yuv420p", None, False),
+        ("libx264rgb", "rgb24", None, False),
+        ("libx264rgb", "rgb24", True, True),
+    ],
+)
+def test_exact(
+    tmp_path: Path, codec: str, pix_fmt: str, declared: bool | None, exact: bool
+) -> None:
+    write_video(place(tmp_path, kind="videos"), FRONT, codec, pix_fmt)
+    write_table(
+        tmp_path, rows_of(DRAWER, FOUR, **({} if declared is None else {"exact": declared}))
+    )
+    source = FramesSource(tmp_path)
+    assert source.read(source.episodes()[0], None).exact is exact
+
+
+def test_the_example_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = re.search(r"<!-- example: frames -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
+    assert found is not None
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(found[1], names)
+    source = FramesSource(tmp_path / "my_robot")
+    (episode,) = source.episodes()
+    recording = source.read(episode, None)
+    assert (str(episode.id), recording.exact) == (DRAWER, True)
+    for frame, image in zip(recording.frames, names["frames"], strict=True):
+        np.testing.assert_array_equal(frame.images["front"], image)
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+def refused(folder: Path) -> str:
+    """Return the refusal when all episodes are listed and read."""
+    with pytest.raises(InterferenceError) as caught:
+        source = FramesSource(folder)
+        for episode in source.episodes():
+            list(source.read(episode, None).frames)
+    return str(caught.value)
+
+
+def four(**values: Any) -> Rows:
+    return rows_of(DRAWER, FOUR, **values)
+
+
+def changed(row: int, **values: Any) -> Rows:
+    rows = four()
+    rows[row].update(values)
+    return rows
+
+
+def without(name: str) -> Rows:
+    return [{key: v for key, v in row.items() if key != name} for row in four()]
+
+
+TABLES: list[tuple[Callable[[], Rows], str]] = [
+    (lambda: without("state"), "column 'state' is missing"),
+    (lambda: without("goal"), "column 'goal' is missing"),
+    (lambda: four(is_demos=True), "unknown column 'is_demos'(.|\n)*'is_demo'"),
+    (lambda: four(state="low"), "column 'state' holds string; expected lists of"),
+    (lambda: four(seed="7"), "column 'seed' holds string; expected whole numbers"),
+    (lambda: four(is_demo=1), "column 'is_demo' holds int64; expected true or"),
+    (lambda: four(action=[[1]] * 4), "column 'action' holds list<.*int64>; expec"),
+    (lambda: changed(2, goal=None), "column 'goal' has no value in row 2"),
+    (lambda: changed(1, action=None), "column 'action' has no value in row 1"),
+    (lambda: changed(1, state=[np.float32(1)]), r"'state' has .* several lengths: \[1, 8\]"),
+    (lambda: changed(2, frame_index=3), f"{DRAWER}: frame_index in row 2 is 3; expected 2"),
+    (lambda: four()[1:], "frame_index in row 0 is 1; expected 0"),
+    (lambda: four()[:2] + rows_of(MOVE, FOUR)[:1] + four()[2:], "not together: .* in row 3"),
+    (lambda: rows_of("OpenDrawer", FOUR), "row 0: 'OpenDrawer' is not an episode id"),
+    (lambda: rows_of("A/trian/0", FOUR), "row 0: 'trian' is not a split"),
+    (lambda: changed(3, goal="shut it"), f"{DRAWER} has several values of 'goal'"),
+    (lambda: four(seed=[1, 1, 2, 1]), "several values of 'seed': 1, 2"),
+    (lambda: four(goal=" "), "goal is ' '"),
+    (lambda: four(difficulty="hrd"), "difficulty is 'hrd'(.|\n)*'hard'"),
+    (lambda: four(is_demo=[False, True, True, False]), f"{DRAWER}: is_demo is true in 2 frames"),
+]
+
+
+@pytest.mark.parametrize(("rows", "message"), TABLES)
+def test_broken_tables(tmp_path: Path, rows: Callable[[], Rows], message: str) -> None:
+    write(tmp_path, rows())
+    text = refused(tmp_path)
+    assert re.search(message, text)
+    assert "\n" in text  # says what to do
+
+
+def replace_by_video(folder: Path, frames: int, suffix: str = ".mkv") -> None:
+    shutil.rmtree(folder / "images", ignore_errors=True)
+    shown = make_episode(0, frames).images["front"]
+    write_video(place(folder, kind="videos").with_suffix(suffix), shown)
+
+
+def empty(folder: Path) -> None:
+    table = pq.read_table(folder / "frames.parquet").slice(0, 0)
+    pq.write_table(table, folder / "frames.parquet")
+
+
+def image(number: int) -> str:
+    return f"images/front/{DRAWER}/00000{number}.png"
+
+
+def misplaced(file: str) -> Callable[[Path], Any]:
+    def write(folder: Path) -> None:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(b"")
+
+    return write
+
+
+HARMS: list[tuple[Callable[[Path], Any], str]] = [
+    (lambda f: (f / "frames.parquet").unlink(), "no frames folder: frames.parquet is missing"),
+    (lambda f: (f / "frames.parquet").write_bytes(b"id,goal"), "frames.parquet: cannot be read"),
+    (empty, "has no rows"),
+    (lambda f: replace_by_video(f, 3), "0.mkv holds 3 frames; frames.parquet has 4 rows"),
+    (lambda f: replace_by_video(f, 6), "0.mkv holds 6 frames; frames.parquet has 4 rows"),
+    (lambda f: (f / image(2)).unlink(), "0 lacks 000002.png; frames.parquet has 4 rows"),
+    (misplaced(image(4)), "0 holds 000004.png"),
+    (lambda f: (f / image(1)).write_bytes(encode_image(FRONT[1])[:-30]), "1.png: .*is damaged"),
+    (
+        # which would not be exact
+        lambda f: (f / image(1)).write_bytes(encode_image(FRONT[1], "jpg")),
+        "000001.png: not a PNG image",
+    ),
+    (
+        lambda f: write_video(place(f, kind="videos"), FRONT),
+        f"camera 'front' of {DRAWER} is there twice: .*videos.* and .*images",
+    ),
+    (
+        lambda f: [replace_by_video(f, 4), replace_by_video(f, 4, ".avi")],
+        f"camera 'front' of {DRAWER} is there twice: .*avi and .*mkv",
+    ),
+    (
+        lambda f: (f / "images/front").rename(f / "images/top"),
+        f"no images of camera 'front'(.|\n)*videos/front/{DRAWER}.mkv",
+    ),
+    (misplaced(f"videos/wrist/{DRAWER}.mkv"), "0.mkv is not a readable video"),
+    (misplaced("videos/front/A/train/3.mkv"), "3.mkv belongs to A/train/3, which frames.parq"),
+    (misplaced("videos/front/A/train/07.mkv"), "'A/train/07' is not an episode id"),
+    (misplaced("videos/front/A/train/notes.txt"), "notes.txt is no video file; expected one of"),
+    (misplaced("images/front/A/train/1"), "train/1 is a file; expected a folder"),
+]
+
+
+@pytest.mark.parametrize(("harm", "message"), HARMS)
+def test_broken_folders(tmp_path: Path, harm: Callable[[Path], Any], message: str) -> None:
+    write(tmp_path)
+    harm(tmp_path)
+    assert re.search(message, refused(tmp_path))
+
+
+def test_cameras_that_differ(tmp_path: Path) -> None:
+    write(tmp_path, four() + rows_of(MOVE, FOUR))
+    write_images(place(tmp_path, MOVE), FRONT)
+    write_images(place(tmp_path, MOVE, camera="wrist"), FRONT)
+    assert f"{DRAWER} has no images of camera 'wrist'" in refused(tmp_path)

@@ -1,0 +1,201 @@
+"""RoboMME's own recordings: what the official files may hold, and what may be wrong with them."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.recordings import EPISODES, check_recording, write_h5
+
+from robomme_interference_data.build_dataset.sources import Recording, open_source
+from robomme_interference_data.build_dataset.sources.h5 import identify
+from robomme_interference_data.errors import (
+    InvalidIdError,
+    MissingExtraError,
+    SourceError,
+)
+
+h5py = pytest.importorskip("h5py")
+
+NAME = "MoveCube/train/0"  # 12 steps, of them 5 of the demonstration
+EPISODE = EPISODES[NAME]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A file with one episode."""
+    write_h5(tmp_path, {NAME: EPISODE})
+    return tmp_path / "record_dataset_MoveCube.h5"
+
+
+def put(path: Path, name: str, value: Any) -> None:
+    """Put another value in a place of the episode; None removes it."""
+    with h5py.File(path, "r+") as file:
+        del file["episode_0"][name]
+        if value is not None:
+            file["episode_0"][name] = value
+
+
+def read(path: Path) -> Recording:
+    source = open_source(f"robomme-h5:{path}")
+    return source.read(source.episodes()[0], None)
+
+
+# --- what is read --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fingers", [1, 2])
+def test_files_that_count_from_one(tmp_path: Path, fingers: int) -> None:
+    write_h5(tmp_path, EPISODES, first=1, fingers=fingers)
+    (tmp_path / "notes.h5").write_bytes(b"not ours")
+    source = open_source(f"robomme-h5:{tmp_path}")
+    assert [str(episode.id) for episode in source.episodes()] == list(EPISODES)
+    for episode in source.episodes():
+        check_recording(source.read(episode, None), EPISODES[str(episode.id)])
+
+
+@pytest.mark.parametrize(
+    ("goal", "texts"),
+    [
+        (np.bytes_(b"fixed bytes"), ("fixed bytes",)),
+        (["one", "other"], ("one", "other")),
+        (np.array([b"one", b"other"]), ("one", "other")),
+        ("nimm den Würfel", ("nimm den Würfel",)),
+    ],
+)
+def test_texts_of_any_type(path: Path, goal: Any, texts: tuple[str, ...]) -> None:
+    put(path, "setup/task_goal", goal)
+    put(path, "setup/difficulty", np.bytes_(b"easy"))
+    recording = read(path)
+    assert (recording.goals, recording.difficulty) == (texts, "easy")
+
+
+def test_seed_difficulty_and_a_camera_may_be_missing(path: Path) -> None:
+    for name in ("seed", "difficulty"):
+        put(path, f"setup/{name}", None)
+    for step in range(len(EPISODE)):
+        put(path, f"timestep_{step}/obs/wrist_rgb", None)
+    recording = read(path)
+    assert (recording.seed, recording.difficulty) == (None, None)
+    assert {tuple(frame.images) for frame in recording.frames} == {("front",)}
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("setup", None),
+        ("setup/task_goal", None),
+        ("setup/task_goal", np.bytes_(b"\xff\xfe")),
+        ("setup/seed", "seven"),
+        ("timestep_0", 7),
+        ("timestep_7/info/is_video_demo", None),
+        ("timestep_7/obs", 7),
+        ("timestep_7/obs/front_rgb", None),
+        ("timestep_7/obs/joint_state", None),
+        ("timestep_7/obs/joint_state", "text"),
+        ("timestep_7/action/joint_action", None),
+    ],
+)
+def test_a_missing_or_wrong_piece(path: Path, place: str, value: Any) -> None:
+    put(path, place, value)
+    with pytest.raises(SourceError, match=r"is not a complete RoboMME recording") as raised:
+        list(read(path).frames)
+    assert raised.value.message.startswith(str(path))
+    assert "Record or download the file again" in str(raised.value.hint)
+    if "7/obs/" in place or "action/" in place:  # what is met while frames are read says where
+        assert "episode_0/timestep_7 is not" in raised.value.message
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ("timestep_4", None, "episode_0 does not hold consecutive timestep_<T> groups"),
+        ("setup/task_goal", np.empty(0, "S4"), "goal is missing"),
+        ("setup/difficulty", "unknown", "difficulty is 'unknown'; expected one of easy"),
+        ("timestep_8/info/is_video_demo", True, "is_video_demo in .*episode_0 is true in 6 frames"),
+    ],
+)
+def test_what_cannot_be_used(path: Path, place: str, value: Any, message: str) -> None:
+    put(path, place, value)
+    with pytest.raises(SourceError, match=message):
+        read(path)
+
+
+@pytest.mark.parametrize("keep", [0, 9000, -90])
+def test_files_that_are_not_whole(path: Path, keep: int) -> None:
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(SourceError, match=r"\.h5 is not a complete RoboMME recording"):
+        read(path)
+
+
+def test_nothing_to_read(path: Path) -> None:
+    for camera in ("front", "wrist"):
+        put(path, f"timestep_0/obs/{camera}_rgb", None)
+    with pytest.raises(SourceError, match="episode_0 has no front_rgb or wrist_rgb"):
+        read(path)
+    with h5py.File(path, "r+") as file:
+        del file["episode_0"]
+    with pytest.raises(SourceError, match="holds no episode_<N> group"):
+        read(path)
+    path.rename(path.with_stem("other"))
+    with pytest.raises(SourceError, match=r"no record_dataset_<Family>\.h5"):
+        read(path.parent)
+
+
+def test_any_flipped_bit_is_one_clear_error_or_none(path: Path) -> None:
+    data = path.read_bytes()
+    for number, place in enumerate(np.linspace(0, len(data) - 1, 60, dtype=int).tolist()):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << number % 8
+        path.write_bytes(flipped)
+        try:
+            list(read(path).frames)
+        except SourceError as error:
+            assert "\n" not in error.message
+
+
+def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path.rename(path.with_stem("record_dataset_Move Cube"))
+    with pytest.raises(InvalidIdError, match="'Move Cube' is not a family name"):
+        read(path.parent)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(MissingExtraError, match=r"needs h5py(.|\n)*data\[build\]"):
+        read(path.parent)
+
+
+# --- numbers, splits and seeds -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("family", "seeds", "expected"),
+    [
+        # train: 1000 · code + 100 · index + attempt; MoveCube's code is 14
+        ("MoveCube", {7: 14_799}, "train/7"),
+        ("MoveCube", {7: 14_699}, "train/6"),
+        ("VideoUnmaskSwap", {3: 5301, 0: 5000}, "train/3 train/0"),
+        ("RouteStick", {100: 25_900}, "train/99"),
+        # test: 500,000 + 10,000 · code + 100 · index + attempt; PatternLock's code is 15
+        ("PatternLock", {1: 650_000, 50: 654_902}, "test/0 test/49"),
+        # val: 1,000,000 + 10,000 · code + 100 · index + attempt; a few are 100 higher
+        ("RouteStick", {5: 1_160_500, 6: 1_160_700, 7: 1_160_700}, "val/5 val/6 val/7"),
+        ("RouteStick", {1: 1_160_100, 2: 1_160_100, 3: 1_160_200}, "val/0 val/1 val/2"),
+        # one file with several splits
+        ("MoveCube", {1: 14_000, 2: 640_100, 3: 1_140_200}, "train/0 test/1 val/2"),
+        # no seeds, or a family that RoboMME does not have: numbering says it
+        ("MoveCube", {1: None, 4: None}, "train/0 train/3"),
+        ("MoveCube", {4: None}, "train/4"),
+        ("OpenDrawer", {1: 7, 2: 8}, "train/0 train/1"),
+        # seeds of another rule contradict each other: numbering says it
+        ("MoveCube", {1: 3, 2: 999}, "train/0 train/1"),
+        # where there is an episode 0, numbers are indices whatever the seeds say
+        ("MoveCube", {0: 14_100, 1: 14_200}, "train/0 train/1"),
+    ],
+)
+def test_identify(family: str, seeds: dict[int, int | None], expected: str) -> None:
+    found = identify(family, seeds)
+    assert list(found) == list(seeds)
+    assert [str(name) for name in found.values()] == [f"{family}/{n}" for n in expected.split()]

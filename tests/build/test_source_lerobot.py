@@ -1,0 +1,233 @@
+"""LeRobot datasets as sources: what they say of an episode, by which names, and refusals."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from support.goal_texts import GOALS
+from support.lerobot_layouts import DATA, TABLE, edit_columns, edit_info, write_lerobot
+from support.recordings import (
+    EPISODES,
+    MOVE,
+    PEG,
+    Episode,
+    check_recording,
+    encode_image,
+    make_episode,
+)
+
+from robomme_interference_data.build_dataset.sources import OpenOptions, Recording, open_source
+from robomme_interference_data.build_dataset.sources.families import BLOCK_FAMILIES
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    InvalidOptionError,
+    MissingFileError,
+    SourceError,
+    UnknownNameError,
+)
+
+VERSIONS = ("v3.0", "v2.1")
+NAME = "MoveCube/train/0"
+FOUR = make_episode(1, 4, MOVE, 2)
+
+
+def read(root: Path, index: int = 0, **options: Any) -> Recording:
+    source = open_source(f"lerobot:{root}", OpenOptions(**options))
+    return source.read(source.episodes()[index], None)
+
+
+def one(episode: Episode = FOUR) -> dict[str, Episode]:
+    return {NAME: episode}
+
+
+@pytest.fixture
+def v21(tmp_path: Path) -> Path:
+    return write_lerobot(tmp_path / "v21", version="v2.1")
+
+
+# --- what is read --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_actions_marks_and_a_camera_may_be_missing(tmp_path: Path, version: str) -> None:
+    bare = make_episode(5, 4, MOVE, cameras=("front",), actions=False)
+    root = write_lerobot(tmp_path, one(bare), version=version, marked=False)
+    check_recording(read(root), bare, marked=False)
+
+
+def test_jpeg_is_not_exact(tmp_path: Path) -> None:
+    recording = read(write_lerobot(tmp_path, one(), stored="jpg"))
+    assert not recording.exact
+    assert next(recording.frames).images["front"].shape == (16, 24, 3)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_what_per_episode_columns_say(tmp_path: Path, version: str) -> None:
+    """The columns of this project's own datasets."""
+    columns = {
+        "simulator": ["tabletop"],  # which has goals of its own
+        "exact": [False],
+        "exec_start_idx": [2],
+        "goals": [["fold the towel", "fold it"]],
+    }
+    recording = read(write_lerobot(tmp_path, one(), version=version, marked=False, **columns))
+    assert (recording.simulator, recording.exact) == ("tabletop", False)
+    assert recording.goals == ("fold the towel", "fold it")
+    assert [frame.is_demonstration for frame in recording.frames] == [True, True, False, False]
+
+
+def test_a_part_of_a_dataset_can_be_used(v21: Path) -> None:
+    (v21 / "data/chunk-000/episode_000001.parquet").unlink()
+    check_recording(read(v21), EPISODES[NAME])
+    with pytest.raises(MissingFileError, match=r"episode_000001\.parquet is missing"):
+        read(v21, 1)
+
+
+# --- families and goals --------------------------------------------------------------------------
+
+
+def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
+    by_family = {family: goal for goal, fits in GOALS.items() for family in fits}
+    goals = [by_family[family] for family in BLOCK_FAMILIES for _ in range(100)]
+    episodes = {str(number): replace(FOUR, goal=goal) for number, goal in enumerate(goals)}
+    root = write_lerobot(tmp_path / "d", episodes, stored=None, episode_id=None)
+    start = time.perf_counter()
+    listed = open_source(f"lerobot:{root}").episodes()
+    assert time.perf_counter() - start < 5  # 0.5 s on an idle machine
+    found = {index: (str(one.id), simulator) for one in listed for index, simulator, _ in [one.key]}
+    assert (len(found), found[950]) == (1600, ("MoveCube/train/50", "robomme"))
+    assert [episode.id for episode in listed] == sorted(episode.id for episode in listed)
+
+    edit_columns(root / TABLE, tasks=[[g] for g in [*goals[:950], PEG, *goals[951:]]])
+    message = f"episode 950 would be MoveCube/train/50, but its goal {PEG!r} .*it fits InsertPeg"
+    with pytest.raises(SourceError, match=message) as caught:
+        open_source(f"lerobot:{root}").episodes()
+    assert "--families-file" in str(caught.value.hint)
+    families = [name.split("/")[0] for _, (name, _) in sorted(found.items())]
+    names = tmp_path / "families.json"
+    names.write_text(json.dumps(dict(enumerate([*families[:950], "InsertPeg", *families[951:]]))))
+    listed = open_source(f"lerobot:{root}", OpenOptions(families_file=names)).episodes()
+    ids = {episode.key[0]: str(episode.id) for episode in listed}
+    assert (ids[950], ids[1000]) == ("InsertPeg/train/0", "InsertPeg/train/1")
+
+
+def test_families_that_are_not_told_or_do_not_fit(tmp_path: Path) -> None:
+    root = write_lerobot(tmp_path / "nameless", episode_id=None)
+    with pytest.raises(SourceError, match=r"of what family its 3 episodes(.|\n)*--families-file"):
+        read(root)
+    root = write_lerobot(tmp_path / "towel", one(make_episode(0, 2, "fold the towel")))
+    with pytest.raises(SourceError, match="it fits no family of RoboMME"):
+        read(root)
+
+
+# --- columns by other names ----------------------------------------------------------------------
+
+
+def test_columns_by_other_names(v21: Path) -> None:
+    given = {"front": "wrist_image", "wrist": "image", "action": "state"}
+    known = EPISODES[NAME]
+    images = {"front": known.images["wrist"], "wrist": known.images["front"]}
+    expected = replace(known, images=images, action=known.state)
+    check_recording(read(v21, columns=given), expected)
+    edit_info(v21, lambda info: info["features"].pop("image"))
+    with pytest.raises(
+        SourceError, match=r"no column named .* or image(.|\n)*front=COLUMN"
+    ) as raised:
+        read(v21)
+    assert "actions, exec_start_idx, is_demo, state, wrist_image" in raised.value.message
+
+
+@pytest.mark.parametrize(
+    ("columns", "error", "message"),
+    [
+        ({"fornt": "image"}, InvalidOptionError, "'fornt' is none of(.|\n)*'front'"),
+        ({"front": "imge"}, UnknownNameError, "'imge' is not in(.|\n)*'image'"),
+        ({"front": "state"}, SourceError, "'state' holds float32 .*'front' needs images"),
+        ({"state": "image"}, SourceError, "'image' holds image .*needs a vector of floats"),
+        ({"wrist": "depth"}, SourceError, r"of the shape \(48, 64, 1\).*three channels"),
+        ({"is_demo": "state"}, SourceError, "'state' holds float32 .*needs booleans"),
+    ],
+)
+def test_columns_that_do_not_fit(v21: Path, columns: Any, error: Any, message: str) -> None:
+    depth = {"dtype": "image", "shape": [48, 64, 1]}
+    edit_info(v21, lambda info: info["features"].update(depth=depth))
+    with pytest.raises(error, match=message):
+        read(v21, columns=columns)
+
+
+# --- where demonstrations end --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("columns", "lesson"),
+    [
+        ({"is_demo": [True, True, True, False], "exec_start_idx": [3] * 4}, 3),  # not as lists
+        ({"is_demo": [1, 1, 1, 0], "exec_start_idx": [3] * 4}, 3),
+        ({"is_demo": [True, False, True, False]}, "true in 2 frames, not all of them at the"),
+        ({"exec_start_idx": [2, 2, 3, 2]}, "'exec_start_idx' holds 2, 3; expected one number"),
+        ({"exec_start_idx": [5] * 4}, "holds 5; expected one number from 0 to 4"),
+        ({"exec_start_idx": [3] * 4}, "not clear: 2 by is_demo and 3 by exec_start_idx"),
+        ({"exec_start_idx": [2, None, 2, 2]}, "1 empty values"),
+        ({"is_demo": ["yes"] * 4}, "column 'is_demo' is of type string"),
+    ],
+)
+def test_marks(tmp_path: Path, columns: Any, lesson: int | str) -> None:
+    root = write_lerobot(tmp_path, one())
+    edit_columns(root / DATA, **dict.fromkeys(columns))  # away with the old type
+    edit_columns(root / DATA, **columns)
+    if isinstance(lesson, int):
+        shown = [frame.is_demonstration for frame in read(root).frames]
+        assert shown == [step < lesson for step in range(4)]
+        return
+    with pytest.raises((SourceError, FormatError), match=lesson):
+        read(root)
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"seed": ["17"]},
+        {"difficulty": [3]},
+        {"difficulty": ["hrd"]},
+        {"exact": ["yes"]},
+        {"exec_start_idx": [2.5]},
+        {"exec_start_idx": [3]},  # the rows say 2
+        {"goals": [MOVE]},
+        {"goals": [[""]]},
+        {"tasks": [["something else"]]},
+        {"tasks": [[]]},
+        {"episode_id": [None]},
+    ],
+)
+def test_values_that_are_wrong(tmp_path: Path, version: str, columns: dict[str, Any]) -> None:
+    root = write_lerobot(tmp_path, one(), version=version, **columns)
+    with pytest.raises((SourceError, FormatError)):
+        read(root)
+
+
+def test_images_that_are_wrong(tmp_path: Path) -> None:
+    root = write_lerobot(tmp_path, one())
+    column = "observation.images.front"
+    cells = pq.read_table(root / DATA)[column].to_pylist()
+    small, jpeg = FOUR.images["front"][2][:8], FOUR.images["front"][2]
+    for data, message in (
+        (cells[2]["bytes"][:60], "image is damaged"),
+        (encode_image(small), r"frame 2 .* has the shape \(8, 24, 3\); info.json says \(16, 24"),
+        (encode_image(jpeg, "jpg"), "frame 2 .* is a JPEG, although"),
+        (b"", "expected PNG or JPEG"),
+    ):
+        wrong = [*cells[:2], {"bytes": data, "path": None}, cells[3]]
+        edit_columns(root / DATA, **{column: wrong})
+        frames = read(root).frames
+        assert [next(frames).is_demonstration for _ in range(2)] == [True, True]  # one by one
+        with pytest.raises(InterferenceError, match=message):
+            next(frames)

@@ -1,0 +1,128 @@
+"""A simulator is a source like any other: its episodes are played while they are read."""
+
+import pickle
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robomme_interference_data.build_dataset.cut import cut_demonstration
+from robomme_interference_data.build_dataset.sources import OpenOptions, Recording, open_source
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
+from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
+from robomme_interference_data.simulators.registry import SIMULATORS
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+
+
+class Played:
+    """Plays a lesson of five frames, then succeeds after three steps.
+
+    A front image is filled with the episode's index, a wrist image with 99. States count the
+    frames of the lesson, and then the steps from 10 on.
+    """
+
+    def __init__(self, made: list["Played"], name: str, cameras: tuple[str, ...], **options: Any):
+        made.append(self)
+        self.name, self.cameras, self.options = name, cameras, options
+        self.steps, self.closed = 0, False
+
+    def images(self, *leading: int) -> dict[str, np.ndarray]:
+        fill = {"front": self.index, "wrist": 99}
+        return {name: np.full((*leading, 4, 4, 3), fill[name], np.uint8) for name in self.cameras}
+
+    def seen(self) -> Observation:
+        return Observation(self.images(), np.full(8, 10 + self.steps, np.float32))
+
+    def reset(self, episode_id: str) -> Any:
+        self.index, self.steps = EpisodeId.parse(episode_id).index, 0
+        told = 5 if self.name == "tabletop" else 0  # RoboMME tells no actions
+        states = np.repeat(np.arange(5, dtype=np.float32)[:, None], 8, 1)
+        lesson = Demonstration(self.images(5), states, np.ones((told, 8), np.float32))
+        info = EpisodeInfo("goal", ("goal", "other"), "easy", self.index, self.name)
+        return lesson, self.seen(), info
+
+    def act(self, policy: str) -> np.ndarray:
+        assert (self.name, policy) == ("tabletop", "oracle")
+        return np.full(8, self.steps)
+
+    def step(self, action: np.ndarray) -> tuple[Observation, Status]:
+        self.steps += 1
+        return self.seen(), Status.ONGOING if self.steps < 3 else Status.SUCCESS
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[Played]:
+    """The simulators that are made."""
+    found: list[Played] = []
+    for name in ("tabletop", "robomme"):
+        monkeypatch.setitem(SIMULATORS, name, partial(Played, found, name))
+    return found
+
+
+def read(source: Any, cameras: tuple[str, ...] | None = None) -> Recording:
+    wanted = EpisodeId("MoveCube", "train", 9)
+    (episode,) = (one for one in source.episodes() if one.id == wanted)
+    return source.read(episode, cameras)
+
+
+def test_an_episode_of_the_tabletop(made: list[Played]) -> None:
+    source = open_source("tabletop")
+    assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
+    assert (source.time_limit, source.whole) == (300, True)  # seconds
+    recording = read(source)
+    told = (recording.seed, recording.difficulty, recording.simulator, recording.exact)
+    assert (recording.goals, told) == (("goal", "other"), (9, "easy", "tabletop", True))
+    frames = list(recording.frames)
+    # 5 frames of the lesson, then one before each of the 3 steps; none after the end.
+    assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False] * 3
+    assert [float(frame.state[0]) for frame in frames] == [0, 1, 2, 3, 4, 10, 11, 12]
+    # Each with the action that was taken after it was seen.
+    actions = [float(frame.action[0]) for frame in frames if frame.action is not None]
+    assert actions == [1, 1, 1, 1, 1, 0, 1, 2]
+    assert all((frame.images["front"] == 9).all() for frame in frames)
+    assert all((frame.images["wrist"] == 99).all() for frame in frames)
+    lesson = list(cut_demonstration(read(source).frames))
+    assert [float(frame.state[0]) for frame in lesson] == [0, 1, 2, 3, 4, 10]
+    assert made[0].steps == 0  # cut without a step
+
+
+def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Played]) -> None:
+    source = open_source("robomme", OpenOptions(robomme_python="/opt/python"))
+    assert source.provenance == {"kind": "robomme"}
+    assert (source.time_limit, source.whole) == (1800, False)
+    frames = list(read(source).frames)
+    assert [frame.is_demonstration for frame in frames] == [True] * 5 + [False]
+    assert [frame.action for frame in frames] == [None] * 6
+    assert made[0].options == {"python": "/opt/python"}
+
+
+def test_one_simulator_is_kept_for_the_same_cameras(made: list[Played]) -> None:
+    source = open_source("tabletop")
+    for cameras in (("front",), ("front",), None, ("wrist", "front")):
+        for frame in read(source, cameras).frames:
+            assert sorted(frame.images) == sorted(cameras or ("front", "wrist"))
+    assert [(one.cameras, one.closed) for one in made] == [
+        (("front",), True),
+        (("front", "wrist"), False),
+    ]
+    copy = pickle.loads(pickle.dumps(source))  # without the simulator
+    source.close()
+    assert made[1].closed
+    list(read(copy, ("front",)).frames)
+    assert len(made) == 3
+    with pytest.raises(InvalidOptionError, match="'top' is none of front, wrist"):
+        read(copy, ("top",))
+
+
+@pytest.mark.parametrize("name", ["tabletop", "robomme"])
+def test_episodes(name: str) -> None:
+    ids = [episode.id for episode in open_source(name).episodes()]
+    assert len(set(ids)) == len(ids) == len(FAMILIES) * (100 + 50 + 50)
+    assert ids == sorted(ids)

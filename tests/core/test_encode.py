@@ -1,0 +1,124 @@
+"""The one writer of video: lossless at any size, the same bytes each time, one clear error."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from robomme_interference_data.encode import (
+    CLIP,
+    CODECS,
+    RECORDING,
+    Codec,
+    VideoEncoder,
+)
+from robomme_interference_data.errors import BuildError
+from robomme_interference_data.video import iter_frames
+
+LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]
+
+
+def noise(seed: int, *shape: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (*shape, 3), dtype=np.uint8)
+
+
+def write(path: Path, images: NDArray[np.uint8], codec: Codec = LOSSLESS) -> NDArray[np.uint8]:
+    """Encode images, and return what the file decodes to."""
+    encoder = VideoEncoder(path, codec, 10, *images.shape[1:3])
+    for image in images:
+        encoder.add(image)
+    encoder.close()
+    return np.stack(list(iter_frames(path, 0, None, 10)))
+
+
+# --- lossless ------------------------------------------------------------------------------------
+
+
+@given(
+    arrays(
+        np.uint8,
+        st.tuples(st.integers(1, 20), st.integers(1, 40), st.integers(1, 40), st.just(3)),
+        elements=st.sampled_from([0, 1, 127, 128, 254, 255]),
+    ),
+    st.integers(0, 1000),
+)
+@settings(max_examples=25)
+def test_any_size_and_value(images: NDArray[np.uint8], seed: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for given_images in (images, noise(seed, *images.shape[:3])):
+            assert np.array_equal(write(Path(folder) / "v.mp4", given_images), given_images)
+
+
+def test_file_layout(tmp_path: Path) -> None:
+    write(tmp_path / "video.mp4", noise(0, 40, 16, 24))
+    with av.open(str(tmp_path / "video.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("libdav1d", "gbrp")
+        assert (stream.height, stream.width, stream.average_rate) == (16, 24, 10)
+        packets = [packet for packet in container.demux(stream) if packet.pts is not None]
+    numbers = [round(float(packet.pts * packet.time_base) * 10) for packet in packets]
+    keys = [n for n, packet in zip(numbers, packets, strict=True) if packet.is_keyframe]
+    assert numbers == list(range(40))  # no reordering: a packet a frame, in order
+    assert keys == [0, 16, 32]
+    assert all(packet.pts == packet.dts for packet in packets)
+
+
+@pytest.mark.parametrize("codec", [LOSSLESS, LOSSY, RECORDING, CLIP], ids=lambda one: one.name)
+def test_the_same_frames_give_the_same_bytes_and_nothing_is_printed(
+    tmp_path: Path, codec: Codec, capfd: pytest.CaptureFixture[str]
+) -> None:
+    images = noise(2, 10, 64, 66)
+    one, two = tmp_path / "one.mp4", tmp_path / "two.mp4"
+    if codec is RECORDING:
+        one, two = tmp_path / "one.mkv", tmp_path / "two.mkv"
+    found = write(one, images, codec)
+    write(two, images, codec)
+    assert one.read_bytes() == two.read_bytes()
+    assert found.shape == images.shape
+    assert np.array_equal(found, images) == codec.exact
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_container_can_be_named(tmp_path: Path) -> None:
+    encoder = VideoEncoder(tmp_path / "clip.partial", CLIP, 10, 16, 16, container="mp4")
+    encoder.add(noise(0, 16, 16))
+    encoder.close()
+    assert b"ftyp" in (tmp_path / "clip.partial").read_bytes()[:16]
+
+
+# --- what cannot be encoded ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("height", "width"), [(63, 64), (64, 63)])
+def test_too_small_for_the_lossy_codec(tmp_path: Path, height: int, width: int) -> None:
+    with pytest.raises(BuildError, match=f"{width}×{height} pixels are too small") as raised:
+        VideoEncoder(tmp_path / "video.mp4", LOSSY, 10, height, width)
+    assert "--codec av1-lossless" in str(raised.value.hint)
+
+
+@pytest.mark.slow
+def test_the_lossy_encoder_does_not_crash_from_its_smallest_size_on(tmp_path: Path) -> None:
+    # SVT-AV1 ends the process with SIGFPE or SIGSEGV on some small frames.
+    for side in range(64, 100, 5):
+        for height, width in ((64, side), (side, 64), (side, 256)):
+            write(tmp_path / "video.mp4", noise(0, 10, height, width), LOSSY)
+
+
+def test_what_cannot_be_written(tmp_path: Path) -> None:
+    images = noise(0, 2, 8, 8)
+    with pytest.raises(BuildError, match=r"missing/video\.mp4: the video cannot be written"):
+        write(tmp_path / "missing" / "video.mp4", images)
+    codec = dataclasses.replace(LOSSLESS, vcodec="libmissing")
+    with pytest.raises(BuildError, match="the video cannot be written: libmissing"):
+        write(tmp_path / "video.mp4", images, codec)
+    if Path("/dev/full").exists():
+        (tmp_path / "full.mp4").symlink_to("/dev/full")
+        with pytest.raises(BuildError, match="No space left on device"):
+            write(tmp_path / "full.mp4", images)

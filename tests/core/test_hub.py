@@ -1,0 +1,207 @@
+"""Files on a Hub, through the real client and a server on the loopback interface."""
+
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from huggingface_hub import constants
+from support.hub_server import HubServer
+from support.lerobot_layouts import write_lerobot
+
+from robomme_interference_data.build_dataset.sources import open_source
+from robomme_interference_data.errors import (
+    FormatError,
+    HubError,
+    InvalidOptionError,
+    MissingFileError,
+)
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.hub import HubFiles, locate
+
+REPO = "someone/small"
+DATASET = f"datasets/{REPO}"
+FILES = {f"meta/part-{number}.json": b"%d" % number for number in range(4)}
+FILES |= {"README.md": b"read me", "meta/deep/a.parquet": b"a"}
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
+    with HubServer().running() as server:
+        template = server.endpoint + "/{repo_id}/resolve/{revision}/{filename}"
+        monkeypatch.setattr(constants, "ENDPOINT", server.endpoint)
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        yield server
+
+
+@pytest.fixture
+def offline(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    return lambda: monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+
+
+# --- where a location leads ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", ["lerobot/robomme", "a/b", "A-1/b.c_d"])
+def test_repositories(text: str) -> None:
+    found = locate(text + "@v1.0")
+    assert isinstance(found, HubFiles)
+    assert (found.repo_id, found.revision, found.repo_type) == (text, "v1.0", "dataset")
+
+
+@pytest.mark.parametrize("text", ["robomme", "a/b/c", "/a/b", "~/a", "a/", "a b/c", "a/b@", "@v1"])
+def test_what_is_none(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
+        locate(text, "model")
+    (tmp_path / REPO).mkdir(parents=True)
+    assert isinstance(locate(REPO), LocalFiles)  # a folder goes before a repository
+
+
+# --- what is fetched -----------------------------------------------------------------------------
+
+
+def test_path_and_list(hub: HubServer) -> None:
+    commit = hub.push(DATASET, FILES)
+    files = HubFiles(REPO)
+    assert (files.describe(), hub.requests) == ("someone/small@main", [])  # nothing is asked yet
+    assert files.path("README.md").read_bytes() == b"read me"
+    assert files.list("meta") == sorted(name for name in FILES if name.startswith("meta/"))
+    assert files.list("meta", ".parquet") == ["meta/deep/a.parquet"]
+    assert files.list("nothing") == []
+    assert files.describe() == f"someone/small@{commit}"
+    before = len(hub.requests)
+    assert files.path("README.md").read_bytes() == b"read me"
+    assert len(hub.requests) == before  # from the cache, without a request
+
+
+def test_a_revision_is_pinned_once(hub: HubServer) -> None:
+    first = hub.push(DATASET, FILES)
+    files = HubFiles(REPO)
+    assert files.commit == first
+    second = hub.push(DATASET, FILES | {"README.md": b"changed"})
+    tagged = hub.push(DATASET, {"README.md": b"tagged"}, ref="v1.0")
+    copy = pickle.loads(pickle.dumps(files))
+    assert copy.path("README.md").read_bytes() == b"read me"
+    assert HubFiles(REPO).commit == second
+    assert HubFiles(REPO).path("README.md").read_bytes() == b"changed"
+    assert HubFiles(REPO, first).path("README.md").read_bytes() == b"read me"
+    assert HubFiles(REPO, "v1.0").commit == tagged
+    assert HubFiles(REPO, "v1.0").path("README.md").read_bytes() == b"tagged"
+
+
+@pytest.mark.parametrize("path", ["../../etc/passwd", "/etc/passwd"])
+def test_no_path_leads_out(hub: HubServer, path: str) -> None:
+    hub.push(DATASET, FILES)
+    with pytest.raises(FormatError, match="leads out of it"):
+        HubFiles(REPO).path(path)
+    assert hub.requests == []
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+def test_missing_file(hub: HubServer) -> None:
+    commit = hub.push(DATASET, FILES)
+    with pytest.raises(MissingFileError) as caught:
+        HubFiles(REPO).path("meta/info.json")
+    assert f"meta/info.json is missing in someone/small@{commit}" in caught.value.message
+    assert f"{hub.endpoint}/{DATASET}/tree/{commit}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("repo", "revision", "telling", "hint"),
+    [
+        ("someone/smal", None, "there is no dataset repository 'someone/smal'", "hf auth login"),
+        (REPO, "v9", "has no revision 'v9'", "/tree/main"),
+        (REPO, "0" * 40, "has no revision '0000", "/tree/main"),
+        ("someone/gated", None, "is gated", "/datasets/someone/gated, then type: hf auth login"),
+        ("someone/gated", "0" * 40, "is gated", "hf auth login"),
+    ],
+)
+def test_refusals(hub: HubServer, repo: str, revision: str, telling: str, hint: str) -> None:
+    hub.push(DATASET, FILES)
+    hub.push(REPO, FILES)  # a model of the same name is another repository
+    hub.push("datasets/someone/gated", FILES)
+    hub.gated.add("datasets/someone/gated")
+    with pytest.raises(HubError, match=telling) as caught:
+        HubFiles(repo, revision).path("README.md")
+    assert hint in str(caught.value.hint)
+    assert "--source" not in str(caught.value)
+
+
+def test_a_hub_that_is_down(hub: HubServer) -> None:
+    commit = hub.push(DATASET, FILES)
+    HubFiles(REPO).path("README.md")
+    hub.down = True
+    files = HubFiles(REPO)
+    assert files.commit == commit
+    assert files.path("README.md").read_bytes() == b"read me"
+    with pytest.raises(HubError, match=r"the Hub cannot be reached: .*503") as caught:
+        HubFiles("someone/else").path("README.md")
+    assert "hf download --repo-type dataset someone/else" in str(caught.value)
+
+
+def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
+    commit = hub.push(DATASET, FILES)
+    HubFiles(REPO).path("meta/part-1.json")
+    assert HubFiles(REPO).list("meta/deep") == ["meta/deep/a.parquet"]
+    offline()
+    asked = len(hub.requests)
+    files = HubFiles(REPO)
+    assert files.commit == commit
+    assert files.path("meta/part-1.json").read_bytes() == b"1"
+    assert files.list("meta/deep") == ["meta/deep/a.parquet"]
+    with pytest.raises(HubError, match="HF_HUB_OFFLINE is set") as caught:
+        files.path("meta/part-2.json")
+    command = f"hf download --repo-type dataset {REPO} --revision {commit} meta/part-2.json"
+    assert f"HF_HUB_OFFLINE=0 {command}" in str(caught.value.hint)
+    for ask in (lambda: HubFiles("a/b").commit, lambda: HubFiles("a/b", "0" * 40).list("meta")):
+        with pytest.raises(HubError, match="not in the cache, and HF_HUB_OFFLINE is set"):
+            ask()
+    assert len(hub.requests) == asked
+
+
+# --- a LeRobot dataset on the Hub ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_source_fetches_what_it_needs_and_opens_offline_again(
+    hub: HubServer, tmp_path: Path, offline: Callable[[], None], version: str
+) -> None:
+    made = write_lerobot(tmp_path / "made", version=version, stored="video")
+    (made / "videos/of-no-episode.mkv").write_bytes(b"none")
+    commit = hub.push(DATASET, made)
+    source = open_source(f"lerobot:{REPO}")
+    assert source.provenance == {"kind": "lerobot", "repo": REPO, "revision": commit}
+    episodes = source.episodes()
+    assert hub.downloads()
+    assert all(path.startswith("meta/") for path in hub.downloads())
+    before = len(hub.downloads())
+    copy, again = pickle.loads(pickle.dumps((source, episodes[1])))
+    assert len(list(copy.read(again, ("front",)).frames)) == 7
+    assert len(hub.downloads()) == before + 2  # the data file and one video
+    offline()
+    hub.down = True
+    source = open_source(f"lerobot:{REPO}")
+    assert source.provenance["revision"] == commit
+    assert len(list(source.read(source.episodes()[1], ("front",)).frames)) == 7
+    with pytest.raises(HubError, match="of the dataset repository .* is not in the cache"):
+        list(source.read(source.episodes()[1], ("wrist",)).frames)
+
+
+def test_a_source_at_a_revision(hub: HubServer, tmp_path: Path) -> None:
+    old = hub.push(DATASET, write_lerobot(tmp_path / "made"))
+    hub.push(DATASET, FILES)
+    source = open_source(f"lerobot:{REPO}@{old}")
+    assert (len(source.episodes()), source.provenance["revision"]) == (3, old)
+    with pytest.raises(MissingFileError, match="is no LeRobot dataset"):
+        open_source(f"lerobot:{REPO}").episodes()
+
+
+def test_the_known_repositories_are_of_robomme(hub: HubServer, tmp_path: Path) -> None:
+    hub.push("datasets/lerobot/robomme", write_lerobot(tmp_path / "made"))
+    source = open_source("lerobot:lerobot/robomme")
+    assert source.read(source.episodes()[0], None).simulator == "robomme"

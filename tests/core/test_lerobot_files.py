@@ -1,0 +1,281 @@
+"""The one reader of LeRobot datasets: both layouts, and what may be wrong with them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.lerobot_layouts import DATA, NAMES, TABLE, edit_columns, edit_info, write_lerobot
+from support.recordings import EPISODES
+
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    MissingFileError,
+    TruncatedVideoError,
+    UnknownNameError,
+)
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.lerobot_files import LeRobotFiles
+from robomme_interference_data.lerobot_layout import fill_template
+
+VIDEO = "videos/observation.images.front/"
+V21 = "chunk-000/episode_000002"
+PLACES = {  # of the third episode, which begins with frame 19 of the common files of v3.0
+    "v3.0": (9, DATA, (VIDEO + "chunk-000/file-000.mkv", 19)),
+    "v2.1": (9, f"data/{V21}.parquet", (f"videos/image/{V21}.mkv", 0)),
+}
+
+
+def opened(root: Path) -> LeRobotFiles:
+    return LeRobotFiles(LocalFiles(root))
+
+
+def read_all(root: Path) -> None:
+    """Read everything there is, as the sources and datasets do."""
+    lerobot = opened(root)
+    assert lerobot.tasks
+    for index in range(len(lerobot)):
+        for name, feature in lerobot.features.items():
+            if feature["dtype"] == "video":
+                list(lerobot.iter_frames(index, name, 0, lerobot.place(index).length))
+            elif feature["dtype"] == "float32":
+                lerobot.vectors(index, name)
+
+
+@pytest.fixture(params=["v3.0", "v2.1"])
+def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A dataset of videos of either version."""
+    return write_lerobot(tmp_path / "dataset", version=request.param, stored="video")
+
+
+@pytest.fixture
+def v30(tmp_path: Path) -> Path:
+    return write_lerobot(tmp_path / "dataset", stored="video", rows_a_group=10)
+
+
+# --- what is read --------------------------------------------------------------------------------
+
+
+def test_values_frames_and_places(root: Path) -> None:
+    lerobot = opened(root)
+    front = NAMES[str(lerobot.version)]["front"]
+    assert (len(lerobot), lerobot.fps, lerobot.shape(front)) == (3, 10.0, (16, 24, 3))
+    assert lerobot.tasks == {episode.goal for episode in EPISODES.values()}
+    for index, episode in enumerate(EPISODES.values()):
+        frames = episode.images["front"]
+        found = np.stack(list(lerobot.iter_frames(index, front, 2, 6)))
+        np.testing.assert_array_equal(found, frames[2:6])
+        lerobot.read_frames(index, front, 1, found)
+        np.testing.assert_array_equal(found, frames[1:5])
+    place = lerobot.place(2)
+    assert (place.length, place.data, place.videos[front]) == PLACES[str(lerobot.version)]
+    with pytest.raises(UnknownNameError, match="episode 3 is not in .* 3 episodes"):
+        lerobot.row(3)
+    with pytest.raises(TruncatedVideoError, match="7 stored frames; frames 4 to 7"):
+        lerobot.iter_frames(1, front, 4, 8)
+
+
+def test_several_files_statistics_and_tasks_as_pandas_writes_them(v30: Path) -> None:
+    edit_columns(v30 / TABLE, **{"stats/state/mean": [[0.0]] * 3})
+    whole = pq.read_table(v30 / TABLE)
+    pq.write_table(whole.slice(1), v30 / TABLE)
+    pq.write_table(whole.slice(0, 1), (v30 / TABLE).with_name("file-001.parquet"))
+    tasks = pa.table({"task_index": [0, 1], "__index_level_0__": ["one", "two"]})
+    pq.write_table(tasks, v30 / "meta/tasks.parquet")
+    lerobot = opened(v30)
+    assert [row["episode_index"] for row in lerobot.all_rows()] == [0, 1, 2]
+    assert "stats/state/mean" not in lerobot.row(2)  # statistics are never read
+    assert lerobot.tasks == {"one", "two"}
+
+
+# --- paths ---------------------------------------------------------------------------------------
+
+VALUES: dict[str, Any] = {"chunk_index": 3, "file_index": 12, "video_key": "a.b"}
+PARTS = ("{chunk_index:03d}", "{file_index:06d}", "{file_index}", "{video_key}", "data/", ".mp4é ")
+
+
+@given(st.lists(st.sampled_from(PARTS), max_size=8))
+def test_templates_are_filled_as_python_does(parts: list[str]) -> None:
+    template = "".join(parts)
+    assert fill_template(template, "here", **VALUES) == template.format(**VALUES)
+
+
+@given(st.text(alphabet="abdz{}_.!:[]0", max_size=25))
+def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
+    try:
+        assert "{" not in fill_template(template, "here", d="x", a=7)
+    except FormatError as error:
+        assert "path template" in error.message
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("{video_key.__class__}/{file_index}", "cannot be filled in"),
+        ("{file_index!r}", "cannot be filled in"),
+        ("{file_index:999999999d}", "cannot be filled in"),
+        ("data/{chunk_index:03d/file.parquet", "cannot be filled in"),
+        ("data/file}.parquet", "cannot be filled in"),
+        ("{nothing}", "cannot be filled in"),
+        ("../../etc/passwd", "leads out of it"),
+        ("/etc/passwd", "leads out of it"),
+        ("videos/../../outside.mkv", "leads out of it"),
+        ("linked.mkv", "is a link that leads out of the folder"),
+    ],
+)
+@pytest.mark.parametrize("which", ["data_path", "video_path"])
+def test_paths_that_are_refused(root: Path, which: str, path: str, message: str) -> None:
+    outside = root.parent / "outside.mkv"
+    outside.write_bytes(b"secret")
+    (root / "linked.mkv").symlink_to(outside)
+    edit_info(root, **{which: path})
+    with pytest.raises(FormatError, match=message):
+        read_all(root)
+
+
+def test_a_link_that_goes_round_is_missing(root: Path) -> None:
+    data = next(root.glob("data/*/*.parquet"))
+    data.unlink()
+    data.symlink_to(data.name)
+    with pytest.raises(MissingFileError, match="is missing"):
+        read_all(root)
+
+
+# --- damage --------------------------------------------------------------------------------------
+
+
+def feature(**values: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda info: next(iter(info["features"].values())).update(values)
+
+
+def info(**values: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda found: found.update(values)
+
+
+INFO: list[Callable[[dict[str, Any]], Any]] = [
+    info(codebase_version="v2.0"),
+    info(codebase_version=["v3.0"]),
+    info(features=None),
+    info(features={"state": "float32"}),
+    info(fps="10"),
+    info(fps=float("nan")),
+    info(fps=None),
+    info(total_episodes="3"),
+    info(total_episodes=-1),
+    info(total_episodes=2),
+    info(total_episodes=10**12),
+    info(chunks_size=0),
+    info(data_path=None),
+    info(video_path=7),
+    feature(dtype=None),
+    feature(shape=None),
+    feature(shape=[100_000, 100_000, 3]),
+    feature(shape=[-16, 24, 3]),
+    feature(shape=[32, 24, 3]),
+    feature(info="ffv1"),
+]
+
+
+@pytest.mark.parametrize("change", INFO)
+def test_info_that_is_wrong(root: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    edit_info(root, change)
+    with pytest.raises(FormatError) as caught:
+        read_all(root)
+    assert str(root) in caught.value.message
+
+
+LINE: dict[str, Any] = {"episode_index": 0, "length": 12, "tasks": ["x"]}
+GOOD = json.dumps(LINE) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{\n", "line 1: "),
+        ("[0, 1]\n", "line 1: no JSON object"),
+        (GOOD + "[" * 100_000, "line 2: "),
+        (GOOD, "the episodes 0 to 2, each once"),
+        (GOOD * 3, "the episodes 0 to 2, each once"),
+        ("", "no whole numbers 'episode_index'"),
+        ('{"episode_index": 0}\n', "no whole numbers 'length'"),
+        (GOOD + '{"episode_index": 1}\n', "no whole numbers 'length'"),
+        (json.dumps(LINE | {"length": 10**30}), "cannot be read"),
+        (json.dumps(LINE | {"tasks": ["\ud800"]}), "cannot be read"),
+        (GOOD + json.dumps(LINE | {"tasks": 7}), "cannot be read"),
+    ],
+)
+def test_lines_that_are_wrong(tmp_path: Path, text: str, message: str) -> None:
+    root = write_lerobot(tmp_path, version="v2.1", stored=None)
+    (root / "meta/episodes.jsonl").write_text(text)
+    with pytest.raises(FormatError, match=message):
+        opened(root).all_rows()
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"length": None},
+        {"length": [12, None, 9]},
+        {"length": [12, 10**12, 9]},
+        {"length": [12, 8, 9]},
+        {"length": pa.array([12.0, 7.0, 9.0])},
+        {"episode_index": [0, 1, 1]},
+        {"data/chunk_index": None},
+        {"data/file_index": [0, -1, 0]},
+        {VIDEO + "from_timestamp": [0.0, float("nan"), 1.9]},
+        {VIDEO + "from_timestamp": [0.0, 1.25, 1.9]},  # between two frames
+        {VIDEO + "from_timestamp": [0.0, 2.5, 1.9]},  # ends after the file does
+        {VIDEO + "from_timestamp": [0.0, 1e8, 1.9]},
+        {VIDEO + "chunk_index": [0, 0, None]},
+    ],
+)
+def test_episode_tables_that_are_wrong(v30: Path, columns: dict[str, Any]) -> None:
+    edit_columns(v30 / TABLE, **columns)
+    with pytest.raises((FormatError, TruncatedVideoError)):
+        read_all(v30)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"episode_index": [0] * 13 + [1] * 6 + [2] * 9}, "13 rows of episode 0; 12"),
+        ({"episode_index": [0, 1] * 14}, "14 rows of episode 0; 12"),
+        ({"frame_index": [0, 2, 1, *range(3, 12), *range(7), *range(9)]}, "one after the other"),
+        ({"episode_index": None}, "no column 'episode_index'"),
+        ({"observation.state": pa.array([[0.0]] * 28)}, "1 values a frame; info.json"),
+        ({"observation.state": pa.array([["x"]] * 28)}, "expected lists of floats"),
+    ],
+)
+def test_rows_that_are_wrong(v30: Path, columns: dict[str, Any], message: str) -> None:
+    edit_columns(v30 / DATA, **columns)
+    with pytest.raises((FormatError, TruncatedVideoError), match=message):
+        read_all(v30)
+
+
+def test_files_that_are_missing(v30: Path) -> None:
+    (v30 / TABLE).unlink()
+    with pytest.raises(MissingFileError, match="meta/episodes holds no parquet file"):
+        read_all(v30)
+    (v30 / "meta/info.json").unlink()
+    with pytest.raises(MissingFileError, match=r"is no LeRobot dataset: meta/info\.json"):
+        opened(v30)
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", TABLE, DATA])
+def test_any_flipped_bit_is_one_clear_error_or_none(v30: Path, name: str) -> None:
+    data = (v30 / name).read_bytes()
+    for number, place in enumerate(np.linspace(0, len(data) - 1, 32, dtype=int).tolist()):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << number % 8
+        (v30 / name).write_bytes(flipped)
+        try:
+            read_all(v30)
+        except InterferenceError as error:
+            assert "\n" not in error.message

@@ -1,0 +1,211 @@
+"""Spans of videos: equal to a plain decode for every codec, and never wrong when damaged."""
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from robomme_interference_data.encode import CODECS
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    MissingFileError,
+    TruncatedVideoError,
+)
+from robomme_interference_data.video import decode_into, iter_frames
+
+COUNT, SIZE, FPS = 60, (64, 80), 10
+pytestmark = pytest.mark.timeout(120)
+
+RNG = np.random.default_rng(0)
+PICTURE = np.repeat(np.repeat(RNG.integers(0, 256, (8, 10, 3)), 8, 0), 8, 1).astype(np.uint8)
+SOURCE = np.stack([np.roll(PICTURE, 3 * step, 1) for step in range(COUNT)])
+"""Frames that all differ, with edges, noise and a number in their corner."""
+SOURCE[:, :16, :16] = (4 * np.arange(COUNT)).reshape(-1, 1, 1, 1)
+SOURCE[:, 20:28, 20:28] = RNG.integers(0, 256, (COUNT, 8, 8, 3))
+
+SVT = {"g": "33", "crf": "30", "preset": "12", "svtav1-params": "pred-struct=2"}
+X265 = {"x265-params": "lossless=1:bframes=4:keyint=20:log-level=none"}
+CASES: dict[str, tuple[str, str, dict[str, str]]] = {
+    "lossless.mp4": ("libaom-av1", "gbrp", dict(CODECS["av1-lossless"].options)),
+    "ffv1.mkv": ("ffv1", "bgr0", {}),
+    # Frames that refer to later ones, key frames far apart:
+    "av1-reordered.mp4": ("libsvtav1", "yuv420p", SVT),
+    "h264-reordered.mp4": ("libx264", "yuv444p", {"g": "25", "bf": "3"}),
+    "hevc-reordered.mp4": ("libx265", "gbrp", X265),
+}
+EXACT = ("lossless.mp4", "ffv1.mkv", "hevc-reordered.mp4")
+
+
+def write(
+    path: Path,
+    codec: str = "ffv1",
+    pix_fmt: str = "bgr0",
+    options: dict[str, str] | None = None,
+    *,
+    times: list[int] | None = None,
+    time_base: Fraction = Fraction(1, FPS),
+    **flags: str,
+) -> Path:
+    """Encode the source, or one frame for each of `times`, in units of `time_base`."""
+    with av.open(str(path), "w", options=flags) as container:
+        stream = container.add_stream(codec, rate=FPS, options=options or {})
+        stream.pix_fmt = pix_fmt
+        stream.height, stream.width = SIZE
+        stream.time_base = stream.codec_context.time_base = time_base
+        for image, time in zip(SOURCE, times or range(COUNT), strict=False):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = time, time_base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@dataclass(frozen=True)
+class Video:
+    path: Path
+    frames: NDArray[np.uint8]
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Video]:
+    """The source in every codec, with its plain sequential decode."""
+    folder = tmp_path_factory.mktemp("videos")
+    made = {}
+    for name, case in CASES.items():
+        flags = {} if name == "lossless.mp4" else {"movflags": "faststart"}
+        path = write(folder / name, *case, **flags)
+        with av.open(str(path)) as container:
+            frames = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+        made[name] = Video(path, np.stack(frames))
+        assert np.array_equal(made[name].frames, SOURCE) == (name in EXACT)
+    return made
+
+
+# --- spans ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_start_and_the_whole(videos: dict[str, Video], name: str) -> None:
+    """Just before, at and just after key frames: where seeking goes wrong if it does."""
+    video = videos[name]
+    for start in range(COUNT):
+        stop = min(COUNT, start + 3)
+        found = np.stack(list(iter_frames(video.path, start, stop, FPS)))
+        np.testing.assert_array_equal(found, video.frames[start:stop])
+    for start in (0, 37):
+        found = np.stack(list(iter_frames(video.path, start, None, FPS)))
+        np.testing.assert_array_equal(found, video.frames[start:])
+    room = np.zeros((50, *SIZE, 3), np.uint8)
+    assert decode_into(room[10:40], video.path, 21, FPS) is not None
+    np.testing.assert_array_equal(room[10:40], video.frames[21:51])
+    assert not room[:10].any()
+    assert not room[40:].any()
+    assert list(iter_frames(video.path, 5, 5, FPS)) == []
+
+
+def test_frames_are_the_callers(videos: dict[str, Video]) -> None:
+    video = videos["lossless.mp4"]
+    found = []
+    for frame in iter_frames(video.path, 0, 20, FPS):
+        found.append(frame.copy())
+        frame[:] = 0  # does not reach the decoder's pictures, which later frames refer to
+    np.testing.assert_array_equal(np.stack(found), video.frames[:20])
+
+
+# --- what is not there, or not a video -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [0, COUNT - 1, COUNT, 5000])
+def test_frames_after_the_end(videos: dict[str, Video], start: int) -> None:
+    stop = max(start, COUNT) + 1
+    for video in videos.values():
+        with pytest.raises(TruncatedVideoError, match=f"expected frames {start} to") as caught:
+            list(iter_frames(video.path, start, stop, FPS))
+        assert str(video.path) in caught.value.message
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\0" * 5000, b"not a video " * 400, b"\x00\x00\x00\x20ftyp"]
+)
+def test_not_a_video(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "file.mp4").write_bytes(data)
+    for name in ("file.mp4", "."):  # a folder is none either
+        with pytest.raises(FormatError, match="is not a readable video"):
+            next(iter_frames(tmp_path / name, 0, 1, FPS))
+    with pytest.raises(MissingFileError, match=r"nowhere\.mp4 does not exist"):
+        next(iter_frames(tmp_path / "nowhere.mp4", 0, 1, FPS))
+
+
+@pytest.mark.parametrize("fps", [5, 9.5, 24, 20, 30])  # a multiple of the rate leaves gaps
+def test_another_rate(videos: dict[str, Video], fps: float) -> None:
+    error = TruncatedVideoError if fps in (20, 30) else FormatError
+    with pytest.raises(error, match="frames per second|frame 1 is missing"):
+        list(iter_frames(videos["lossless.mp4"].path, 0, 20, fps))
+
+
+def test_times_with_a_gap_or_off_the_grid(tmp_path: Path) -> None:
+    """Time bases in milliseconds cannot hold every frame time exactly."""
+    path = write(tmp_path / "gap.mkv", times=[0, 1, 2, 3, 6, 7, 8])
+    assert len(list(iter_frames(path, 6, 9, FPS))) == 3
+    with pytest.raises(TruncatedVideoError, match=r"frame 4 is missing \(the next one found is 6"):
+        list(iter_frames(path, 2, 8, FPS))
+    base = Fraction(1, 1000)
+    path = write(tmp_path / "rounded.mkv", times=[0, 101, 199, 300, 408], time_base=base)
+    assert len(list(iter_frames(path, 0, 5, FPS))) == 5
+    path = write(tmp_path / "uneven.mkv", times=[0, 100, 200, 340, 400], time_base=base)
+    with pytest.raises(FormatError, match=r"lies at 0\.3400 s, between frames 3 and 4"):
+        list(iter_frames(path, 0, 5, FPS))
+
+
+# --- damaged files -------------------------------------------------------------------------------
+
+
+def is_whole(path: Path, video: Video, start: int, stop: int) -> bool:
+    """Whether a span of a damaged file comes whole; frames that come must be right ones."""
+    found: list[Any] = []
+    whole = False
+    try:
+        for frame in iter_frames(path, start, stop, FPS):
+            found.append(frame)  # one by one: those before an error count
+        whole = True
+    except InterferenceError as error:
+        assert str(path) in error.message
+    assert len(found) == stop - start or not whole
+    for frame, expected in zip(found, video.frames[start:stop], strict=False):
+        np.testing.assert_array_equal(frame, expected)
+    return whole
+
+
+@pytest.mark.parametrize("name", ["lossless.mp4", "ffv1.mkv", "h264-reordered.mp4"])
+def test_files_cut_anywhere(videos: dict[str, Video], name: str, tmp_path: Path) -> None:
+    """Frames that still come are right ones, and the end is told: wherever the file is cut."""
+    video = videos[name]
+    data = video.path.read_bytes()
+    path = tmp_path / f"cut{video.path.suffix}"
+    # The header stands at one of the ends; it has a thousand bytes or two. FFmpeg opens some
+    # files that are cut inside it, with a stream without a codec.
+    cuts = {1, 7, 8, *range(0, 2000, 83), *range(len(data) - 2000, len(data), 83)}
+    whole = []
+    for cut in sorted(cuts | set(range(0, len(data), len(data) // 12))):
+        path.write_bytes(data[:cut])
+        whole += [cut for span in ((0, COUNT), (COUNT - 5, COUNT)) if is_whole(path, video, *span)]
+    # The last frames come only where what is missing stands after them.
+    assert all(cut > len(data) - 300 for cut in whole)
+
+
+def test_a_header_that_is_not_text_and_frames_of_another_size(
+    videos: dict[str, Video], tmp_path: Path
+) -> None:
+    data = videos["lossless.mp4"].path.read_bytes()
+    path = tmp_path / "damaged.mp4"
+    path.write_bytes(data.replace(b"VideoHandler", b"Video\xff\xfedler"))
+    with pytest.raises(FormatError, match="is not a readable video"):
+        next(iter_frames(path, 0, 1, FPS))
+    with pytest.raises(FormatError, match="80×64 pixels; .*says 32×64"):
+        decode_into(np.empty((4, 64, 32, 3), np.uint8), videos["ffv1.mkv"].path, 0, FPS)

@@ -1,0 +1,97 @@
+"""Sources against LeRobot's own writer and reader."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.recordings import check_recording, make_episode
+
+from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
+from robomme_interference_data.encode import CODECS, Codec
+
+
+@pytest.fixture(scope="module")
+def lerobot() -> Any:
+    return pytest.importorskip("lerobot.datasets")
+
+
+@pytest.mark.parametrize("codec", CODECS.values(), ids=list(CODECS))
+def test_codecs_are_those_that_lerobot_would_use(lerobot: Any, codec: Codec) -> None:
+    from lerobot.configs.video import RGBEncoderConfig
+
+    config = RGBEncoderConfig(vcodec=codec.vcodec, pix_fmt=codec.pix_fmt, **codec.settings)
+    assert dict(codec.options) == config.get_codec_options(as_strings=True)
+    assert (codec.vcodec, codec.pix_fmt) == (config.vcodec, config.pix_fmt)
+    if codec.name == "lerobot-default":
+        default = RGBEncoderConfig()
+        assert (codec.vcodec, codec.pix_fmt) == (default.vcodec, default.pix_fmt)
+        assert dict(codec.options) == default.get_codec_options(as_strings=True)
+
+
+SIZE = (64, 64)  # the least that lerobot's default encoder takes
+EPISODES = {
+    "MoveCube/train/0": make_episode(1, 12, lesson=5, size=SIZE),
+    "MoveCube/train/1": make_episode(2, 7, lesson=7, size=SIZE),
+}
+
+
+def write(root: Path, stored: str) -> None:
+    """Write the episodes with lerobot: images in parquet, or video of a codec of ours."""
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+
+    kind = "image" if stored == "image" else "video"
+    features: dict[str, Any] = {
+        f"observation.images.{camera}": {
+            "dtype": kind,
+            "shape": (*SIZE, 3),
+            "names": ["height", "width", "channels"],
+        }
+        for camera in ("front", "wrist")
+    }
+    for name in ("observation.state", "action"):
+        features[name] = {"dtype": "float32", "shape": (8,), "names": None}
+    features["is_demo"] = {"dtype": "bool", "shape": (1,), "names": None}
+    encoder = {}
+    if kind == "video":
+        codec = CODECS[stored]
+        settings = {"vcodec": codec.vcodec, "pix_fmt": codec.pix_fmt, **codec.settings}
+        encoder = {"rgb_encoder": RGBEncoderConfig(**settings)}
+    made = LeRobotDataset.create(
+        "test/small", 10, features, root=root, use_videos=kind == "video", **encoder
+    )
+    for episode in EPISODES.values():
+        for step in range(len(episode)):
+            images = {f"observation.images.{n}": i[step] for n, i in episode.images.items()}
+            assert episode.action is not None
+            vectors = {"observation.state": episode.state[step], "action": episode.action[step]}
+            shown = {"is_demo": np.array([step < episode.lesson])}
+            made.add_frame({**images, **vectors, **shown, "task": episode.goal})
+        made.save_episode()
+    made.finalize()
+
+
+@pytest.mark.parametrize("stored", ["image", "av1-lossless", "lerobot-default"])
+def test_a_dataset_of_lerobots_is_read_as_lerobot_does(
+    lerobot: Any, tmp_path: Path, stored: str
+) -> None:
+    root, names = tmp_path / "dataset", tmp_path / "families.json"
+    write(root, stored)
+    names.write_text('{"0": "MoveCube", "1": "MoveCube"}')
+    source = LeRobotSource(str(root), families_file=names)
+    theirs = lerobot.LeRobotDataset("test/small", root=root, video_backend="pyav")
+    row = 0
+    for episode in source.episodes():
+        recording = source.read(episode, None)
+        assert recording.exact == (stored != "lerobot-default")
+        if recording.exact:
+            check_recording(source.read(episode, None), EPISODES[str(episode.id)])
+        for frame in recording.frames:
+            item = theirs[row]
+            row += 1
+            np.testing.assert_array_equal(frame.state, item["observation.state"].numpy())
+            for camera, image in frame.images.items():
+                pixels = (item[f"observation.images.{camera}"] * 255).round().byte()
+                np.testing.assert_array_equal(image, pixels.permute(1, 2, 0).numpy())
+    assert row == len(theirs)
