@@ -24,6 +24,7 @@ __all__ = [
     "PAPER_SYSTEMS",
     "SYSTEMS",
     "System",
+    "base_of",
     "check_condition",
     "check_history",
     "display_name",
@@ -66,10 +67,9 @@ class System:
     paper: bool = False
     bound: bool = False
 
-    @property
-    def no_history(self) -> bool:
-        """Whether `no-history` applies: there is nothing to retrieve from."""
-        return not self.retrieval
+    def applies(self, condition: str) -> bool:
+        """Whether a condition says anything: retrieval needs a history, a memory-free one none."""
+        return not self.retrieval if condition == NO_HISTORY else self.with_history
 
 
 def _released(
@@ -160,6 +160,14 @@ def display_name(name: str) -> str:
     return SYSTEMS[name].display if name in SYSTEMS else name
 
 
+def base_of(name: str) -> str | None:
+    """Return the system without the retrieval step; None for one that has none."""
+    if name not in SYSTEMS or not SYSTEMS[name].retrieval:
+        return None
+    plain = name.removeprefix("retrieval-")
+    return plain if plain in SYSTEMS else f"perceptual-{plain}"
+
+
 def is_bound(name: str) -> bool:
     """Whether a system only bounds what a memory can reach; one of your own never does."""
     return name in SYSTEMS and SYSTEMS[name].bound
@@ -175,18 +183,17 @@ def check_condition(system: System, condition: str) -> None:
     Raises:
         InvalidOptionError: The condition does not apply.
     """
-    if condition == NO_HISTORY and not system.no_history:
-        plain = system.name.removeprefix("retrieval-")
-        plain = plain if plain in SYSTEMS else f"perceptual-{plain}"
+    if system.applies(condition):
+        return
+    if condition == NO_HISTORY:
         raise InvalidOptionError(
             f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
-            f"Run {plain} under {NO_HISTORY}: without history it is the same system.",
+            f"Run {base_of(system.name)} under {NO_HISTORY}: without history it is the same system.",
         )
-    if condition != NO_HISTORY and not system.with_history:
-        raise InvalidOptionError(
-            f"{system.name} has no memory: {condition} does not apply",
-            f"Run it under {NO_HISTORY} only.",
-        )
+    raise InvalidOptionError(
+        f"{system.name} has no memory: {condition} does not apply",
+        f"Run it under {NO_HISTORY} only.",
+    )
 
 
 def check_history(system: System, frames: Mapping[str, int]) -> None:

@@ -50,7 +50,17 @@ __all__ = [
     "InterferenceError",
 ]
 
-_MODULES = ("split", "buffer", "cache", "query", "records", "ids", "conditions", "dataset", "errors")
+_MODULES = (
+    "split",
+    "buffer",
+    "cache",
+    "query",
+    "records",
+    "ids",
+    "conditions",
+    "dataset",
+    "errors",
+)
 
 
 def __getattr__(name: str) -> Any:

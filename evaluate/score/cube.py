@@ -6,11 +6,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, NO_HISTORY, in_order
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.rows import Rows
-from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.evaluate.systems import SYSTEMS, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 
@@ -143,7 +143,8 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
     status[(*axes, rows.places("model_seed", model_seeds))] = rows.places("status", STATUSES)
     found = rows.places("difficulty", DIFFICULTIES)
     difficulty[at[found >= 0]] = found[found >= 0]
-    applies = np.array([[_applies(s, c) and c in due for c in conditions] for s in systems])
+    known = [name_system(system) for system in systems]
+    applies = np.array([[one.applies(c) and c in due for c in conditions] for one in known])
     return Cube(
         simulator,
         systems,
@@ -160,8 +161,3 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
 def _table_order(system: str) -> tuple[int, str]:
     known = list(SYSTEMS)
     return (known.index(system) if system in SYSTEMS else len(known), system)
-
-
-def _applies(system: str, condition: str) -> bool:
-    known = SYSTEMS.get(system)
-    return known is None or (known.no_history if condition == NO_HISTORY else known.with_history)

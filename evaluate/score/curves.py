@@ -12,10 +12,9 @@ from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_con
 from robomme_interference_data.drawing import INK, tidy
 from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.effects import base_of
 from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 
 __all__ = ["Data", "Look", "curve", "dodged", "explained", "label_ends", "legend", "looks_of"]
 __all__ += ["set_axes", "short", "spread"]

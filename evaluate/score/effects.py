@@ -15,11 +15,10 @@ from robomme_interference_data import stats
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair
-from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.stats import LEAST, Floats, Interval
 from robomme_interference_data.tables import Table
 
-__all__ = ["START", "SURE", "Contrast", "base_of", "contrast_table", "decay_table", "effects_of"]
+__all__ = ["START", "SURE", "Contrast", "contrast_table", "decay_table", "effects_of"]
 __all__ += ["lift_table", "noise_table"]
 
 START = "k0"
@@ -55,14 +54,6 @@ class Contrast:
     def is_lift(self) -> bool:
         """Whether history is compared with none."""
         return self.against[1] == NO_HISTORY != self.condition
-
-
-def base_of(system: str) -> str | None:
-    """Return the system without the retrieval step, None for one that has none."""
-    if system not in SYSTEMS or not SYSTEMS[system].retrieval:
-        return None
-    plain = system.removeprefix("retrieval-")
-    return plain if plain in SYSTEMS else f"perceptual-{plain}"
 
 
 def effects_of(

@@ -14,8 +14,9 @@ from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.drawing import GREY, INK, ink_on, open_figure, save_figure, tidy
 from robomme_interference_data.evaluate.score import curves
 from robomme_interference_data.evaluate.score.curves import Data, curve, explained, legend
-from robomme_interference_data.evaluate.score.effects import SURE, base_of
+from robomme_interference_data.evaluate.score.effects import SURE
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.systems import base_of
 
 __all__ = ["FIGURES", "draw_figure", "draw_figures"]
 

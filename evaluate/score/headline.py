@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.effects import START, Contrast, base_of
+from robomme_interference_data.evaluate.score.effects import START, Contrast
 from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import display_name, is_bound
+from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.tables import percent, points
 
 __all__ = ["headline"]

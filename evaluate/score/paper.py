@@ -7,7 +7,7 @@ from functools import cache
 from importlib import resources
 
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.effects import base_of
+from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats import newcombe, wilson
 from robomme_interference_data.tables import Table
 

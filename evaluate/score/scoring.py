@@ -10,6 +10,7 @@ from robomme_interference_data.errors import BadRowsError
 from robomme_interference_data.evaluate.score import Against, Grid, Settings, cells, effects, paper
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
+from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.files import write_text
 from robomme_interference_data.stats import DRAWS
 from robomme_interference_data.tables import Table
@@ -72,7 +73,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     notes: list[str] = []
     for cube in cubes.values():
         for system in cube.systems:
-            base = effects.base_of(system)
+            base = base_of(system)
             if base not in cube.systems:
                 base = None
             elif reason := _apart(rows, cube.simulator, system, base or ""):

@@ -97,7 +97,7 @@ def test_files(tiny_split: Path) -> None:
 @pytest.mark.slow
 def test_build() -> None:
     (rows,) = printed("build", "--source", "sample:MoveCube", "--rounds", "1", "--workers", "1")
-    assert [row["step"] for row in rows][0] == "bare encoder (PyAV)"
+    assert rows[0]["step"] == "bare encoder (PyAV)"
     assert rows[0]["of bare"] == "1.00"
     for row in rows:
         assert is_quotient(row["frames/s"], "1000.000", row["ms a frame"])

@@ -138,7 +138,10 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
             ["build", "distractors", "--source", "frmes:{}", "--out", "{}/out"],
             ("frmes", "Did you mean 'frames'?"),
         ),
-        (["build", "distractors", "--source", "sample", "--out", "{}/x", "--codec", "h264"], ("h264",)),
+        (
+            ["build", "distractors", "--source", "sample", "--out", "{}/x", "--codec", "h264"],
+            ("h264",),
+        ),
     ],
 )
 def test_known_errors(

@@ -1,0 +1,294 @@
+"""Whole builds in this process: what is written, what goes on, what grows, what is refused."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.made_up import MadeUpSource
+from support.splits import GOLDEN
+
+from robomme_interference_data.build_dataset.build import (
+    BuildPlan,
+    BuildResult,
+    build_dataset,
+    work_folder,
+)
+from robomme_interference_data.build_dataset.config import (
+    BuildConfig,
+    PlanConfig,
+    list_episodes,
+    plan_all,
+    plan_build,
+)
+from robomme_interference_data.build_dataset.sources import Source
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.console import WorkProgress
+from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.errors import (
+    BuildError,
+    InterferenceError,
+    InvalidIdError,
+    InvalidOptionError,
+    PoolTooSmallError,
+    SourceError,
+)
+from robomme_interference_data.execution import Serial
+from robomme_interference_data.files import LocalFiles, hold, read_json
+
+TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
+
+
+def build(
+    out: Path, *sources: Source, kind: str = "distractors", filters: Any = None, **options: Any
+) -> BuildResult:
+    tasks = list_episodes(sources, **(filters or {}))
+    plan = BuildPlan(kind, sources, tasks, **options)
+    return build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+def ids(root: Path) -> list[str]:
+    return [str(one.episode_id) for one in Dataset(LocalFiles(root)).records()]
+
+
+def test_the_golden_units_come_out_again_and_grow_to_the_same_bytes(tmp_path: Path) -> None:
+    """In three steps, the later episodes first, as in one: videos are taken over as they are."""
+    out, golden = tmp_path / "out", GOLDEN / "distractors"
+    source = SampleSource(size=32)
+
+    def step(**filters: Any) -> BuildResult:
+        return build(out, source, filters={"split": "train", **filters})
+
+    some = step(numbers=(1,), families=("MoveCube", "VideoRepick", "RouteStick"))
+    assert (some.episodes, some.added, some.skipped) == (
+        2,
+        2,
+        {"VideoRepick/train/1": "200 raw frames; a unit needs 249"},
+    )
+    assert step(numbers=(0,)).added == 9
+    whole = step(numbers=(0, 1))
+    assert (whole.episodes, whole.added, whole.frames) == (17, 6, 17 * 32)
+    assert contents(out) == contents(golden)
+    again = step(numbers=(0, 1))
+    assert (again.episodes, again.added) == (17, 0)
+    assert contents(out) == contents(golden)
+    assert not work_folder(out).exists()
+
+
+def test_order_of_sources_does_not_matter(tmp_path: Path) -> None:
+    one = MadeUpSource({name: TRAIN[name] for name in list(TRAIN)[:2]})
+    other = MadeUpSource({name: TRAIN[name] for name in list(TRAIN)[2:]})
+    build(tmp_path / "a", one, other)
+    build(tmp_path / "b", other, one)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_a_build_goes_on_from_what_was_staged(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    source = MadeUpSource(TRAIN, {"B/train/0": {9: SourceError("broke off", "record it again")}})
+    with pytest.raises(SourceError, match="B/train/0: broke off"):
+        build(out, source)
+    assert not out.exists()
+    for name in TRAIN:  # nothing but that one is read again
+        source.wrong[name] = {0: SourceError("must not be read")}
+    source.wrong["B/train/0"] = {}
+    assert build(out, source).added == 4
+    assert not work_folder(out).exists()
+
+
+def test_several_failures_are_listed(tmp_path: Path) -> None:
+    wrong = {name: {3: SourceError("broke off")} for name in list(TRAIN)[1:]}
+    with pytest.raises(BuildError, match="3 of 4 episodes failed") as caught:
+        build(tmp_path / "out", MadeUpSource(TRAIN, wrong))
+    assert "A/train/1: broke off (started 1 times)" in caught.value.message
+    assert "the same command again" in str(caught.value.hint)
+
+
+def test_what_a_killed_build_had_moved_away_is_put_back(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    source = MadeUpSource(TRAIN)
+    build(out, source, filters={"numbers": (0,)})
+    work_folder(out).mkdir()
+    out.rename(work_folder(out) / "before")  # killed between the two renames
+    assert build(out, source).added == 2
+    assert ids(out) == list(TRAIN)
+
+
+def test_episodes_with_and_without_actions_mix(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    told = MadeUpSource({"A/train/0": (260, None)})
+    silent = MadeUpSource({"B/train/0": (260, None)}, actions=False)
+    build(out, told)
+    assert "action" in Dataset(LocalFiles(out)).features
+    build(out, told, silent)  # grows, and drops what not all have
+    dataset = Dataset(LocalFiles(out))
+    assert "action" not in dataset.features
+    assert all("action" not in one.feature_sha256 for one in dataset.records())
+    build(tmp_path / "at once", silent, told)
+    assert contents(out) == contents(tmp_path / "at once")
+
+
+def test_episodes_of_other_sizes_do_not(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
+    with pytest.raises(SourceError, match="cannot be in one dataset"):
+        build(out, MadeUpSource({"A/train/0": (260, None)}), both)
+    build(out, MadeUpSource({"A/train/0": (260, None)}))
+    with pytest.raises(InterferenceError, match="other sizes|cannot be in one dataset"):
+        build(out, both)
+    assert build(out, both, cameras=("front",)).episodes == 2
+
+
+@pytest.mark.parametrize(
+    "options", [{"codec": "lerobot-default"}, {"version": "2.0.0"}, {"kind": "demonstrations"}]
+)
+def test_a_dataset_that_was_built_otherwise(tmp_path: Path, options: dict[str, Any]) -> None:
+    out = tmp_path / "out"
+    build(out, MadeUpSource({"A/train/0": (260, 5)}))
+    before = contents(out)
+    with pytest.raises(BuildError, match="was built otherwise") as caught:
+        build(out, MadeUpSource({"A/train/1": (260, 5)}), **options)
+    assert "Choose another --out" in str(caught.value.hint)
+    assert contents(out) == before
+
+
+def test_another_version_of_the_simulators_suite(tmp_path: Path) -> None:
+    class Suite(MadeUpSource):
+        version = 1
+
+        @property
+        def provenance(self) -> dict[str, Any]:
+            return {"kind": "tabletop", "suite_version": self.version}
+
+    source = Suite(TRAIN)
+    build(tmp_path / "out", source)
+    source.version = 2
+    with pytest.raises(BuildError, match="suite_version"):
+        build(tmp_path / "out", source)
+
+
+def test_what_else_may_be_in_the_way(tmp_path: Path) -> None:
+    source = MadeUpSource(TRAIN)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    with pytest.raises(BuildError, match="is not a dataset of this package"):
+        build(tmp_path / "mine", source)
+    assert contents(tmp_path / "mine") == {"notes.txt": b"keep"}
+    work = work_folder(tmp_path / "out")
+    work.mkdir()
+    with (
+        hold(work / "lock", BuildError("x")),
+        pytest.raises(BuildError, match="another build of .*out is running"),
+    ):
+        build(tmp_path / "out", source)
+
+
+def test_nothing_to_store(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="no episode yields distractors: 2 unusable"):
+        build(tmp_path / "out", MadeUpSource({"A/train/0": (9, None), "B/train/0": (8, None)}))
+    assert not (tmp_path / "out").exists()
+
+
+def test_report_and_identity(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    build(out, MadeUpSource({**TRAIN, "A/train/7": (9, None)}), version="1.2.3")
+    assert read_json(out / "meta" / "build_report.json") == {
+        "format_version": 1,
+        "kind": "distractors",
+        "counts": {"episodes": 4, "frames": 128, "families": {"A": 2, "B": 2}, "skipped": 1},
+        "skipped": [{"episode_id": "A/train/7", "why": "9 raw frames; a unit needs 249"}],
+    }
+    identity = Dataset(LocalFiles(out)).identity
+    assert (identity.kind, identity.version, identity.codec) == (
+        "distractors",
+        "1.2.3",
+        "av1-lossless",
+    )
+    assert (identity.cameras, identity.simulators, identity.exact) == (
+        ("front",),
+        ("made-up",),
+        True,
+    )
+    assert identity.sources == ({"kind": "made-up"},)
+    assert identity.unit == {"frames": 32, "stride": 8}
+
+
+# --- what is asked -------------------------------------------------------------------------------
+
+
+def listed(**filters: Any) -> list[str]:
+    source = SampleSource(("MoveCube", "X"), size=32)
+    return [str(one.id) for _, one in list_episodes([source], **filters)]
+
+
+def test_filters() -> None:
+    assert listed(split="test") == ["MoveCube/test/0", "X/test/0"]
+    assert listed(families=("X",), numbers=(1, 2)) == ["X/train/1", "X/train/2"]
+    assert len(listed()) == 8
+    for filters, error in (
+        ({"families": ("Y",)}, InvalidOptionError),
+        ({"split": "tset"}, InvalidOptionError),
+        ({"numbers": (99,)}, SourceError),
+    ):
+        with pytest.raises(error):
+            listed(**filters)
+
+
+def test_an_episode_of_two_sources() -> None:
+    source = SampleSource(("MoveCube",), size=32)
+    with pytest.raises(SourceError, match=r"recorded twice \(in source 1 and source 2\)"):
+        list_episodes([source, source])
+
+
+def config(tmp_path: Path, *source: str, **changes: Any) -> BuildConfig:
+    return BuildConfig(source=source or ("sample",), out=tmp_path / "out", **changes)
+
+
+def test_units_are_of_train_episodes(tmp_path: Path) -> None:
+    plan = plan_build("distractors", config(tmp_path))
+    assert {one.id.split for _, one in plan.tasks} == {"train"}
+    plans = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
+    assert [str(one.id) for _, one in plans["demonstrations"].tasks] == ["MoveCube/test/0"]
+    assert len(plans["distractors"].tasks) == 27
+
+
+@pytest.mark.parametrize(
+    ("changes", "plan", "error"),
+    [
+        ({"workers": 0}, {}, InvalidOptionError),
+        ({"codec": "h264"}, {}, InvalidOptionError),
+        ({"episodes": "3-1"}, {}, InvalidOptionError),
+        ({"columns": ("front",)}, {}, InvalidOptionError),
+        ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
+        ({}, {"conditions": ("x3",)}, InvalidIdError),
+        ({}, {"position_limit": "many"}, InvalidOptionError),
+        ({}, {"conditions": ("k63",)}, PoolTooSmallError),
+        ({"source": ("robomme",)}, {}, InvalidOptionError),
+        ({"source": ("sample:MoveCube",)}, {}, PoolTooSmallError),
+    ],
+)
+def test_build_all_refuses_before_it_reads(
+    tmp_path: Path, changes: dict[str, Any], plan: dict[str, Any], error: type[InterferenceError]
+) -> None:
+    asked = {"source": ("sample",), "out": tmp_path / "out", **changes}
+    with pytest.raises(error):
+        plan_all(BuildConfig(**asked), PlanConfig(**plan))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_golden_demonstrations_hold_what_the_source_gives(tmp_path: Path) -> None:
+    """Built without videos that were there before: the same hashes of the same frames."""
+    out = tmp_path / "out"
+    families = ("VideoRepick", "MoveCube", "PatternLock")
+    filters = {"families": families, "split": "test"}
+    build(out, SampleSource(size=32), kind="demonstrations", filters=filters)
+    assert contents(out) == contents(GOLDEN / "demonstrations")
+    shutil.rmtree(out)

@@ -1,0 +1,214 @@
+"""Manifests: what every buffer holds, the same bytes from the same inputs, and what is refused."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.made_up import record, write_metadata
+from support.splits import CONDITIONS, GOLDEN, QUERIES, copy_split
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.manifests import (
+    ManifestPlan,
+    plan_manifests,
+    planned_buffers,
+    write_manifests,
+)
+from robomme_interference_data.digest import combine
+from robomme_interference_data.draw import UnitPool
+from robomme_interference_data.errors import (
+    BuildError,
+    HistoryTooLongError,
+    InterferenceError,
+    InvalidIdError,
+    InvalidOptionError,
+    MissingFileError,
+    PoolTooSmallError,
+    SourceError,
+)
+from robomme_interference_data.files import read_json
+
+FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
+
+
+def made_up(root: Path, *, queries: Any = None, units: Any = None) -> Path:
+    """A split of metadata alone: four families, two queries and three units each."""
+    asked = queries or [
+        record("demonstrations", f"{family}/test/{n}", lesson=20 + 13 * n)
+        for family in FAMILIES
+        for n in range(2)
+    ]
+    pool = units or [
+        record("distractors", f"{family}/train/{n}", seed=n)
+        for family in FAMILIES
+        for n in range(3)
+    ]
+    write_metadata(root / "demonstrations", "demonstrations", asked)
+    write_metadata(root / "distractors", "distractors", pool)
+    return root
+
+
+def written(plan: ManifestPlan, root: Path) -> dict[str, bytes]:
+    assert sum(write_manifests(plan, root)) > 0
+    folder = root / "manifests"
+    assert {path.name for path in folder.iterdir()} == {"manifest.json", "buffers.parquet"}
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_the_golden_manifests_come_out_again(tmp_path: Path) -> None:
+    root = copy_split(tmp_path / "split")
+    plan = plan_manifests(root, tuple(reversed(CONDITIONS)))
+    golden = {path.name: path.read_bytes() for path in (GOLDEN / "manifests").iterdir()}
+    assert written(plan, root) == golden
+
+
+def test_what_buffers_hold(tmp_path: Path) -> None:
+    root = made_up(tmp_path)
+    plan = plan_manifests(root, ("no-history", "k0", "k2", "k4"), seed=5)
+    found = {str(one): one for one in planned_buffers(plan)}
+    assert len(found) == 8 * 4
+    one = found["PatternLock/test/1 under k4"]
+    pool = UnitPool((unit.episode_id for unit in plan.distractors.records()), 5)
+    drawn = pool.draw(one.episode_id, 4)
+    assert [session.source for session in one.sessions] == [one.episode_id, *drawn]
+    lesson, *units = one.sessions
+    query = plan.demonstrations.record(lesson.episode_index)
+    assert query.episode_id == one.episode_id
+    assert (lesson.role, lesson.dataset, lesson.start, lesson.stop, lesson.repeat) == (
+        *("lesson", "demonstrations", 0, 33, 1),
+    )
+    assert lesson.revision == plan.demonstrations.revision
+    assert query.lesson_sha256 is not None
+    assert lesson.sha256 == combine(query.lesson_sha256)
+    for unit in units:
+        stored = plan.distractors.record(unit.episode_index)
+        assert stored.episode_id == unit.source
+        assert (unit.role, unit.dataset, unit.start, unit.stop) == (
+            "distractor",
+            "distractors",
+            0,
+            32,
+        )
+        assert unit.sha256 == combine(stored.feature_sha256)
+    assert (one.k, one.lesson_frames, one.history_frames) == (4, 33, 33 + 4 * 32)
+    # An even 32-frame sample of 161 history frames and the live one: ⌊j·161/31⌋ < 33 for j ≤ 6.
+    assert one.lesson_share == 7 / 32
+    assert (one.query.dataset, one.query.frame) == ("demonstrations", 33)
+    # Nested, and paired over the conditions.
+    assert found["PatternLock/test/1 under k2"].sessions == one.sessions[:3]
+    assert found["PatternLock/test/1 under k0"].sessions == one.sessions[:1]
+    empty = found["PatternLock/test/1 under no-history"]
+    assert (empty.sessions, empty.history_frames, empty.lesson_share) == ((), 0, 0.0)
+    assert empty.query == one.query
+
+
+def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
+    units = [record("distractors", f"X{n}/train/0", exact=n != 1) for n in range(3)]
+    queries = [record("demonstrations", "MoveCube/test/0")]
+    plan = plan_manifests(made_up(tmp_path, queries=queries, units=units), ("k0", "k3"))
+    assert [one.exact for one in planned_buffers(plan)] == [True, False]
+
+
+def test_header(tmp_path: Path) -> None:
+    root = made_up(tmp_path)
+    files = written(plan_manifests(root, ("k1", "no-history"), 7, None), root)
+    header = read_json(root / "manifests" / "manifest.json")
+    datasets = {
+        name: {
+            "kind": name,
+            "version": "1.0.0",
+            "revision": read_json(root / name / "meta" / "interference.json")["revision"],
+            "identity": hashlib.sha256(
+                (root / name / "meta" / "interference.json").read_bytes()
+            ).hexdigest(),
+        }
+        for name in ("demonstrations", "distractors")
+    }
+    assert header == {
+        "format_version": 1,
+        "rule_version": 1,
+        "seed": 7,
+        "conditions": ["no-history", "k1"],
+        "position_limit": None,
+        "datasets": datasets,
+        "counts": {"queries": 8, "buffers": 16, "sessions": 16},
+        "rows": hashlib.sha256(files["buffers.parquet"]).hexdigest(),
+    }
+
+
+def test_queries_stand_in_canonical_order(tmp_path: Path) -> None:
+    names = ["Other/test/0", "RouteStick/test/10", "RouteStick/test/2", "VideoRepick/test/0"]
+    queries = [record("demonstrations", name) for name in names]
+    units = [record("distractors", "InsertPeg/train/0")]
+    plan = plan_manifests(made_up(tmp_path, queries=queries, units=units), ("k0",))
+    assert [str(one.episode_id) for one in planned_buffers(plan)] == [
+        *("VideoRepick/test/0", "RouteStick/test/2", "RouteStick/test/10", "Other/test/0")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("conditions", "error"),
+    [
+        (("k64",), InvalidIdError),
+        (("x",), InvalidIdError),
+        ((), InvalidOptionError),
+        (("k1", "k1"), InvalidOptionError),
+    ],
+)
+def test_no_such_conditions(
+    tmp_path: Path, conditions: tuple[str, ...], error: type[InterferenceError]
+) -> None:
+    with pytest.raises(error):
+        plan_manifests(made_up(tmp_path), conditions)
+
+
+def test_a_pool_too_small(tmp_path: Path) -> None:
+    root = made_up(tmp_path)
+    with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):
+        list(write_manifests(plan_manifests(root, ("k10",)), root))
+    assert list((root / "manifests").iterdir()) == []
+
+
+@pytest.mark.parametrize(("limit", "fits"), [(33 + 32 + 1300, True), (33 + 32 + 1299, False)])
+def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
+    plan = plan_manifests(made_up(tmp_path), ("k1",), position_limit=limit)
+    if fits:
+        assert len(list(planned_buffers(plan))) == 8
+        return
+    with pytest.raises(HistoryTooLongError, match="under k1 needs 1365 positions") as caught:
+        list(planned_buffers(plan))
+    assert "--position-limit none" in str(caught.value.hint)
+
+
+def test_units_must_be_of_train_episodes(tmp_path: Path) -> None:
+    units = [record("distractors", "InsertPeg/test/0"), record("distractors", "Drawer/val/0")]
+    with pytest.raises(SourceError, match="must come from train episodes.* test, val"):
+        plan_manifests(made_up(tmp_path, units=units))
+
+
+def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
+    root = made_up(tmp_path)
+    info = root / "distractors" / "meta" / "info.json"
+    info.write_text(info.read_text().replace("      4,\n", "      8,\n"))
+    with pytest.raises(SourceError, match="cannot follow one another"):
+        plan_manifests(root)
+    (root / "distractors").rename(root / "units")
+    with pytest.raises(MissingFileError):
+        plan_manifests(root)
+    (root / "demonstrations").rename(root / "distractors")
+    (root / "units").rename(root / "demonstrations")
+    with pytest.raises(InvalidOptionError, match="is a dataset of distractors"):
+        plan_manifests(root)
+
+
+def test_earlier_manifests_are_replaced_and_strangers_kept(tmp_path: Path) -> None:
+    root = copy_split(tmp_path / "split")
+    (root / "manifests" / ".buffers.parquet.x.partial").write_text("left by a killed run")
+    assert sum(write_manifests(plan_manifests(root, ("k0",)), root)) == len(QUERIES)
+    assert load_split(root).conditions == ("k0",)
+    other = made_up(tmp_path / "other")
+    (other / "manifests").mkdir()
+    (other / "manifests" / "notes.txt").write_text("mine")
+    with pytest.raises(BuildError, match=r"holds no manifests, but notes\.txt"):
+        list(write_manifests(plan_manifests(other), other))

@@ -1,0 +1,393 @@
+"""Every kind of damage to a split is found, and named where it is; leaks are told apart."""
+
+import json
+import random
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.made_up import record, write_metadata
+from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_split
+from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.files import sha256_file
+
+EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
+DATA = "distractors/data/chunk-000/file-003.parquet"
+VIDEO = "distractors/videos/observation.images.front/chunk-000/file-003.mp4"
+HEADER = "manifests/manifest.json"
+ROWS = "manifests/buffers.parquet"
+
+
+def found(root: Path, *, decode: bool = False) -> list[str]:
+    return [f"{one.where}: {one.what}" for one in verify_split(root, decode=decode)]
+
+
+def expect(root: Path, *patterns: str, decode: bool = False) -> None:
+    """Check that violations match the patterns, each at least once, and nothing is raised."""
+    told = found(root, decode=decode)
+    for pattern in patterns:
+        assert any(re.search(pattern, one) for one in told), f"{pattern}: {told}"
+    assert told
+
+
+def edit(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def put(table: pa.Table, name: str, values: Any) -> pa.Table:
+    place = table.column_names.index(name)
+    return table.set_column(place, name, pa.array(values, table.schema.field(name).type))
+
+
+def first_changed(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
+    return lambda table: put(table, name, [value, *table[name].to_pylist()[1:]])
+
+
+# --- nothing to find -----------------------------------------------------------------------------
+
+
+def test_a_clean_split() -> None:
+    counted: list[int] = []
+    assert list(verify_split(GOLDEN, advance=counted.append)) == []
+    assert counted == [49] * len(QUERIES) + [32] * UNITS
+    assert found(GOLDEN) == []
+
+
+def test_what_people_put_beside_a_dataset_is_no_violation(own_split: Path) -> None:
+    (own_split / "distractors" / "README.md").write_text("mine")
+    (own_split / "demonstrations" / ".gitattributes").write_text("")
+    assert found(own_split) == []
+
+
+# --- every byte ----------------------------------------------------------------------------------
+
+FILES = sorted(str(path.relative_to(GOLDEN)) for path in GOLDEN.rglob("*") if path.is_file())
+ONE_OF_EACH = [name for name in FILES if "file-0" not in name or "file-000" in name]
+
+
+@pytest.mark.parametrize("path", ONE_OF_EACH)
+def test_a_flipped_bit_anywhere(own_split: Path, path: str) -> None:
+    data = bytearray((own_split / path).read_bytes())
+    chosen = random.Random(path)
+    for _ in range(3):
+        place, bit = chosen.randrange(len(data)), 1 << chosen.randrange(8)
+        data[place] ^= bit
+        (own_split / path).write_bytes(data)
+        if path == HEADER:
+            _expect_of_header(own_split)
+        else:
+            expect(own_split, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
+        data[place] ^= bit
+
+
+def _expect_of_header(root: Path) -> None:
+    """The header is the root of trust: what is wrong in it is told by what it names, or raised."""
+    try:
+        told = found(root)
+    except FormatError:
+        return
+    # Its hash is the split's revision, which rows of rollouts name.
+    assert told or load_split(root).revision != load_split(GOLDEN).revision
+
+
+@pytest.mark.parametrize("path", [EPISODES, DATA, VIDEO, ROWS, "distractors/meta/tasks.parquet"])
+@pytest.mark.parametrize("damage", ["missing", "cut"])
+def test_missing_and_cut_files(own_split: Path, path: str, damage: str) -> None:
+    file = own_split / path
+    if damage == "missing":
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:-9])
+    expect(own_split, "missing|SHA-256|cannot be read", decode=path == VIDEO)
+
+
+@pytest.mark.parametrize("path", ["data/x.parquet", "videos/extra.mp4", "meta/more.json"])
+def test_a_file_too_many(own_split: Path, path: str) -> None:
+    (own_split / "distractors" / path).write_text("?")
+    expect(own_split, f"distractors/{path}: is too many")
+
+
+# --- what the bytes mean: the sums are written anew by whoever changed the files -----------------
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "told"),
+    [
+        (DATA, first_changed("timestamp", 0.05), "timestamp of episode 3"),
+        (DATA, first_changed("task_index", 0), "task_index of episode 3"),
+        (DATA, first_changed("index", 5), "index of episode 3"),
+        (DATA, first_changed("frame_index", 1), "holds 32 rows of episode 3"),
+        (DATA, first_changed("episode_index", 4), "episode 3"),
+        (EPISODES, first_changed("dataset_from_index", 7), "dataset_from_index"),
+        (EPISODES, first_changed("dataset_to_index", 7), "dataset_to_index"),
+        (
+            EPISODES,
+            first_changed("videos/observation.images.front/to_timestamp", 1.0),
+            "to_timestamp",
+        ),
+        (
+            EPISODES,
+            first_changed("videos/observation.images.front/from_timestamp", 0.5),
+            "from_timestamp",
+        ),
+        (EPISODES, first_changed("videos/observation.images.front/file_index", 1), "is shared by"),
+        (EPISODES, first_changed("data/file_index", 1), "is shared by episodes"),
+        (EPISODES, first_changed("tasks", ["another"]), "tasks of"),
+        (EPISODES, first_changed("goals", ["another"]), "revision is"),
+        (EPISODES, first_changed("length", 31), "holds 31 frames, not 32"),
+        (EPISODES, first_changed("exec_start_idx", 7), "exec_start_idx is 7"),
+        (EPISODES, first_changed("seed", 1), "revision is"),
+        (EPISODES, lambda t: t.drop_columns(["feature_sha256"]), "feature_sha256 is missing"),
+        (EPISODES, lambda t: t.slice(1), "does not list the episodes"),
+        (
+            "distractors/meta/tasks.parquet",
+            lambda t: put(t, "task_index", list(reversed(range(len(t))))),
+            "tasks.parquet: task_index|task_index of episode",
+        ),
+    ],
+)
+def test_tables_that_mean_something_else(
+    own_split: Path, path: str, change: Callable[[pa.Table], pa.Table], told: str
+) -> None:
+    edit(own_split / path, change)
+    renew_sums(own_split / "distractors")
+    expect(own_split, told)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("meta/stats.json", lambda v: {}, "stats.json: has no finite statistics"),
+        (
+            "meta/stats.json",
+            lambda v: {**v, "action": {"mean": [float("nan")]}},
+            "no finite statistics of action",
+        ),
+        ("meta/info.json", lambda v: {**v, "total_frames": 1}, "total_frames is 1"),
+        ("meta/info.json", lambda v: {**v, "total_episodes": 1}, "does not list the episodes"),
+        ("meta/info.json", lambda v: {**v, "splits": {}}, "splits is {}"),
+        ("meta/info.json", lambda v: {**v, "features": None}, "features is None"),
+        ("meta/info.json", lambda v: {**v, "fps": "10"}, "fps is '10'"),
+        (
+            "meta/info.json",
+            lambda v: {**v, "video_path": "../../etc/{video_key}"},
+            "leads out of it",
+        ),
+        (
+            "meta/info.json",
+            lambda v: {**v, "video_path": "{video_key.__class__}"},
+            "cannot be filled in",
+        ),
+        ("meta/interference.json", lambda v: {**v, "codec": "h264"}, "codec 'h264' is unknown"),
+        ("meta/interference.json", lambda v: {**v, "unit": None}, "unit is None"),
+        ("meta/interference.json", lambda v: {**v, "kind": "demonstrations"}, "kind is"),
+        ("meta/interference.json", lambda v: {**v, "exact": False}, "exact is False"),
+        ("meta/interference.json", lambda v: {**v, "sources": 3}, "sources: 3"),
+        (
+            "meta/interference.json",
+            lambda v: {**v, "counts": {**v["counts"], "frames": 1}},
+            "counts is",
+        ),
+    ],
+)
+def test_json_that_means_something_else(
+    own_split: Path, name: str, change: Callable[[Any], Any], told: str
+) -> None:
+    path = own_split / "distractors" / name
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    renew_sums(own_split / "distractors")
+    expect(own_split, told)
+
+
+def test_frames_that_are_not_the_hashed_ones(own_split: Path) -> None:
+    videos = own_split / "distractors/videos/observation.images.front/chunk-000"
+    shutil.copyfile(videos / "file-005.mp4", videos / "file-003.mp4")
+    renew_sums(own_split / "distractors")
+    expect(own_split, r"observation\.images\.front \(frames\) does not have", decode=True)
+
+
+def test_vectors_that_are_not_the_hashed_ones(own_split: Path) -> None:
+    def change(table: pa.Table) -> pa.Table:
+        states = np.array(table["observation.state"].to_pylist(), np.float32)
+        states[17, 3] = np.nextafter(states[17, 3], 9, dtype=np.float32)
+        return put(table, "observation.state", states.tolist())
+
+    edit(own_split / "demonstrations/data/chunk-000/file-001.parquet", change)
+    renew_sums(own_split / "demonstrations")
+    expect(
+        own_split,
+        r"MoveCube/test/0: observation\.state \(frames\) does not",
+        r"MoveCube/test/0: observation\.state \(lesson\) does not",
+        decode=True,
+    )
+
+
+# --- manifests -----------------------------------------------------------------------------------
+
+
+def renew_header(root: Path, **changes: Any) -> None:
+    path = root / HEADER
+    header = json.loads(path.read_text())
+    path.write_text(json.dumps({**header, "rows": sha256_file(root / ROWS), **changes}))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda t: t.slice(1), "VideoRepick/test/0 under no-history: is missing"),
+        (lambda t: pa.concat_tables([t.slice(1), t.slice(0, 1)]), "is not in its place"),
+        (first_changed("condition", "k9"), "under k9: should not be in"),
+        (first_changed("lesson_share", 0.5), r"lesson_share is 0\.5; the rules give 0\.0"),
+        (first_changed("goals", ["x"]), "goals is 'x' at 0; the rules give"),
+        (first_changed("history_frames", 5), "the sessions hold 0 frames"),
+        (
+            lambda t: put(
+                t, "sessions", [*t["sessions"].to_pylist()[:1], [], *t["sessions"].to_pylist()[2:]]
+            ),
+            "the sessions hold 0 frames",
+        ),
+    ],
+)
+def test_rows_that_the_rules_do_not_give(
+    own_split: Path, change: Callable[[pa.Table], pa.Table], told: str
+) -> None:
+    edit(own_split / ROWS, change)
+    renew_header(own_split)
+    expect(own_split, told)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"seed": 1}, "the rules give"),
+        ({"rule_version": 2}, "rule version 2; this package can check 1"),
+        ({"counts": {}}, "counts are {}"),
+        ({"conditions": ["k0"]}, "should not be in"),
+        ({"conditions": []}, "conditions"),
+        ({"position_limit": 1400}, "under k3 needs 1444 positions"),
+    ],
+)
+def test_headers_that_say_something_else(
+    own_split: Path, changes: dict[str, Any], told: str
+) -> None:
+    renew_header(own_split, **changes)
+    expect(own_split, told)
+
+
+@pytest.mark.parametrize("datasets", [{}, {"x": {}}, None])
+def test_headers_that_cannot_be_read(own_split: Path, datasets: Any) -> None:
+    renew_header(own_split, datasets=datasets)
+    with pytest.raises(FormatError, match=r"manifest\.json"):
+        found(own_split)
+
+
+def test_a_dataset_that_is_gone(own_split: Path) -> None:
+    shutil.rmtree(own_split / "distractors")
+    expect(own_split, "distractors: .*missing")
+    shutil.rmtree(own_split / "manifests")
+    with pytest.raises(MissingFileError, match="is not a split"):
+        found(own_split)
+
+
+# --- audit ---------------------------------------------------------------------------------------
+
+
+def audited(root: Path, queries: list[Any], units: list[Any], *conditions: str) -> Audit:
+    write_metadata(root / "demonstrations", "demonstrations", queries)
+    write_metadata(root / "distractors", "distractors", units)
+    for _ in write_manifests(plan_manifests(root, conditions or ("k0",)), root):
+        pass
+    return audit_split(load_split(root))
+
+
+def query(name: str, **changes: Any) -> Any:
+    return record("demonstrations", name, **changes)
+
+
+def unit(name: str, **changes: Any) -> Any:
+    return record("distractors", name, **changes)
+
+
+def test_use_by_hand(tmp_path: Path) -> None:
+    # MoveCube's queries can only draw Drawer's unit, and Drawer's only MoveCube's.
+    report = audited(
+        tmp_path,
+        [query("MoveCube/test/0"), query("MoveCube/test/1"), query("Drawer/test/0")],
+        [unit("MoveCube/train/0"), unit("Drawer/train/5")],
+        *("no-history", "k0", "k1"),
+    )
+    assert report.leaks == []
+    assert {
+        name: {str(one): n for one, n in uses.items()} for name, uses in report.uses.items()
+    } == {
+        "no-history": {"MoveCube/train/0": 0, "Drawer/train/5": 0},
+        "k0": {"MoveCube/train/0": 0, "Drawer/train/5": 0},
+        "k1": {"MoveCube/train/0": 1, "Drawer/train/5": 2},
+    }
+    uses, families = report.tables()
+    assert uses.rows[2] == ("k1", 2, 1, 1.5, 2, 0)
+    assert families.rows == (("MoveCube", 1, 1, 1, 1, 1), ("Drawer", 1, 2, 2, 2, 2))
+    assert json.loads(json.dumps(report.as_dict()))["units"] == {
+        "MoveCube/train/0": 1,
+        "Drawer/train/5": 2,
+    }
+
+
+def test_the_golden_split_leaks_nothing() -> None:
+    report = audit_split(load_split(GOLDEN))
+    assert report.leaks == []
+    assert sum(report.uses["k7"].values()) == 3 * 7
+
+
+def test_leaks_in_the_pool(tmp_path: Path) -> None:
+    same = {"observation.images.front": "same", "observation.state": "x"}
+    report = audited(
+        tmp_path,
+        [query("MoveCube/test/0", seed=3, simulator="s"), query("Drawer/test/0", seed=3)],
+        [
+            unit("MoveCube/train/7", seed=3, simulator="s"),
+            unit("InsertPeg/train/0", feature_sha256=same),
+            unit("PatternLock/train/0", feature_sha256=same),
+        ],
+    )
+    assert report.leaks == [
+        Leak("same scene", "unit MoveCube/train/7 and query MoveCube/test/0 (seed 3)"),
+        Leak(
+            "identical frames",
+            "InsertPeg/train/0 and PatternLock/train/0 (observation.images.front)",
+        ),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "kind"),
+    [
+        ("MoveCube/train/1", "same family"),
+        ("InsertPeg/test/1", "not a train episode"),
+        ("twice", "repeated unit"),
+    ],
+)
+def test_leaks_in_a_buffer(own_split: Path, source: str, kind: str) -> None:
+    def change(table: pa.Table) -> pa.Table:
+        rows = table["sessions"].to_pylist()
+        place = table["condition"].to_pylist().index("k3", 5)  # MoveCube's
+        first, second = rows[place][1:3]
+        wanted = first["source"] if source == "twice" else source
+        second |= {"source": wanted, "family": wanted.split("/")[0]}
+        return put(table, "sessions", rows)
+
+    edit(own_split / ROWS, change)
+    leaks = audit_split(load_split(own_split)).leaks
+    assert [leak.kind for leak in leaks] == [kind]
+    assert leaks[0].where.startswith("MoveCube/test/0 under k3")
