@@ -188,7 +188,7 @@ def check_condition(system: System, condition: str) -> None:
     if condition == NO_HISTORY:
         raise InvalidOptionError(
             f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
-            f"Run {base_of(system.name)} under {NO_HISTORY}: without history it is the same system.",
+            f"Run {base_of(system.name)} under {NO_HISTORY}: there the two are the same system.",
         )
     raise InvalidOptionError(
         f"{system.name} has no memory: {condition} does not apply",
