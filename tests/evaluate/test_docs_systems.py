@@ -24,7 +24,7 @@ def row(system: System) -> list[str]:
         (True, True): "all",
         (True, False): "`no-history`",
         (False, True): "with history",
-    }[system.no_history, system.with_history]
+    }[not system.retrieval, system.with_history]
     return [
         f"`{system.name}`",
         system.display,
