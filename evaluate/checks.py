@@ -15,14 +15,14 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.clips import check_drawing
-from robomme_interference_data.evaluate.config import FRONT_CAMERA, MAX_RULE, RunConfig
+from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
 from robomme_interference_data.evaluate.systems import (
     SYSTEMS,
     System,
-    check_condition,
+    base_of,
     check_history,
     name_system,
 )
@@ -36,13 +36,7 @@ from robomme_interference_data.simulators.registry import (
 )
 from robomme_interference_data.split import Split
 
-__all__ = [
-    "applicable",
-    "check_plan",
-    "check_settings",
-    "check_simulator",
-    "default_system",
-]
+__all__ = ["applicable", "check_plan", "check_settings", "check_simulator", "default_system"]
 
 
 def default_system(config: RunConfig) -> str:
@@ -67,9 +61,7 @@ def default_system(config: RunConfig) -> str:
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", spec.target).strip("-")
     if config.retrieval is None:
         return name
-    step = ((config.retrieval_rule, MAX_RULE), (config.retrieval_camera, FRONT_CAMERA))
-    unusual = [value.replace("/", "-") for value, usual in step if value != usual]
-    return "-".join(("retrieval", name, *unusual))
+    return "-".join(("retrieval", name, *_unusual(config).values())).replace("/", "-")
 
 
 def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
@@ -95,18 +87,23 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
             "Run it on --simulator tabletop, or take another policy.",
         )
     Rule.parse(config.retrieval_rule)
-    for name, usual in (("retrieval_rule", MAX_RULE), ("retrieval_camera", FRONT_CAMERA)):
-        if config.retrieval is None and getattr(config, name) != usual:
-            raise InvalidOptionError(
-                f"--{name.replace('_', '-')} says nothing without a retrieval step",
-                "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
-            )
+    for name in _unusual(config) if config.retrieval is None else ():
+        raise InvalidOptionError(
+            f"--{name.replace('_', '-')} says nothing without a retrieval step",
+            "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
+        )
     _check_name(config, name_system(system))
     if config.videos:
         check_drawing()
     for camera in policy.history_cameras:
         if camera not in split.cameras:
             raise UnknownNameError.among("camera", camera, split.root, split.cameras)
+
+
+def _unusual(config: RunConfig) -> dict[str, str]:
+    """Return in what the retrieval step is not the paper's: setting to value."""
+    step = {name: getattr(config, name) for name in ("retrieval_rule", "retrieval_camera")}
+    return {name: value for name, value in step.items() if value != getattr(RunConfig, name)}
 
 
 def _check_name(config: RunConfig, system: System) -> None:
@@ -129,11 +126,8 @@ def _check_name(config: RunConfig, system: System) -> None:
     elif system.retrieval != step:
         has, given = ("a", "none is given") if system.retrieval else ("no", "one is given")
         why = f"system {system.name} has {has} retrieval step, and {given} (--retrieval)"
-    elif step and Rule.parse(config.retrieval_rule).method != MAX_RULE:
-        why = (
-            f"the retrieval step of {system.name} chooses by {MAX_RULE}, not by "
-            f"{config.retrieval_rule}"
-        )
+    elif step and Rule.parse(config.retrieval_rule).method != "max":
+        why = f"the retrieval step of {system.name} chooses by max, not by {config.retrieval_rule}"
     if why is not None:
         raise InvalidOptionError(why, "Give --system a name of your own: see docs/systems.md.")
 
@@ -150,7 +144,7 @@ def check_plan(
     policy: Policy,
     items: Sequence[WorkItem],
 ) -> None:
-    """Check every planned rollout.
+    """Check all that is planned.
 
     Raises:
         InvalidOptionError: A condition does not apply, or the split is of another simulator.
@@ -191,11 +185,6 @@ def check_simulator(config: RunConfig, watched: Iterable[str], executor: Executo
 
     One of the user's own is made by the workers only.
 
-    Args:
-        config: The settings.
-        watched: Cameras that the policy wants.
-        executor: Who makes it.
-
     Raises:
         NoRendererError: This machine cannot draw its pictures.
         MissingExtraError: Its libraries are not installed, or RoboMME's interpreter lacks it.
@@ -221,13 +210,15 @@ def _make_once(name: str, options: dict[str, Any], worker: Worker) -> None:
 
 def _refusal(system: System, policy: Policy, condition: str) -> InterferenceError | None:
     """Return why a condition does not apply, or None."""
-    try:
-        check_condition(system, condition)
-    except InvalidOptionError as error:
-        return error
-    if condition != NO_HISTORY and not policy.wants_history:
+    if condition != NO_HISTORY and not (system.with_history and policy.wants_history):
+        who = "the policy" if system.with_history else system.name
         return InvalidOptionError(
-            f"the policy takes no history, so {condition} says nothing of it",
+            f"{who} takes no history, so {condition} says nothing of it",
             f"Give --conditions {NO_HISTORY}.",
+        )
+    if not system.applies(condition):
+        return InvalidOptionError(
+            f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
+            f"Run {base_of(system.name)} under {NO_HISTORY}: there the two are the same system.",
         )
     return None

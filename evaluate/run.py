@@ -56,7 +56,6 @@ class RunResult:
     """What a run came to.
 
     Attributes:
-        folder: The run's folder.
         rows: Rows of all rollouts that were asked for and have ended, in canonical order.
         planned: Rollouts that were asked for.
         counts: Rows by status.

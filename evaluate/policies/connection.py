@@ -5,7 +5,8 @@ import os
 import socket
 import threading
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
@@ -30,6 +31,18 @@ _CLOSE_S = 2.0
 _GUIDE = "docs/systems.md says how to start one."
 
 
+@contextmanager
+def _after(seconds: float, call: Callable[[], object]) -> Iterator[None]:
+    """Call something if what is inside takes longer."""
+    timer = threading.Timer(seconds, call)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 class ServerConnection:
     """A connection that is opened, used, and, after any error, gone.
 
@@ -49,7 +62,6 @@ class ServerConnection:
         self.metadata: dict[str, Any] | None = None
         self._connect_s, self._response_s = connect_s, response_s
         self._connection: ClientConnection | None = None
-        self._stack = ExitStack()
         self._sent = b""
 
     @property
@@ -64,17 +76,9 @@ class ServerConnection:
             PolicyServerError: The server cannot be reached, refuses, or is no policy server.
         """
         self.close()
-        told = threading.Timer(
-            _QUIET_S,
-            MESSAGES.print,
-            [f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"],
-        )
-        told.daemon = True
-        told.start()
-        try:
+        told = f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"
+        with _after(_QUIET_S, lambda: MESSAGES.print(told)):
             self._connect()
-        finally:
-            told.cancel()
 
     def _connect(self) -> None:
         until = time.monotonic() + self._connect_s
@@ -133,12 +137,13 @@ class ServerConnection:
 
     def close(self) -> None:
         """Close the connection, if there is one."""
-        self._connection = None
-        self._stack.close()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
     def _handshake(self, seconds: float) -> ClientConnection:
         key = os.environ.get(API_KEY_VARIABLE)
-        connecting = connect(
+        return connect(
             f"ws://{self.name}",
             additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
             open_timeout=seconds,
@@ -149,7 +154,6 @@ class ServerConnection:
             # A server that computes does not answer pings; `response_s` finds the dead ones.
             ping_interval=None,
         )
-        return self._stack.enter_context(connecting)
 
     def _refusal(self, reason: object) -> PolicyServerError:
         if reason in (http.HTTPStatus.UNAUTHORIZED, http.HTTPStatus.FORBIDDEN):
@@ -179,13 +183,11 @@ class ServerConnection:
             with suppress(OSError):
                 connection.socket.shutdown(socket.SHUT_RDWR)
 
-        timer = threading.Timer(seconds, expire)
-        timer.daemon = True
-        timer.start()
         try:
-            if data is not None:
-                connection.send(data)
-            return connection.recv()
+            with _after(seconds, expire):
+                if data is not None:
+                    connection.send(data)
+                return connection.recv()
         except (ConnectionClosed, OSError) as error:
             self.close()
             late = f"did not answer within {seconds:.3g} s"
@@ -197,8 +199,6 @@ class ServerConnection:
             # An answer that nobody read would be taken for that of the next message.
             self.close()
             raise
-        finally:
-            timer.cancel()
 
     def _read(self, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):

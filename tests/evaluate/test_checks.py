@@ -54,7 +54,12 @@ pytestmark = pytest.mark.usefixtures("world")
         ({"rollout_timeout": float("nan")}, InvalidOptionError, "--rollout-timeout nan"),
         ({"simulator_timeout": float("inf")}, InvalidOptionError, "--simulator-timeout inf"),
         ({"shard": "4/3"}, InvalidOptionError, "--shard '4/3'"),
-        ({"system": "pi05_baseline"}, InvalidOptionError, "k0 does not apply"),
+        ({"system": "pi05_baseline"}, InvalidOptionError, "pi05_baseline takes no history, so k0"),
+        (
+            {"system": "retrieval-framesamp-modul", "retrieval": "thumbnail"},
+            InvalidOptionError,
+            "has nothing to retrieve from under no-history",
+        ),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "and none is given"),
         ({"system": "perceptual-framesamp-modull"}, UnknownNameError, "reads like the system"),
         ({"system": "replay-full"}, InvalidOptionError, "is not the control replay-full"),

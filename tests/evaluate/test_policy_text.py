@@ -16,7 +16,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.policies.base import Policy
-from robomme_interference_data.evaluate.policies.options import bind_options, split_options
+from robomme_interference_data.evaluate.policies.options import bind_options
 from robomme_interference_data.evaluate.policies.registry import (
     PolicySpec,
     check_workers,
@@ -122,7 +122,7 @@ def test_options_reach_the_policy_with_the_declared_type() -> None:
 @pytest.mark.parametrize("texts", [["gripper"], ["=1"], ["two words=1"], ["a=1", "b=1", "a=2"]])
 def test_what_is_no_option(texts: list[str]) -> None:
     with pytest.raises(InvalidOptionError, match="--policy-option"):
-        split_options(texts)
+        policy_options("hold", texts)
 
 
 @pytest.mark.parametrize(

