@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.clips import check_drawing
 from robomme_interference_data.evaluate.config import RunConfig
-from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
 from robomme_interference_data.evaluate.systems import (
@@ -138,24 +138,20 @@ def applicable(system: System, split: Split, policy: Policy) -> tuple[str, ...]:
 
 
 def check_plan(
-    config: RunConfig,
-    system: System,
-    split: Split,
-    policy: Policy,
-    items: Sequence[WorkItem],
-) -> None:
-    """Check all that is planned.
+    config: RunConfig, system: System, split: Split, policy: Policy, plan: Plan
+) -> tuple[WorkItem, ...]:
+    """Check every rollout of a plan, and return them.
 
     Raises:
         InvalidOptionError: A condition does not apply, or the split is of another simulator.
         UnknownNameError: The split has no buffers for a condition.
         HistoryTooLongError: A buffer exceeds the system's position limit.
     """
-    conditions = tuple(dict.fromkeys(item.condition for item in items))
-    for name in conditions:
+    items = plan.items()
+    for name in plan.conditions:
         if (refusal := _refusal(system, policy, name)) is not None:
             raise refusal
-        split.manifest(items[0].episode, name)  # is refused with what there is
+        split.manifest(split.episode_ids[0], name)  # is refused with what there is
     own = ":" in config.simulator  # a simulator of one's own may serve any episodes
     for episode in dict.fromkeys(item.episode for item in items):
         recorded = split.query(episode).simulator
@@ -165,19 +161,14 @@ def check_plan(
                 f"{config.simulator!r}",
                 f"Give --simulator {recorded}, or a split of {config.simulator}.",
             )
-    if config.retrieval is None:
-        _check_positions(system, split, items)
-
-
-def _check_positions(system: System, split: Split, items: Sequence[WorkItem]) -> None:
-    """Refuse conditions with buffers that the system cannot number, all of them at once."""
-    planned = set(items)
-    longest: dict[str, int] = {}
-    for manifest in split.manifests() if system.position_limit is not None else ():
-        name = manifest.condition
-        if WorkItem(name, manifest.episode_id) in planned:
-            longest[name] = max(manifest.history_frames, longest.get(name, 0))
-    check_history(system, longest)
+    if system.position_limit is not None and config.retrieval is None:
+        planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
+        for manifest in split.manifests():
+            name = manifest.condition
+            if WorkItem(name, manifest.episode_id) in planned:
+                longest[name] = max(manifest.history_frames, longest[name])
+        check_history(system, longest)
+    return items
 
 
 def check_simulator(config: RunConfig, watched: Iterable[str], executor: Executor) -> None:

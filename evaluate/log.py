@@ -7,6 +7,7 @@ what is finished never runs again. The tables beside it are exported when a run 
 
 import json
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_
 from robomme_interference_data.errors import FormatError, RunFolderError, first_line
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.files import atomic_path, canonical_json, hold, write_json
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.records import FINAL, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
 __all__ = [
@@ -276,10 +277,8 @@ def is_done(row: Rollout) -> bool:
 
 def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
     """Count rows by status."""
-    counts = dict.fromkeys(map(str, (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)), 0)
-    for row in rows:
-        counts[row.status] += 1
-    return counts
+    counts = Counter(row.status for row in rows)
+    return {str(status): counts[status] for status in FINAL}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

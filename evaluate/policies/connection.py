@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
@@ -62,6 +62,7 @@ class ServerConnection:
         self.metadata: dict[str, Any] | None = None
         self._connect_s, self._response_s = connect_s, response_s
         self._connection: ClientConnection | None = None
+        self._stack = ExitStack()
         self._sent = b""
 
     @property
@@ -137,13 +138,12 @@ class ServerConnection:
 
     def close(self) -> None:
         """Close the connection, if there is one."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.close()
+        self._connection = None
+        self._stack.close()
 
     def _handshake(self, seconds: float) -> ClientConnection:
         key = os.environ.get(API_KEY_VARIABLE)
-        return connect(
+        connecting = connect(
             f"ws://{self.name}",
             additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
             open_timeout=seconds,
@@ -154,6 +154,7 @@ class ServerConnection:
             # A server that computes does not answer pings; `response_s` finds the dead ones.
             ping_interval=None,
         )
+        return self._stack.enter_context(connecting)
 
     def _refusal(self, reason: object) -> PolicyServerError:
         if reason in (http.HTTPStatus.UNAUTHORIZED, http.HTTPStatus.FORBIDDEN):

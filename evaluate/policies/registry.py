@@ -51,7 +51,7 @@ class PolicySpec:
 
     Attributes:
         kind: `websocket`, `lerobot`, `python`, or a built-in's name.
-        target: What follows the kind; of `replay` its memory rule, of other built-ins nothing.
+        target: What follows it; of `replay` the memory rule, of other built-ins nothing.
     """
 
     kind: str
@@ -88,18 +88,14 @@ def parse_policy(text: str) -> PolicySpec:
     spec = PolicySpec(kind, target)
     if not re.fullmatch(pattern, target, re.DOTALL) or bool(colon) > bool(target):
         raise InvalidOptionError.expected("policy", text, form)
-    ports = [port for _, port in spec.servers]
-    if len(set(spec.servers)) < len(ports) or not all(0 < port < 65536 for port in ports):
+    servers = spec.servers
+    if len(set(servers)) < len(servers) or not all(0 < port < 65536 for _, port in servers):
         raise InvalidOptionError.expected("policy", text, form)
     return spec
 
 
 def check_workers(spec: PolicySpec, workers: int) -> None:
-    """Refuse more workers than there are servers: a server holds the memory of one rollout.
-
-    Raises:
-        InvalidOptionError: There are fewer servers than workers.
-    """
+    """Refuse more workers than there are servers: a server holds the memory of one rollout."""
     if spec.kind == "websocket" and len(spec.servers) < workers:
         raise InvalidOptionError(
             f"{workers} workers need {workers} policy servers; {spec} names {len(spec.servers)}",

@@ -44,8 +44,12 @@ def test_the_history_is_the_buffer_in_chunks(chunk: int, tiny_split: Path) -> No
     assert {total for _, total in policy.chunks} == {144}
 
 
-def test_live_observations_come_once_each_in_chunks_of_16() -> None:
+@pytest.mark.parametrize("times", [1, 3])
+def test_live_observations_come_once_each_in_chunks_of_16(times: int) -> None:
+    """More than 16 actions are cut."""
     policy = Cheat()
+    hold = policy.act
+    policy.act = lambda o, g: np.tile(hold(o, g), (times, 1))  # type: ignore[method-assign]
     row = roll("no-history", policy)
     # The first one, then 16 and 16; the episode ends with the 40th step, in the third chunk.
     assert (row.steps, policy.live) == (40, [1, 16, 16])
@@ -57,14 +61,6 @@ def test_a_policy_may_ask_for_the_deciding_observations_only() -> None:
     roll("no-history", policy, simulator=world)
     assert policy.live == [1, 1, 1]
     assert world.drawn == 2  # after 16 and 32 steps; the 40th ends it
-
-
-def test_more_than_16_actions_are_cut() -> None:
-    policy = Cheat()
-    hold = policy.act
-    policy.act = lambda o, g: np.tile(hold(o, g), (3, 1))  # type: ignore[method-assign]
-    roll("no-history", policy)
-    assert policy.live == [1, 16, 16]
 
 
 def test_history_is_decoded_while_an_episode_in_another_process_begins(
@@ -159,14 +155,11 @@ def test_the_row_says_what_was_given(tiny_split: Path) -> None:
     assert row.wall_s is not None and row.wall_s >= (row.reset_s or 0) + (row.policy_s or 0) - 0.01
 
 
-def test_a_rollout_times_out_after_1300_steps(trouble: Path) -> None:
+def test_the_oracle_gets_the_simulator_and_a_rollout_times_out(trouble: Path) -> None:
+    assert roll("k1", Privileged("oracle")).status == "success"
     (trouble / "MoveCube-0").write_text("endless")
     row = roll("no-history", Cheat())
     assert (row.status, row.success, row.steps) == ("timeout", False, 1300)
-
-
-def test_the_oracle_gets_the_simulator() -> None:
-    assert roll("k1", Privileged("oracle")).status == "success"
 
 
 # --- policies and simulators that break --------------------------------------------------------

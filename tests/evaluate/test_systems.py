@@ -1,8 +1,6 @@
 """The table of systems: the paper's grid, its conditions, and names that do not pretend."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
 from robomme_interference_data.evaluate.systems import (
@@ -10,7 +8,6 @@ from robomme_interference_data.evaluate.systems import (
     SYSTEMS,
     base_of,
     check_history,
-    display_name,
     name_system,
 )
 
@@ -83,13 +80,3 @@ def test_own_names_do_not_pretend(name: str, system: str) -> None:
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(InvalidIdError, match="is not the name of a system"):
         name_system(name)
-
-
-@given(st.text(max_size=30))
-def test_any_text_is_a_system_or_a_clear_error(name: str) -> None:
-    try:
-        system = name_system(name)
-    except (InvalidIdError, UnknownNameError):
-        return
-    assert system.name == name
-    assert display_name(name) == system.display
