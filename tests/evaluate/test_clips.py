@@ -1,14 +1,13 @@
 """Clips of rollouts: what they show is what was given, and what fails in them harms no rollout."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import av
 import numpy as np
 import pytest
-from support.runs import EPISODE, config, roll
-from support.worlds import Cheat, World
+from support.runs import EPISODE, config
+from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.encode import VideoEncoder
@@ -83,32 +82,6 @@ def test_the_history_is_what_was_given(start: int, stop: int, buffer: Buffer) ->
             np.testing.assert_array_equal(picture[y : y + 28, x : x + 28], small)
     sessions = [0] * 48 + [1] * 32
     assert found == sessions[start:stop] + [None] * (64 - (stop - start))
-
-
-@pytest.mark.parametrize(
-    ("condition", "selector", "begun"),
-    [
-        ("no-history", None, (0, 0, 0)),
-        ("k1", None, (80, 0, 80)),
-        ("k3", (48, 80), (144, 48, 80)),
-    ],
-)
-def test_a_clip_is_told_what_the_policy_is_given(
-    condition: str, selector: Any, begun: tuple[int, int, int]
-) -> None:
-    notes: list[tuple[int, int, int]] = []
-    clip = SimpleNamespace(
-        begin=lambda buffer, start, stop, *_: notes.append((len(buffer), start, stop)),
-        step=lambda *_: None,
-    )
-    if selector is not None:
-        shares = dict.fromkeys(("lesson_fraction", "filler_fraction", "query_fraction"), 0.0)
-        chosen = SimpleNamespace(start=selector[0], stop=selector[1], **shares)
-        selector = SimpleNamespace(name="one", camera="front", select=lambda *_: chosen)
-    policy = Cheat()
-    roll(condition, policy, clip=clip, selector=selector)
-    assert notes == [begun]
-    assert len(policy.states) == begun[2] - begun[1]
 
 
 def test_names_goal_and_length_of_the_history_are_on_the_picture(
