@@ -11,8 +11,9 @@ if __name__ == "__main__":  # worker processes import the script
 ```
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.config import RunConfig
@@ -30,11 +31,4 @@ __all__ = [
     "run_evaluation",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is asked for: the command line imports this package first."""
-    homes = {"RunConfig": "config", "merge_runs": "merge", "Merged": "merge"}
-    homes |= {"Policy": "policies.base", "RolloutInfo": "policies.base"}
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{homes.get(name, 'run')}"), name)
+__getattr__ = lazily(__name__, ".config", ".policies.base", ".merge", ".run")

@@ -15,11 +15,6 @@ STATE_TOLERANCE = 0.01
 """How far, rad or m, the first live state may be from the recorded one: on another machine floating
 point differs in its last bits, and an episode of another version of the suite by more."""
 
-_OTHER_VERSION = (
-    "The dataset was recorded with another version of the simulator: build it again, or install "
-    "the version that recorded it."
-)
-
 
 def check_episode(
     query: Query, played: Demonstration, first: Observation, info: EpisodeInfo
@@ -32,26 +27,29 @@ def check_episode(
     Raises:
         RolloutError: One of them does not.
     """
-    compared: list[tuple[str, Any, Any]] = [
-        ("seed", query.seed, info.seed),
-        ("difficulty", query.difficulty, info.difficulty),
-        ("length of the demonstration", query.lesson_frames, len(played)),
+    compared: dict[str, tuple[Any, Any]] = {
+        "seed": (query.seed, info.seed),
+        "difficulty": (query.difficulty, info.difficulty),
+        "length of the demonstration": (query.lesson_frames, len(played)),
         # Any of its wordings: which one comes first may depend on the source.
-        ("goal", query.goal, query.goal if query.goal in info.goals else info.goal),
+        "goal": (query.goal, query.goal if query.goal in info.goals else info.goal),
+    }
+    wrong = [
+        f"{name} is {recorded!r} in the dataset, {given!r} in the simulator"
+        for name, (recorded, given) in compared.items()
+        if recorded is not None and recorded != given
     ]
-    for name, recorded, given in compared:
-        if recorded is not None and recorded != given:
-            raise RolloutError(
-                f"{query.episode_id}: {name} is {recorded!r} in the dataset, {given!r} in the "
-                "simulator",
-                _OTHER_VERSION,
-            )
     apart = float(np.abs(query.state() - first.state).max())
     if not apart <= STATE_TOLERANCE:
+        wrong.append(
+            f"the first live state is {apart:.4f} away from the recorded one; expected at most "
+            f"{STATE_TOLERANCE}"
+        )
+    if wrong:
         raise RolloutError(
-            f"{query.episode_id}: the first live state is {apart:.4f} away from the recorded one; "
-            f"expected at most {STATE_TOLERANCE}",
-            _OTHER_VERSION,
+            f"{query.episode_id}: {'; '.join(wrong)}",
+            "The dataset was recorded with another version of the simulator: build it again, or "
+            "install the version that recorded it.",
         )
 
 

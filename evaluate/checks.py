@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -15,14 +15,14 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.clips import check_drawing
-from robomme_interference_data.evaluate.config import FRONT_CAMERA, MAX_RULE, RunConfig
-from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
 from robomme_interference_data.evaluate.systems import (
     SYSTEMS,
     System,
-    check_condition,
+    base_of,
     check_history,
     name_system,
 )
@@ -36,13 +36,7 @@ from robomme_interference_data.simulators.registry import (
 )
 from robomme_interference_data.split import Split
 
-__all__ = [
-    "applicable",
-    "check_plan",
-    "check_settings",
-    "check_simulator",
-    "default_system",
-]
+__all__ = ["applicable", "check_plan", "check_settings", "check_simulator", "default_system"]
 
 
 def default_system(config: RunConfig) -> str:
@@ -67,9 +61,7 @@ def default_system(config: RunConfig) -> str:
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", spec.target).strip("-")
     if config.retrieval is None:
         return name
-    step = ((config.retrieval_rule, MAX_RULE), (config.retrieval_camera, FRONT_CAMERA))
-    unusual = [value.replace("/", "-") for value, usual in step if value != usual]
-    return "-".join(("retrieval", name, *unusual))
+    return "-".join(("retrieval", name, *_unusual(config).values())).replace("/", "-")
 
 
 def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
@@ -95,18 +87,23 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
             "Run it on --simulator tabletop, or take another policy.",
         )
     Rule.parse(config.retrieval_rule)
-    for name, usual in (("retrieval_rule", MAX_RULE), ("retrieval_camera", FRONT_CAMERA)):
-        if config.retrieval is None and getattr(config, name) != usual:
-            raise InvalidOptionError(
-                f"--{name.replace('_', '-')} says nothing without a retrieval step",
-                "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
-            )
+    for name in _unusual(config) if config.retrieval is None else ():
+        raise InvalidOptionError(
+            f"--{name.replace('_', '-')} says nothing without a retrieval step",
+            "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
+        )
     _check_name(config, name_system(system))
     if config.videos:
         check_drawing()
     for camera in policy.history_cameras:
         if camera not in split.cameras:
             raise UnknownNameError.among("camera", camera, split.root, split.cameras)
+
+
+def _unusual(config: RunConfig) -> dict[str, str]:
+    """Return in what the retrieval step is not the paper's: setting to value."""
+    step = {name: getattr(config, name) for name in ("retrieval_rule", "retrieval_camera")}
+    return {name: value for name, value in step.items() if value != getattr(RunConfig, name)}
 
 
 def _check_name(config: RunConfig, system: System) -> None:
@@ -129,11 +126,8 @@ def _check_name(config: RunConfig, system: System) -> None:
     elif system.retrieval != step:
         has, given = ("a", "none is given") if system.retrieval else ("no", "one is given")
         why = f"system {system.name} has {has} retrieval step, and {given} (--retrieval)"
-    elif step and Rule.parse(config.retrieval_rule).method != MAX_RULE:
-        why = (
-            f"the retrieval step of {system.name} chooses by {MAX_RULE}, not by "
-            f"{config.retrieval_rule}"
-        )
+    elif step and Rule.parse(config.retrieval_rule).method != "max":
+        why = f"the retrieval step of {system.name} chooses by max, not by {config.retrieval_rule}"
     if why is not None:
         raise InvalidOptionError(why, "Give --system a name of your own: see docs/systems.md.")
 
@@ -144,24 +138,20 @@ def applicable(system: System, split: Split, policy: Policy) -> tuple[str, ...]:
 
 
 def check_plan(
-    config: RunConfig,
-    system: System,
-    split: Split,
-    policy: Policy,
-    items: Sequence[WorkItem],
-) -> None:
-    """Check every planned rollout.
+    config: RunConfig, system: System, split: Split, policy: Policy, plan: Plan
+) -> tuple[WorkItem, ...]:
+    """Check every rollout of a plan, and return them.
 
     Raises:
         InvalidOptionError: A condition does not apply, or the split is of another simulator.
         UnknownNameError: The split has no buffers for a condition.
         HistoryTooLongError: A buffer exceeds the system's position limit.
     """
-    conditions = tuple(dict.fromkeys(item.condition for item in items))
-    for name in conditions:
+    items = plan.items()
+    for name in plan.conditions:
         if (refusal := _refusal(system, policy, name)) is not None:
             raise refusal
-        split.manifest(items[0].episode, name)  # is refused with what there is
+        split.manifest(split.episode_ids[0], name)  # is refused with what there is
     own = ":" in config.simulator  # a simulator of one's own may serve any episodes
     for episode in dict.fromkeys(item.episode for item in items):
         recorded = split.query(episode).simulator
@@ -171,30 +161,20 @@ def check_plan(
                 f"{config.simulator!r}",
                 f"Give --simulator {recorded}, or a split of {config.simulator}.",
             )
-    if config.retrieval is None:
-        _check_positions(system, split, items)
-
-
-def _check_positions(system: System, split: Split, items: Sequence[WorkItem]) -> None:
-    """Refuse conditions with buffers that the system cannot number, all of them at once."""
-    planned = set(items)
-    longest: dict[str, int] = {}
-    for manifest in split.manifests() if system.position_limit is not None else ():
-        name = manifest.condition
-        if WorkItem(name, manifest.episode_id) in planned:
-            longest[name] = max(manifest.history_frames, longest.get(name, 0))
-    check_history(system, longest)
+    if system.position_limit is not None and config.retrieval is None:
+        planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
+        for manifest in split.manifests():
+            name = manifest.condition
+            if WorkItem(name, manifest.episode_id) in planned:
+                longest[name] = max(manifest.history_frames, longest[name])
+        check_history(system, longest)
+    return items
 
 
 def check_simulator(config: RunConfig, watched: Iterable[str], executor: Executor) -> None:
     """Make the simulator once, by the executor, as a broken driver may end its process.
 
     One of the user's own is made by the workers only.
-
-    Args:
-        config: The settings.
-        watched: Cameras that the policy wants.
-        executor: Who makes it.
 
     Raises:
         NoRendererError: This machine cannot draw its pictures.
@@ -221,13 +201,15 @@ def _make_once(name: str, options: dict[str, Any], worker: Worker) -> None:
 
 def _refusal(system: System, policy: Policy, condition: str) -> InterferenceError | None:
     """Return why a condition does not apply, or None."""
-    try:
-        check_condition(system, condition)
-    except InvalidOptionError as error:
-        return error
-    if condition != NO_HISTORY and not policy.wants_history:
+    if condition != NO_HISTORY and not (system.with_history and policy.wants_history):
+        who = "the policy" if system.with_history else system.name
         return InvalidOptionError(
-            f"the policy takes no history, so {condition} says nothing of it",
+            f"{who} takes no history, so {condition} says nothing of it",
             f"Give --conditions {NO_HISTORY}.",
+        )
+    if not system.applies(condition):
+        return InvalidOptionError(
+            f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
+            f"Run {base_of(system.name)} under {NO_HISTORY}: there the two are the same system.",
         )
     return None

@@ -85,16 +85,8 @@ def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
 class Clip:
     """Draws a rollout as it goes, 10 pictures a second, and has them encoded at once.
 
-    What goes wrong with the clip never reaches the rollout: it is kept as `problem`, and there is
-    no clip.
-
-    Args:
-        folder: The run's folder; a clip of an earlier attempt is removed from it.
-        item: The rollout.
-        system: Name of the system.
-
-    Attributes:
-        problem: Traceback of what went wrong, or None.
+    What goes wrong with the clip never reaches the rollout: its traceback is kept as `problem`,
+    and there is no clip. One of an earlier attempt is removed from the run's folder.
     """
 
     def __init__(self, folder: Path, item: WorkItem, system: str):
@@ -115,15 +107,7 @@ class Clip:
     def begin(
         self, buffer: Buffer, start: int, stop: int, first: Observation, info: EpisodeInfo
     ) -> None:
-        """Take what is known before the first step.
-
-        Args:
-            buffer: The buffer that the condition prescribes.
-            start: First of its frames that the policy is given.
-            stop: Frame after the last one.
-            first: The first live observation.
-            info: The episode.
-        """
+        """Take what is known before the first step; of the buffer the policy got `start:stop`."""
         self._goal = info.goal
         self._given = f"history given: {stop - start} frames" if stop > start else "no history"
         self._history = history_picture(buffer, start, stop)
@@ -145,10 +129,6 @@ class Clip:
         """Hold the end for a second, and give the clip its name.
 
         There is none of a rollout that broke before its first observation.
-
-        Args:
-            status: How the rollout ended.
-            error: What broke, or None.
         """
         if self._encoder is not None:
             picture = self._picture(status, error=error)
@@ -178,18 +158,12 @@ class Clip:
 
 
 def history_picture(buffer: Buffer, start: int, stop: int) -> NDArray[np.uint8]:
-    """Return 64 frames of a span of a history, evenly spread, as `(256, 256, 3) uint8`.
+    """Return 64 frames from `start` to `stop` (excluded), evenly spread, `(256, 256, 3) uint8`.
 
     Each has a line under it in the colour of its session, the lesson's as in the film strip.
-
-    Args:
-        buffer: The history.
-        start: First frame.
-        stop: Frame after the last one; `start` for a white picture.
+    Without frames the picture is white.
     """
     picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
-    if stop == start:
-        return picture
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
     for place, index in enumerate(spread(start, stop, _COLUMNS * _COLUMNS)):
         y, x = (_THUMB * part for part in divmod(place, _COLUMNS))

@@ -9,10 +9,7 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import Rollout
 from robomme_interference_data.settings import setting
 
-__all__ = ["FRONT_CAMERA", "MAX_RULE", "Run", "RunConfig"]
-
-MAX_RULE, FRONT_CAMERA = "max", "front"
-"""The paper's rule of the retrieval step, and the camera that it looks at."""
+__all__ = ["Run", "RunConfig"]
 
 
 @dataclass(frozen=True)
@@ -45,9 +42,9 @@ class RunConfig:
     retrieval: str | None = setting(
         None, help="Put a retrieval step with this encoder in front of the policy."
     )
-    retrieval_rule: str = setting(MAX_RULE, help="METHOD or METHOD/CUT, as for retrieval-score.")
+    retrieval_rule: str = setting("max", help="METHOD or METHOD/CUT, as for retrieval-score.")
     retrieval_camera: str = setting(
-        FRONT_CAMERA, help="Camera whose frames the retrieval step compares."
+        "front", help="Camera whose frames the retrieval step compares."
     )
     robomme_python: str | None = setting(
         None, help="Interpreter that has RoboMME.", env="ROBOMME_PYTHON"

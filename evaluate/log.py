@@ -1,11 +1,13 @@
 """The folder of a run: one record, a line a rollout, and what was asked of it in `run.json`.
 
 A line of `rollouts.jsonl` is on the disk before the next rollout is counted; one that a crash cut
-short is dropped, and only that one. The tables beside it are exported when a run ends.
+short is dropped, and only that one. Of a rollout that broke and ran again, the last row counts;
+what is finished never runs again. The tables beside it are exported when a run ends.
 """
 
 import json
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,7 +21,7 @@ from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_
 from robomme_interference_data.errors import FormatError, RunFolderError, first_line
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.files import atomic_path, canonical_json, hold, write_json
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.records import FINAL, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "open_log",
     "read_record",
     "read_run",
+    "whole_lines",
 ]
 
 ERRORS_LOG = "errors.log"
@@ -40,15 +43,12 @@ ERRORS_LOG = "errors.log"
 
 @dataclass(frozen=True)
 class Start:
-    """One start of the command.
+    """One start of the command: its settings, what was asked for, and where it ran.
 
     Attributes:
         command: The command line; empty from Python.
-        settings: All settings.
-        plan: What was asked for.
         versions: Of Python, this package, what it used, and the simulator.
         git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
-        machine: Kind of processor.
         policy: What the policy said of itself.
         started: When, UTC, `2026-01-31T12:00:00Z`.
         ended: When; None while it runs, or if it was killed.
@@ -72,14 +72,12 @@ class RunHeader:
     """`run.json`.
 
     Attributes:
-        format_version: Of the files.
         identity: What can change a result: it makes the run the one that it is.
         split: Label of the split in all rows.
         plans: What was asked for, each plan once.
         status: `running`; or `complete` or, if something is missing or broke, `incomplete`.
         planned: Rollouts that were asked for by all plans together.
         counts: Rows by status.
-        starts: Each start of the command.
         merged: Names of the folders that a joined run is made of.
     """
 
@@ -108,13 +106,7 @@ class RunHeader:
 
 
 class RunLog:
-    """A run's folder that is written; made by `open_log`.
-
-    Attributes:
-        folder: The folder.
-        header: What `run.json` holds.
-        rows: The last row of each rollout.
-    """
+    """A run's folder that is written, see `open_log`; `rows` has the row that counts of each."""
 
     def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
         self.folder, self.header, self.rows = folder, header, rows
@@ -207,8 +199,7 @@ def open_log(
             )
         header, rows = read_run(folder)
         check_same_run(folder, header.identity, identity)
-        with (folder / RUN_RECORD).open("r+b") as file:
-            file.truncate(file.read().rfind(b"\n") + 1)
+        os.truncate(folder / RUN_RECORD, len(whole_lines(folder / RUN_RECORD)))
         yield RunLog(folder, header, rows)
 
 
@@ -230,9 +221,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
 
 
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:
-    """Read a run's record: the last row of each rollout; empty where there is none.
-
-    A last line without an end, which a crash can leave, is not read.
+    """Read a run's record: the row that counts of each rollout; empty where there is none.
 
     Raises:
         FormatError: A line is damaged, or a finished rollout has two rows.
@@ -241,7 +230,7 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
     rows: dict[WorkItem, Rollout] = {}
     if not path.exists():
         return rows
-    for number, line in enumerate(path.read_bytes().split(b"\n")[:-1], 1):
+    for number, line in enumerate(whole_lines(path).splitlines(), 1):
         try:
             row = from_dict(Rollout, json.loads(line), "its fields", strict=True)
             item = WorkItem.of(row)
@@ -254,6 +243,12 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
             ) from None
         rows[item] = row
     return rows
+
+
+def whole_lines(record: Path) -> bytes:
+    """Return a record's bytes, without a last line that a crash cut short."""
+    data = record.read_bytes()
+    return data[: data.rfind(b"\n") + 1]
 
 
 def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
@@ -282,10 +277,8 @@ def is_done(row: Rollout) -> bool:
 
 def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
     """Count rows by status."""
-    counts = dict.fromkeys(map(str, (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)), 0)
-    for row in rows:
-        counts[row.status] += 1
-    return counts
+    counts = Counter(row.status for row in rows)
+    return {str(status): counts[status] for status in FINAL}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

@@ -28,8 +28,7 @@ class Merged:
     """What joining came to; all in canonical order.
 
     Attributes:
-        folder: The joined run.
-        rows: Its rows, errors among them.
+        rows: Rows of the joined run, errors among them.
         planned: Rollouts that the shards together were to run.
         missing: Planned rollouts without a row.
         broken: Rollouts whose row is an error.
@@ -51,10 +50,6 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
 
     A finished row stands before an error. Videos and `errors.log` come along. The split's label
     in rows is the first run's; by its revision it is the same split in all.
-
-    Args:
-        shards: Folders of runs.
-        out: Folder of the joined run, new.
 
     Raises:
         RunFolderError: A folder holds no run, or another one than the first; `out` is taken.

@@ -20,9 +20,7 @@ _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 class WorkItem:
     """One rollout: within a run, the key of its row.
 
-    Attributes:
-        condition: Name of the condition, such as `k3`.
-        episode: The query episode.
+    They sort in the canonical order, by episode and condition.
 
     Raises:
         InvalidIdError: There is no such condition.
@@ -43,12 +41,11 @@ class WorkItem:
         return f"{self.episode} under {self.condition}"
 
     def __lt__(self, other: "WorkItem") -> bool:
-        return self._place < other._place
-
-    @property
-    def _place(self) -> tuple[object, ...]:
-        """Place in the canonical order: by episode and condition."""
-        return self.episode.sort_key, parse_condition(self.condition).sort_key
+        mine, others = (
+            (item.episode.sort_key, parse_condition(item.condition).sort_key)
+            for item in (self, other)
+        )
+        return mine < others
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class Plan:
     Attributes:
         episodes: Family and split of the query episodes, such as `MoveCube/test`, to their
             numbers, such as `0-49`.
-        conditions: Names of the conditions.
+        conditions: Names.
         shard: The part of them that is run: `2/8` is the second of eight.
 
     Raises:
@@ -104,15 +101,7 @@ def plan_work(
     episode_split: str = "test",
     shard: str = "1/1",
 ) -> Plan:
-    """Return the plan of a run.
-
-    Args:
-        known: Query episodes of the split.
-        conditions: Which conditions.
-        families: Which families; empty for all.
-        episodes: Their numbers, such as `0-49`; None for all that are there.
-        episode_split: `train`, `val` or `test`.
-        shard: The part to run, such as `2/8`.
+    """Return the plan of a run over the query episodes of a split: `known`; see `RunConfig`.
 
     Raises:
         InvalidIdError: A condition is none.
@@ -133,11 +122,10 @@ def plan_work(
         numbers, group = here[family], f"{family}/{episode_split}"
         missing = sorted(set(asked or ()) - set(numbers))
         if missing or (families and not numbers):
-            has = f"It has {format_numbers(numbers)} of {group}." if numbers else ""
             raise UnknownNameError(
                 f"the split has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                has or f"It has no {episode_split} episode of {family}: see --episode-split.",
+                f"It has {format_numbers(numbers) or 'none'} of {group}: see --episode-split.",
             )
         if numbers:
             chosen[group] = format_numbers(asked or numbers)

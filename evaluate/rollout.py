@@ -22,11 +22,7 @@ from robomme_interference_data.evaluate.systems import check_history, name_syste
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.sampling import lesson_frames, lesson_share
-from robomme_interference_data.simulators.base import (
-    Observation,
-    Simulator,
-    action_array,
-)
+from robomme_interference_data.simulators.base import Observation, Simulator, action_array
 from robomme_interference_data.split import Split
 
 if TYPE_CHECKING:
@@ -66,16 +62,6 @@ def run_rollout(
     The policy never gets what the simulator returns of the demonstration: its history comes from
     the dataset, and is what the condition says (protocol, rules 2 and 6).
 
-    Args:
-        run: The run.
-        item: Which rollout.
-        simulator: Plays the episode.
-        policy: Acts.
-        split: Has the history.
-        selector: The retrieval step, or None.
-        clip: Gets the pictures, or None.
-        worker: Keeps the simulator's time limit; None for none.
-
     Raises:
         RolloutError: Simulator and dataset speak of different episodes.
         HistoryTooLongError: What retrieval chose exceeds the system's position limit.
@@ -83,7 +69,7 @@ def run_rollout(
         SimulatorCrashError: The simulator broke.
     """
     config, clock, began = run.config, _Clock(), time.perf_counter()
-    worker = worker or Worker(0)
+    worker = worker or Worker(0)  # no time limit
     buffer = split.load(item.episode, item.condition)
     chosen: Selection | None = None
     start, stop = 0, len(buffer)
@@ -109,14 +95,8 @@ def run_rollout(
         with clock.part("history_s"):
             if history is None:
                 history = stack.enter_context(_decode(buffer, start, stop, policy, run))
-            policy.reset(
-                RolloutInfo(
-                    info.goal,
-                    stop - start,
-                    config.model_seed,
-                    simulator if policy.privileged else None,
-                )
-            )
+            own = simulator if policy.privileged else None
+            policy.reset(RolloutInfo(info.goal, stop - start, config.model_seed, own))
             for chunk in history:
                 policy.add_history(chunk.frames, chunk.states, stop - start)
     status, steps = _act(run, policy, simulator, first, info.goal, clock, clip, worker)
@@ -205,13 +185,12 @@ def _decode(
 def read_ahead[T](items: Generator[T], depth: int) -> Iterator[Iterator[T]]:
     """Make the first items of a stream at once, and the next ones while the others are used.
 
-    Args:
-        items: The stream; it is closed at the end, read to its end or not. No item is None.
-        depth: Items that are made ahead at most, 1 or more: so many wait in memory.
+    What it gives yields the items in order; an error in making one is raised where that item
+    would have come. The stream is closed at the end, read to its end or not.
 
-    Returns:
-        A context manager; what it gives yields the items in order. An error in making one is
-        raised where that item would have come.
+    Args:
+        items: The stream; no item is None.
+        depth: Items that are made ahead at most, 1 or more: so many wait in memory.
     """
     pool = ThreadPoolExecutor(1, "read-ahead")  # one thread: a stream is made in its order
     made = deque(pool.submit(next, items, None) for _ in range(depth))

@@ -56,7 +56,6 @@ class RunResult:
     """What a run came to.
 
     Attributes:
-        folder: The run's folder.
         rows: Rows of all rollouts that were asked for and have ended, in canonical order.
         planned: Rollouts that were asked for.
         counts: Rows by status.
@@ -75,11 +74,9 @@ class Listener(Protocol):
 
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Take what was asked for, and the rows that an earlier run finished."""
-        ...
 
     def row(self, row: Rollout) -> None:
         """Take a row that has just been written."""
-        ...
 
 
 def run_evaluation(
@@ -128,8 +125,7 @@ def run_evaluation(
         episode_split=config.episode_split,
         shard=config.shard,
     )
-    items = plan.items()
-    check_plan(config, system, split, policy, items)
+    items = check_plan(config, system, split, policy, plan)
     executor = executor or Processes(config.workers)
     there = read_record(folder)
     if any(item not in there or not is_done(there[item]) for item in items):
@@ -151,13 +147,12 @@ def _roll_out(
     executor: Executor,
     listener: Listener | None,
 ) -> RunResult:
-    done = [log.rows[item] for item in items if item in log.rows and is_done(log.rows[item])]
-    finished = set(map(WorkItem.of, done))
+    done = {item: row for item, row in log.rows.items() if is_done(row)}
     if listener is not None:
-        listener.start(items, done)
+        listener.start(items, [done[item] for item in items if item in done])
     outcomes = executor.run(
         RolloutTask(run, log.folder),
-        shuffle_work(item for item in items if item not in finished),
+        shuffle_work(item for item in items if item not in done),
         time_limit=run.config.rollout_timeout,
         again=(SimulatorCrashError,),
     )

@@ -13,19 +13,13 @@ from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
-from robomme_interference_data.errors import (
-    HistoryTooLongError,
-    InvalidIdError,
-    InvalidOptionError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
 
 __all__ = [
     "PAPER_SYSTEMS",
     "SYSTEMS",
     "System",
     "base_of",
-    "check_condition",
     "check_history",
     "display_name",
     "is_bound",
@@ -173,35 +167,10 @@ def is_bound(name: str) -> bool:
     return name in SYSTEMS and SYSTEMS[name].bound
 
 
-def check_condition(system: System, condition: str) -> None:
-    """Refuse a condition that does not apply to a system.
-
-    Args:
-        system: The system.
-        condition: Its name.
-
-    Raises:
-        InvalidOptionError: The condition does not apply.
-    """
-    if system.applies(condition):
-        return
-    if condition == NO_HISTORY:
-        raise InvalidOptionError(
-            f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
-            f"Run {base_of(system.name)} under {NO_HISTORY}: there the two are the same system.",
-        )
-    raise InvalidOptionError(
-        f"{system.name} has no memory: {condition} does not apply",
-        f"Run it under {NO_HISTORY} only.",
-    )
-
-
 def check_history(system: System, frames: Mapping[str, int]) -> None:
     """Refuse histories that, with a whole rollout after them, exceed the system's positions.
 
-    Args:
-        system: The system.
-        frames: Number of history frames by condition: the most there are.
+    `frames` has the longest history of each condition.
 
     Raises:
         HistoryTooLongError: With 1300 steps, some are more than `position_limit`; names them all.

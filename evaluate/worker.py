@@ -30,11 +30,7 @@ class RolloutTask:
     """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.
 
     What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
-    that broke is used again.
-
-    Args:
-        run: The run.
-        folder: Its folder, for clips.
+    that broke is used again. Clips go into the run's folder.
     """
 
     def __init__(self, run: Run, folder: Path):
@@ -101,11 +97,7 @@ class RolloutTask:
         self._policy = self._simulator = None
 
     def _check_server(self, worker: Worker) -> None:
-        """See whether the policy's server is still there: without it nothing can be done here.
-
-        Raises:
-            WorkerRetiredError: It is not.
-        """
+        """Retire the worker unless the policy's server is still there."""
         config = self._run.config
         policy = make_policy(config.policy, config.policy_options, worker=worker.number)
         try:
@@ -117,12 +109,7 @@ class RolloutTask:
 
 
 def make_selector(config: RunConfig) -> "Selector | None":
-    """Make the retrieval step of a run, None if it has none.
-
-    Raises:
-        UnknownNameError, InvalidOptionError, MissingExtraError, MissingWeightsError, FormatError:
-            See `Selector`.
-    """
+    """Make the retrieval step of a run, None if it has none; see `Selector` for its errors."""
     if config.retrieval is None:
         return None
     from robomme_interference_data.retrieval.selector import Selector
@@ -133,9 +120,7 @@ def make_selector(config: RunConfig) -> "Selector | None":
 def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, Any]:
     """Return the options of a run's simulator: it draws only what somebody looks at.
 
-    Args:
-        config: The settings.
-        watched: Cameras that the policy wants.
+    `watched` has the cameras that the policy wants.
     """
     wanted = {*watched}
     if config.retrieval is not None:

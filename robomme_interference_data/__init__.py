@@ -8,8 +8,9 @@ buffer.frames("front")  # (T, H, W, 3) uint8
 ```
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
     from robomme_interference_data.buffer import Buffer, Chunk
@@ -50,24 +51,8 @@ __all__ = [
     "InterferenceError",
 ]
 
-_MODULES = (
-    "split",
-    "buffer",
-    "cache",
-    "query",
-    "records",
-    "ids",
-    "conditions",
-    "dataset",
-    "errors",
+__getattr__ = lazily(
+    __name__,
+    *(".split", ".buffer", ".cache", ".query", ".records", ".ids"),
+    *(".conditions", ".dataset", ".errors"),
 )
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is used: the command line and workers need few of them."""
-    if name in __all__:
-        for module in _MODULES:
-            found = import_module(f"{__name__}.{module}")
-            if name in found.__all__:
-                return getattr(found, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

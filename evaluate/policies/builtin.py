@@ -1,20 +1,159 @@
-"""The built-in policies that ask the simulator, or do nothing: the benchmark's ends."""
+"""The built-in policies, none with learned weights: the benchmark's controls."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION_CHUNK
-from robomme_interference_data.errors import PolicyError
-from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
+from robomme_interference_data.constants import ACTION_CHUNK, SAMPLE_FRAMES
+from robomme_interference_data.errors import PolicyError, UnknownNameError
+from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
+from robomme_interference_data.sampling import even_sample
 from robomme_interference_data.simulators.base import Observation, Simulator
 
-__all__ = ["Hold", "Privileged"]
+__all__ = ["MEMORIES", "Hold", "Privileged", "ReplayPolicy", "follow"]
+
+MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
+    "full": range,
+    "framesamp": lambda live: even_sample(live)[:-1],
+    "window": lambda live: range(max(0, live - SAMPLE_FRAMES + 1), live),
+}
+"""Memory rule: which frames it keeps when the live observation has index `live`, itself apart.
+
+`full` keeps all; `framesamp` all while they are fewer than 32 with the live one, else those of
+the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last 32.
+"""
+
+THUMBNAIL = 16
+"""Side of the small image by which frames are compared."""
+
+MAX_MOVE = 0.08
+"""Most that a joint target moves from one step to the next, rad."""
+
+GRIP_CHANGE = 5e-4
+"""Way of a finger, m, from one kept frame to the next that counts as closing or opening."""
+
+GRIP_STEPS = 5
+"""Steps to wait for the gripper where frames between two kept ones are missing."""
+
+
+class ReplayPolicy(Policy):
+    """`replay`: a memory.
+
+    It keeps what its memory rule lets it keep of the frames that it was given, takes up the
+    trajectory at the kept frame that looks most like the first live view, and follows the states
+    that come after it; at their end, it holds. It knows nothing of sessions, families or answers,
+    so its success tells only whether the right frames are still in memory.
+
+    Args:
+        memory: `full`, `framesamp` or `window`.
+
+    Raises:
+        UnknownNameError: There is no such memory rule.
+    """
+
+    cameras = ("front",)
+    history_cameras = ("front",)
+
+    def __init__(self, memory: str = "full"):
+        if memory not in MEMORIES:
+            raise UnknownNameError.among("memory", memory, "replay", MEMORIES)
+        self.memory = memory
+
+    def reset(self, info: RolloutInfo) -> None:
+        """Forget everything."""
+        self._views: list[NDArray[np.float32]] = []
+        self._states: list[NDArray[np.float32]] = []
+        self._plan: NDArray[np.float32] | None = None
+        self._done = 0
+
+    def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
+        """Take frames into memory. What the rule keeps depends on how many follow."""
+        self._views.append(thumbnails(frames["front"]))
+        self._states.append(np.array(states, np.float32))
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the next 16 targets of the trajectory, `(16, 8) float32`."""
+        if self._plan is None:
+            self._plan = self._take_up(observation)
+        steps = np.arange(self._done, self._done + ACTION_CHUNK)
+        self._done += ACTION_CHUNK
+        return self._plan[np.minimum(steps, len(self._plan) - 1)]
+
+    def metadata(self) -> dict[str, Any]:
+        """Return name and memory rule."""
+        return {"policy": "replay", "memory": self.memory}
+
+    def _take_up(self, observation: Observation) -> NDArray[np.float32]:
+        live = sum(len(states) for states in self._states)
+        kept = np.array(MEMORIES[self.memory](live), np.int64)
+        if not len(kept):
+            return follow(observation.state, kept, observation.state[None][:0])
+        views = np.concatenate(self._views)[kept]
+        view = thumbnails(observation.images["front"][None])
+        # The first of equals: the one with most of a trajectory after it.
+        nearest_view = int(np.argmin(((views - view) ** 2).mean(axis=(1, 2, 3))))
+        kept = kept[nearest_view:]
+        return follow(observation.state, kept, np.concatenate(self._states)[kept])
+
+
+def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the mean colours of 16×16 tiles, `(T, 16, 16, 3) float32`.
+
+    Args:
+        frames: `(T, H, W, 3) uint8`, H and W at least 16; what does not fill a tile is left out.
+    """
+    count, height, width, _ = frames.shape
+    tall, wide = height // THUMBNAIL, width // THUMBNAIL
+    cut = frames[:, : tall * THUMBNAIL, : wide * THUMBNAIL]
+    tiles = cut.reshape(count, THUMBNAIL, tall, THUMBNAIL, wide, 3)
+    return tiles.mean(axis=(2, 4), dtype=np.float32)
+
+
+def follow(
+    now: NDArray[np.float32], kept: NDArray[np.int64], states: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return joint targets that go through states at the pace at which they were seen.
+
+    Between two kept frames the targets are interpolated, one step for each frame that lies
+    between; more where a joint would move over 0.08 rad in a step. The gripper closes when the
+    way of its finger shrinks, opens when it grows, and else stays.
+
+    Args:
+        now: Present state, `(8,) float32`.
+        kept: Indices of the frames, `(n,) int64`, ascending.
+        states: Their states, `(n, 8) float32`.
+
+    Returns:
+        `(m, 8) float32`, m at least 1: 7 joint targets in rad, gripper −1 closed or 1 open.
+    """
+    grip = 1.0 if now[7] > 0.02 else -1.0
+    targets = [np.append(now[:7], np.float32(grip))]
+    at, index = now, None
+    for state, seen in zip(states, kept.tolist(), strict=True):
+        frames = 1 if index is None else seen - index
+        change = 0.0 if index is None else float(state[7] - at[7])
+        wanted = grip if abs(change) <= GRIP_CHANGE else (-1.0 if change < 0 else 1.0)
+        whole = frames == 1  # no frame is missing: the gripper moves when it was seen to
+        if whole:
+            grip = wanted
+        steps = max(frames, int(np.ceil(np.abs(state[:7] - at[:7]).max() / MAX_MOVE)))
+        for step in range(1, steps + 1):
+            joints = at[:7] + (state[:7] - at[:7]) * (step / steps)
+            targets.append(np.append(joints, grip))
+        if not whole and wanted != grip:
+            grip = wanted
+            targets += [np.append(state[:7], grip)] * GRIP_STEPS
+        at, index = state, seen
+    return np.array(targets[1:] or targets, np.float32)
 
 
 class Privileged(Policy):
-    """`oracle` or `guess`: the simulator's own scripts, with the hidden answer or a drawn one."""
+    """`oracle` or `guess`: the simulator's own scripts, with the hidden answer or a drawn one.
+
+    These and `Hold` are the benchmark's ends.
+    """
 
     privileged = True
 

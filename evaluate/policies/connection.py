@@ -5,7 +5,8 @@ import os
 import socket
 import threading
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
@@ -28,6 +29,18 @@ _PAUSES_S = (0.2, 5.0)
 
 _CLOSE_S = 2.0
 _GUIDE = "docs/systems.md says how to start one."
+
+
+@contextmanager
+def _after(seconds: float, call: Callable[[], object]) -> Iterator[None]:
+    """Call something if what is inside takes longer."""
+    timer = threading.Timer(seconds, call)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class ServerConnection:
@@ -64,17 +77,9 @@ class ServerConnection:
             PolicyServerError: The server cannot be reached, refuses, or is no policy server.
         """
         self.close()
-        told = threading.Timer(
-            _QUIET_S,
-            MESSAGES.print,
-            [f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"],
-        )
-        told.daemon = True
-        told.start()
-        try:
+        told = f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"
+        with _after(_QUIET_S, lambda: MESSAGES.print(told)):
             self._connect()
-        finally:
-            told.cancel()
 
     def _connect(self) -> None:
         until = time.monotonic() + self._connect_s
@@ -179,13 +184,11 @@ class ServerConnection:
             with suppress(OSError):
                 connection.socket.shutdown(socket.SHUT_RDWR)
 
-        timer = threading.Timer(seconds, expire)
-        timer.daemon = True
-        timer.start()
         try:
-            if data is not None:
-                connection.send(data)
-            return connection.recv()
+            with _after(seconds, expire):
+                if data is not None:
+                    connection.send(data)
+                return connection.recv()
         except (ConnectionClosed, OSError) as error:
             self.close()
             late = f"did not answer within {seconds:.3g} s"
@@ -197,8 +200,6 @@ class ServerConnection:
             # An answer that nobody read would be taken for that of the next message.
             self.close()
             raise
-        finally:
-            timer.cancel()
 
     def _read(self, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):

@@ -24,22 +24,18 @@ from robomme_interference_data.evaluate.policies.registry import (
 
 __all__ = ["describe_policy", "plain", "policy_identity"]
 
-_WITHOUT_EFFECT = {"websocket": ("connect_s", "response_s"), "lerobot": ("device",)}
-"""Options that no result depends on, by the kind of policy."""
-
-_PLACES = {"websocket": ("server",), "lerobot": ("source", "device")}
-"""What policies say of themselves that tells only where they run, or lie, by their kind."""
+_WITHOUT_EFFECT = {
+    "websocket": ("server", "connect_s", "response_s"),
+    "lerobot": ("source", "device"),
+}
+"""Options, and what policies say of themselves, that no result depends on, by kind of policy:
+where they run, or lie, and how long they are waited for."""
 
 
 def describe_policy(
     text: str, options: Sequence[str] = (), *, workers: int = 1
 ) -> tuple[Policy, dict[str, Any]]:
     """Make a policy once, ask what it is, and release it; of several servers ask each.
-
-    Args:
-        text: As for `make_policy`.
-        options: As for `make_policy`.
-        workers: Worker processes that will use it.
 
     Returns:
         The policy, closed, for its attributes; and what it says of itself, as plain values.
@@ -97,25 +93,20 @@ def policy_identity(text: str, options: Sequence[str], said: Mapping[str, Any]) 
     """Return what of a policy can change a result, as plain values.
 
     Where a server listens or a checkpoint lies is no part of it, nor is the device: what a
-    server says of itself, and the digest of a checkpoint's files, are.
-
-    Args:
-        text: The policy, as `pin_policy` returns it.
-        options: As for `make_policy`; objects of the policy's own among the defaults are left out.
-        said: What it says of itself.
+    server says of itself, and the digest of a checkpoint's files, are. Nor are objects of the
+    policy's own among its options' defaults.
     """
     kind = parse_policy(text).kind
-    places, without = _PLACES.get(kind, ()), _WITHOUT_EFFECT.get(kind, ())
+    without = _WITHOUT_EFFECT.get(kind, ())
     taken = {}
     for name, value in sorted(policy_options(text, options).items()):
-        if name not in without:
-            with suppress(TypeError, ValueError):
-                json.dumps(value)
-                taken[name] = plain(value)
+        with suppress(TypeError, ValueError):
+            json.dumps(value)
+            taken[name] = plain(value)
     return {
-        "policy": kind if kind in _PLACES else text,
-        "policy_options": taken,
-        "policy_metadata": {name: value for name, value in said.items() if name not in places},
+        "policy": kind if without else text,
+        "policy_options": {name: value for name, value in taken.items() if name not in without},
+        "policy_metadata": {name: value for name, value in said.items() if name not in without},
     }
 
 

@@ -112,16 +112,11 @@ class LeRobotPolicy(Policy):
         self._seed, self._asked = info.seed, 0
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Keep the last few frames; a policy that acts on one observation keeps none."""
-        if self.wants_history:
-            self._keep(frames, states)
+        """Keep the last few frames; a policy that acts on one observation is given none."""
+        self.observe(frames, states)
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Keep the last few frames."""
-        self._keep(frames, states)
-
-    def _keep(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Keep observations as LeRobot's processors take them: batches of one, images 0 to 1."""
+        """Keep the last few frames as LeRobot's processors take them: one each, images 0 to 1."""
         for index in range(max(0, len(states) - self._steps), len(states)):
             state = torch.from_numpy(np.array(states[index], np.float32))
             one: dict[str, Any] = {STATE: state[None]}
@@ -207,9 +202,6 @@ def _choose_device(device: str | None) -> str:
 
 def find_policy(path: str) -> tuple[Path, str]:
     """Return the folder with a policy's files, and what names it: with its commit, on the Hub.
-
-    Args:
-        path: A folder, or a model on the Hub: `namespace/name` or `namespace/name@revision`.
 
     Raises:
         InvalidOptionError: It is neither.

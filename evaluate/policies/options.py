@@ -8,7 +8,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from robomme_interference_data.errors import InvalidOptionError
 
-__all__ = ["bind_options", "signature_of", "split_options"]
+__all__ = ["bind_options", "signature_of"]
 
 _WORDS = {
     str: "text",
@@ -19,12 +19,7 @@ _WORDS = {
 }
 
 
-def split_options(texts: Iterable[str]) -> dict[str, str]:
-    """Read options as they are typed, `NAME=VALUE`.
-
-    Raises:
-        InvalidOptionError: A text is something else, or a name is given twice.
-    """
+def _split(texts: Iterable[str]) -> dict[str, str]:
     options: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -50,14 +45,15 @@ def bind_options(
         text: The policy as it is written, for the error.
         factory: What makes it.
         fixed: Arguments that the policy's text gives; they are no options.
-        texts: Options as they are typed.
+        texts: Options as they are typed, `NAME=VALUE`.
 
     Raises:
-        InvalidOptionError: It takes no such option, needs another, or declares another type.
+        InvalidOptionError: A text is something else, a name comes twice, or the factory takes no
+            such option, needs another, or declares another type.
     """
     signature, declared = signature_of(factory), _declared(factory)
     given: dict[str, Any] = {}
-    for name, typed in split_options(texts).items():
+    for name, typed in _split(texts).items():
         kinds = declared.get(name)
         value = typed if kinds and str in kinds else _read(typed)
         if kinds and float in kinds and type(value) is int:

@@ -33,10 +33,8 @@ BUILTINS = ("replay", "oracle", "guess", "hold")
 
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
 _KINDS = {
+    **{name: ("", name) for name in BUILTINS},
     "replay": (r"[a-z]+", "replay, replay:framesamp or replay:window"),
-    "oracle": (r"", "oracle"),
-    "guess": (r"", "guess"),
-    "hold": (r"", "hold"),
     "websocket": (
         rf"//{_SERVER}(?:,{_SERVER})*",
         "websocket://host:port, with commas between several servers, each once",
@@ -53,7 +51,7 @@ class PolicySpec:
 
     Attributes:
         kind: `websocket`, `lerobot`, `python`, or a built-in's name.
-        target: What follows the kind; of `replay` its memory rule, of other built-ins nothing.
+        target: What follows it; of `replay` the memory rule, of other built-ins nothing.
     """
 
     kind: str
@@ -90,18 +88,14 @@ def parse_policy(text: str) -> PolicySpec:
     spec = PolicySpec(kind, target)
     if not re.fullmatch(pattern, target, re.DOTALL) or bool(colon) > bool(target):
         raise InvalidOptionError.expected("policy", text, form)
-    ports = [port for _, port in spec.servers]
-    if len(set(spec.servers)) < len(ports) or not all(0 < port < 65536 for port in ports):
+    servers = spec.servers
+    if len(set(servers)) < len(servers) or not all(0 < port < 65536 for _, port in servers):
         raise InvalidOptionError.expected("policy", text, form)
     return spec
 
 
 def check_workers(spec: PolicySpec, workers: int) -> None:
-    """Refuse more workers than there are servers: a server holds the memory of one rollout.
-
-    Raises:
-        InvalidOptionError: There are fewer servers than workers.
-    """
+    """Refuse more workers than there are servers: a server holds the memory of one rollout."""
     if spec.kind == "websocket" and len(spec.servers) < workers:
         raise InvalidOptionError(
             f"{workers} workers need {workers} policy servers; {spec} names {len(spec.servers)}",
@@ -113,7 +107,7 @@ def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> P
     """Make a policy in this process. No server is reached before the first rollout.
 
     Args:
-        text: As for `parse_policy`.
+        text: The policy as it is written, see `parse_policy`.
         options: Its options, each `NAME=VALUE`: see `WebsocketPolicy` and `LeRobotPolicy`; a
             factory takes what it takes.
         worker: Number of this worker, from 0: with several servers, the one that it uses. A
@@ -156,24 +150,24 @@ def pin_policy(text: str) -> str:
 def _factory(text: str, worker: int) -> tuple[Callable[..., Policy], dict[str, Any]]:
     """Return what makes a policy, and the arguments that its text gives."""
     spec = parse_policy(text)
-    if spec.kind == "websocket":
-        check_workers(spec, worker + 1)
-        host, port = spec.servers[worker]
-        return _load("websocket", "WebsocketPolicy", "evaluate"), {"host": host, "port": port}
-    if spec.kind == "lerobot":
-        return _load("lerobot", "LeRobotPolicy", "build"), {"path": spec.target}
-    if spec.kind == "replay":
-        return _load("replay", "ReplayPolicy", "evaluate"), {"memory": spec.target}
     if spec.kind == "python":
         factory = _own_factory(spec.target)
         takes = "worker" in signature_of(factory).parameters
         return factory, {"worker": worker} if takes else {}
+    if spec.kind == "lerobot":
+        return _load("lerobot", "LeRobotPolicy", "build"), {"path": spec.target}
+    if spec.kind == "websocket":
+        check_workers(spec, worker + 1)
+        host, port = spec.servers[worker]
+        return _load("websocket", "WebsocketPolicy"), {"host": host, "port": port}
+    if spec.kind == "replay":
+        return _load("builtin", "ReplayPolicy"), {"memory": spec.target}
     if spec.kind == "hold":
-        return _load("builtin", "Hold", "evaluate"), {}
-    return _load("builtin", "Privileged", "evaluate"), {"name": spec.kind}
+        return _load("builtin", "Hold"), {}
+    return _load("builtin", "Privileged"), {"name": spec.kind}
 
 
-def _load(module: str, name: str, extra: str) -> Callable[..., Any]:
+def _load(module: str, name: str, extra: str = "evaluate") -> Callable[..., Any]:
     try:
         loaded = import_module(f"{__package__}.{module}")
     except ImportError as error:
@@ -181,8 +175,7 @@ def _load(module: str, name: str, extra: str) -> Callable[..., Any]:
         if missing.startswith(__package__ or "") or isinstance(error, MissingExtraError):
             raise
         raise MissingExtraError.needs("this policy", missing or "a library", extra) from error
-    found: Callable[..., Any] = getattr(loaded, name)
-    return found
+    return getattr(loaded, name)  # type: ignore[no-any-return]
 
 
 def _own_factory(target: str) -> Callable[..., Policy]:

@@ -63,9 +63,9 @@ class WebsocketPolicy(Policy):
     def reset(self, info: RolloutInfo) -> None:
         """Empty the server's memory, connecting first, or again if the connection was lost."""
         self._history, self._live, self._held = info.history_frames, False, None
-        if self._server.is_open:
-            # It may have broken since the last rollout; there is no memory yet that it could lose.
-            with suppress(PolicyServerError):
+        # It may have broken since the last rollout; there is no memory yet that it could lose.
+        with suppress(PolicyServerError):
+            if self._server.is_open:
                 self._server.request({"reset": True}, "reset_finished")
                 return
         self._server.open()

@@ -23,12 +23,15 @@ _NOTHING_ELSE = (
 )
 
 
+_NOT_READ = (KeyError, OverflowError, SyntaxError, TypeError, ValueError, msgpack.UnpackException)
+"""What msgpack and NumPy raise over bytes that are not what they say."""
+
+
 def pack(message: Any) -> bytes:
     """Return a message as bytes.
 
-    Args:
-        message: Maps, lists, texts, bytes, numbers, None, and NumPy arrays and scalars of
-            booleans, integers, floats of at most 8 bytes, or texts.
+    It may hold maps, lists, texts, bytes, numbers, None, and NumPy arrays and scalars of booleans,
+    integers, floats of at most 8 bytes, or texts.
 
     Raises:
         WireError: It holds something else, such as an array of objects.
@@ -53,14 +56,7 @@ def unpack(data: bytes) -> Any:
         return msgpack.unpackb(data, object_hook=_unpack_numpy, ext_hook=_refuse_extension)
     except WireError:
         raise
-    except (
-        KeyError,
-        OverflowError,
-        SyntaxError,
-        TypeError,
-        ValueError,
-        msgpack.UnpackException,
-    ) as error:
+    except _NOT_READ as error:
         reason = str(error) or type(error).__name__
         raise WireError(f"{len(data)} bytes are not a message: {reason}") from error
 
@@ -74,12 +70,8 @@ def _pack_numpy(value: Any) -> dict[bytes, Any]:
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
     # A view of the bytes: images are not copied before msgpack does.
     flat = np.ascontiguousarray(value).reshape(-1).view(np.uint8).data
-    return {
-        b"__ndarray__": True,
-        b"data": flat,
-        b"dtype": value.dtype.str,
-        b"shape": value.shape,
-    }
+    about = {b"dtype": value.dtype.str, b"shape": value.shape}
+    return {b"__ndarray__": True, b"data": flat, **about}
 
 
 def _unpack_numpy(value: dict[Any, Any]) -> Any:

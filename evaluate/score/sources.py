@@ -27,6 +27,7 @@ from robomme_interference_data.constants import (
     RUN_TABLES,
 )
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.evaluate.log import whole_lines
 from robomme_interference_data.files import read_json
 from robomme_interference_data.parquet import open_parquet, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
@@ -204,8 +205,8 @@ def _read_csv(path: Path, with_system: bool) -> Part:
 
 
 def _read_record(path: Path, with_system: bool) -> Part:
-    """Read the record of a run: of a rollout that broke and ran again, the last row counts."""
-    whole, _, _ = path.read_bytes().rpartition(b"\n")  # a crash can leave a part of a line
+    """Read the record of a run: of each rollout the row that counts, see `log`."""
+    whole = whole_lines(path)
     if not whole:
         return Part(path, {}, 0, int)
     schema = pa.schema([_SCHEMA.field(name) for name in (*COLUMNS, "split")])

@@ -8,8 +8,9 @@ observation, status = simulator.step(action)
 simulator.close()
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
     from robomme_interference_data.records import Status
@@ -33,12 +34,4 @@ __all__ = [
     "Status",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is used: the command line imports this package first."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    homes = {"make_simulator": "simulators.registry", "SIMULATORS": "simulators.registry"}
-    homes["Status"] = "records"
-    module = f"robomme_interference_data.{homes.get(name, 'simulators.base')}"
-    return getattr(import_module(module), name)
+__getattr__ = lazily(__name__, ".registry", ".base", "..records")

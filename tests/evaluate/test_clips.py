@@ -1,14 +1,13 @@
 """Clips of rollouts: what they show is what was given, and what fails in them harms no rollout."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import av
 import numpy as np
 import pytest
-from support.runs import EPISODE, config, roll
-from support.worlds import Cheat, World
+from support.runs import EPISODE, config
+from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.encode import VideoEncoder
@@ -85,32 +84,6 @@ def test_the_history_is_what_was_given(start: int, stop: int, buffer: Buffer) ->
     assert found == sessions[start:stop] + [None] * (64 - (stop - start))
 
 
-@pytest.mark.parametrize(
-    ("condition", "selector", "begun"),
-    [
-        ("no-history", None, (0, 0, 0)),
-        ("k1", None, (80, 0, 80)),
-        ("k3", (48, 80), (144, 48, 80)),
-    ],
-)
-def test_a_clip_is_told_what_the_policy_is_given(
-    condition: str, selector: Any, begun: tuple[int, int, int]
-) -> None:
-    notes: list[tuple[int, int, int]] = []
-    clip = SimpleNamespace(
-        begin=lambda buffer, start, stop, *_: notes.append((len(buffer), start, stop)),
-        step=lambda *_: None,
-    )
-    if selector is not None:
-        shares = dict.fromkeys(("lesson_fraction", "filler_fraction", "query_fraction"), 0.0)
-        chosen = SimpleNamespace(start=selector[0], stop=selector[1], **shares)
-        selector = SimpleNamespace(name="one", camera="front", select=lambda *_: chosen)
-    policy = Cheat()
-    roll(condition, policy, clip=clip, selector=selector)
-    assert notes == [begun]
-    assert len(policy.states) == begun[2] - begun[1]
-
-
 def test_names_goal_and_length_of_the_history_are_on_the_picture(
     tmp_path: Path, buffer: Buffer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,19 +109,15 @@ def test_names_goal_and_length_of_the_history_are_on_the_picture(
     assert said[-2:] == ["step 1 of 1300", "error"]
 
 
-def test_a_rollout_that_breaks_leaves_its_clip_too(tmp_path: Path, trouble: Path) -> None:
+def test_a_rollout_that_breaks_leaves_its_clip_too_unless_it_had_not_begun(
+    tmp_path: Path, trouble: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (trouble / "MoveCube-0").write_text("raise")
     outcome = rolled(tmp_path)
     assert "the world fell apart" in str(outcome.error)
     shown = frames(tmp_path / clip_name(K1))
     assert len(shown) == 1 + 4 + 10  # it broke in its fifth step
     assert banner(shown[-1]) == pytest.approx([0, 0, 0], abs=12)
-
-
-def test_a_rollout_that_breaks_before_it_begins_has_none_and_an_old_one_is_gone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rolled(tmp_path)
     left = tmp_path / "videos" / ".MoveCube_test_0_k1.mp4.abc.partial"
     other = tmp_path / "videos" / ".MoveCube_test_0_k3.mp4.abc.partial"
     for path in (left, other):
@@ -159,7 +128,7 @@ def test_a_rollout_that_breaks_before_it_begins_has_none_and_an_old_one_is_gone(
 
     monkeypatch.setattr(World, "reset", fall)
     assert str(rolled(tmp_path).error) == "OSError: no world"
-    assert list((tmp_path / "videos").iterdir()) == [other]
+    assert list((tmp_path / "videos").iterdir()) == [other]  # the old one is gone
 
 
 @pytest.mark.parametrize("when", [0, 7, 45])

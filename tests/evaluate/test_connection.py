@@ -67,13 +67,6 @@ def test_a_port_that_never_answers_is_told_soon_and_given_up(
     assert capsys.readouterr().err == told
 
 
-def test_a_server_that_never_speaks_is_given_up() -> None:
-    with handling(lambda connection: connection.recv()) as port:
-        policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
-        with pytest.raises(PolicyServerError, match="did not answer within"):
-            policy.metadata()
-
-
 def test_a_server_that_starts_late_is_waited_for(capsys: pytest.CaptureFixture[str]) -> None:
     with listening(-1) as port:
         server = PolicyServer(port=port)
@@ -93,23 +86,22 @@ def test_a_server_that_starts_late_is_waited_for(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().err == ""  # that was no time
 
 
-def test_a_server_that_is_not_ready_is_asked_again(server: PolicyServer) -> None:
-    server.status = HTTPStatus.SERVICE_UNAVAILABLE
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [
+        (HTTPStatus.SERVICE_UNAVAILABLE, r"it answers 503 \(for 0\.5 s\)"),  # asked again
+        (HTTPStatus.NOT_FOUND, r"is no policy server.* websocket.* 404"),
+    ],
+)
+def test_a_server_that_is_not_ready_or_something_else(
+    server: PolicyServer, status: HTTPStatus, words: str
+) -> None:
+    server.status = status
     with client(server, connect_s=0.5) as policy:
-        with pytest.raises(PolicyServerError, match=r"it answers 503 \(for 0\.5 s\)"):
+        with pytest.raises(PolicyServerError, match=words):
             policy.reset(info(0))
         server.status = None
         rollout(policy, 0, [], [])
-
-
-def test_something_else_listens(server: PolicyServer) -> None:
-    server.status = HTTPStatus.NOT_FOUND
-    with (
-        client(server) as policy,
-        pytest.raises(PolicyServerError, match=r"is no policy server.* websocket.* 404"),
-    ):
-        policy.reset(info(0))
-    assert server.connections == 0
 
 
 def test_the_key_is_sent(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,15 +172,24 @@ def test_a_server_that_does_not_even_read_is_given_up() -> None:
         policy.close()
 
 
-def test_a_close_with_1011_alone_is_told() -> None:
-    def handle(connection: Any) -> None:
-        connection.send(msgpack.packb({}))
-        connection.recv()
-        connection.close(1011, "out of memory")
+def speaks_never(connection: Any) -> None:
+    connection.recv()
 
+
+def closes(connection: Any) -> None:
+    connection.send(msgpack.packb({}))
+    connection.recv()
+    connection.close(1011, "out of memory")
+
+
+@pytest.mark.parametrize(
+    ("handle", "words"),
+    [(speaks_never, "did not answer within"), (closes, r"received 1011 .* out of memory")],
+)
+def test_a_server_that_never_speaks_or_closes(handle: Callable[[Any], None], words: str) -> None:
     with handling(handle) as port:
-        policy = WebsocketPolicy("127.0.0.1", port, connect_s=1.0)
-        with pytest.raises(PolicyServerError, match=r"received 1011 .* out of memory"):
+        policy = WebsocketPolicy("127.0.0.1", port, connect_s=0.5)
+        with pytest.raises(PolicyServerError, match=words):
             policy.reset(info(0))
 
 

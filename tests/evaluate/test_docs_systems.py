@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 from support import worlds
-from support.policy_server import PolicyServer
 from support.runs import run
 
 from robomme_interference_data import evaluate
@@ -24,7 +23,7 @@ def row(system: System) -> list[str]:
         (True, True): "all",
         (True, False): "`no-history`",
         (False, True): "with history",
-    }[not system.retrieval, system.with_history]
+    }[system.applies("no-history"), system.applies("k0")]
     return [
         f"`{system.name}`",
         system.display,
@@ -84,21 +83,6 @@ def test_the_policy_of_the_page_runs(
         ("no-history", "fail", worlds.STEPS),
         ("k0", "success", 4),
     ]
-
-
-def test_a_run_over_a_server_keeps_its_account(tmp_path: Path, world: None) -> None:
-    """With history and without: the server checks the order of its calls."""
-    with PolicyServer().running() as server:
-        system = "perceptual-framesamp-modul"
-        names = ("no-history", "k1")
-        result = run(tmp_path / "run", policy=server.url, system=system, conditions=names)
-        calls = server.calls
-    # The policy holds still, so every episode ends after 40 steps.
-    assert [(row.status, row.error) for row in result.rows] == [("fail", None)] * 4
-    assert {call["exec_start_idx"] for call in calls if "exec_start_idx" in call} == {0, 80}
-    # 40 steps in chunks of 16: asked three times a rollout.
-    kinds = [call["call"] for call in calls]
-    assert (kinds.count("reset"), kinds.count("infer")) == (4, 4 * 3)
 
 
 def test_examples_in_python_have_the_guard_and_are_the_code() -> None:

@@ -1,13 +1,12 @@
 """What makes a run the one that it is, and what may differ from start to start."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.policy_server import PolicyServer
-from support.runs import run, run_one
+from support.runs import header, run, run_one
 
 from robomme_interference_data.errors import RunFolderError
 from robomme_interference_data.evaluate import RunConfig, merge_runs
@@ -16,9 +15,7 @@ from robomme_interference_data.evaluate.policies.registry import pin_policy
 
 pytestmark = pytest.mark.usefixtures("world")
 
-
-def header(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "run.json").read_text())
+STILL = "python:support.own_policies:Still"
 
 
 def test_every_setting_is_classed() -> None:
@@ -42,16 +39,18 @@ def test_every_setting_is_classed() -> None:
     [
         ({"system": "yours"}, "system is 'mine' there, 'yours' here"),
         ({"model_seed": 7}, "model_seed is 0 there, 7 here"),
-        ({"policy": "hold"}, "policy is 'python:support.worlds:make_cheat' there, 'hold' here"),
+        ({"policy": "hold", "policy_options": ()}, f"policy is {STILL!r} there, 'hold' here"),
+        ({"policy_options": ("gripper=1",)}, "policy_options.gripper is -1.0 there, 1.0 here"),
     ],
 )
 def test_another_run_is_refused_and_the_difference_named(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
-    run_one(tmp_path / "run")
+    usual: dict[str, Any] = {"policy": STILL, "policy_options": ("gripper=-1",)}
+    run_one(tmp_path / "run", **usual)
     before = (tmp_path / "run" / "run.json").read_bytes()
     with pytest.raises(RunFolderError, match="holds another run") as raised:
-        run_one(tmp_path / "run", **changes)
+        run_one(tmp_path / "run", **usual | changes)
     assert message in raised.value.message
     assert (tmp_path / "run" / "run.json").read_bytes() == before
 
@@ -64,19 +63,12 @@ def test_what_may_differ_goes_on_with_the_run(tmp_path: Path) -> None:
     assert [one["settings"]["check_lesson"] for one in starts] == [False, True]
 
 
-def test_options_of_the_policy_make_the_run(tmp_path: Path) -> None:
-    still = "python:support.own_policies:Still"
-    run_one(tmp_path / "run", policy=still, policy_options=("gripper=-1.0",))
-    with pytest.raises(RunFolderError, match=r"policy_options.gripper is -1.0 there, 1.0 here"):
-        run_one(tmp_path / "run", policy=still)
-
-
 def test_another_checkpoint_behind_the_same_words_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = "python:support.own_policies:from_checkpoint"
     for name in ("a", "b"):
-        monkeypatch.setenv("OWN_POLICIES_CHECKPOINT", name)
+        monkeypatch.setenv("CHECKPOINT", name)
         run_one(tmp_path / name, policy=policy)
     difference = r"policy_metadata\.checkpoint is '{}' there, '{}' here"
     with pytest.raises(RunFolderError, match=difference.format("b", "a")):
@@ -107,11 +99,13 @@ def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
 def test_a_privileged_policy_is_on_record(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run_one(tmp_path / "run", policy="python:support.own_policies:insider")
+    insider = {"policy_options": ("name=privileged", "value=true")}
+    run_one(tmp_path / "run", policy="python:support.own_policies:changed", **insider)
     said = header(tmp_path / "run")["starts"][0]["policy"]
     assert said == {"policy": "still", "privileged": True}
-    assert "own_policies:insider is privileged: it gets the simulator" in capsys.readouterr().err
-    run_one(tmp_path / "other", policy="python:support.own_policies:with_array")
+    assert "own_policies:changed is privileged: it gets the simulator" in capsys.readouterr().err
+    says = "python:support.own_policies:says"
+    run_one(tmp_path / "other", policy=says, policy_options=("what=array",))
     said = header(tmp_path / "other")["starts"][0]["policy"]
     assert said == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
     assert "privileged" not in capsys.readouterr().err
@@ -127,10 +121,9 @@ def test_what_of_a_policy_can_change_a_result() -> None:
         "policy_options": {"chunk_frames": 16},
         "policy_metadata": {"policy": "websocket", "server_metadata": {"model": "m"}},
     }
-    own = "python:support.own_policies:Still"
-    assert policy_identity(own, ("gripper=1",), {}) == policy_identity(own, (), {})
-    assert policy_identity(own, ("gripper=0.5",), {"device": "cuda"}) == {
-        "policy": own,
+    assert policy_identity(STILL, ("gripper=1",), {}) == policy_identity(STILL, (), {})
+    assert policy_identity(STILL, ("gripper=0.5",), {"device": "cuda"}) == {
+        "policy": STILL,
         "policy_options": {"gripper": 0.5},
         "policy_metadata": {"device": "cuda"},
     }

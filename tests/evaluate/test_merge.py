@@ -2,10 +2,9 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from support.runs import run, run_one, untimed
+from support.runs import header, run, run_one, untimed
 
 from robomme_interference_data.errors import FormatError, RunFolderError
 from robomme_interference_data.evaluate import merge_runs
@@ -14,10 +13,6 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 
 pytestmark = pytest.mark.usefixtures("trouble")
-
-
-def header(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "run.json").read_text())
 
 
 def shards(tmp_path: Path, count: int = 2) -> list[Path]:

@@ -51,7 +51,7 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
         (
             {"episode_split": "val", "families": ["MoveCube"]},
             UnknownNameError,
-            "has no val episode",
+            "It has none of MoveCube/val",
         ),
         ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
         ({"episode_split": "train"}, InvalidOptionError, "no train episode\nGive --episode-split"),

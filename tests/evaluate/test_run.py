@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from support.runs import run, run_one, untimed
+from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
 from robomme_interference_data.errors import FormatError, RunFolderError, SimulatorCrashError
@@ -19,10 +19,6 @@ from robomme_interference_data.records import Rollout
 from robomme_interference_data.rows import arrow_schema, to_dict
 
 pytestmark = pytest.mark.usefixtures("trouble")
-
-
-def header(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "run.json").read_text())
 
 
 # --- rows --------------------------------------------------------------------------------------
@@ -73,23 +69,19 @@ def test_who_runs_the_rollouts_makes_no_difference(tmp_path: Path) -> None:
     assert untimed(one.rows) == untimed(other.rows)
 
 
-def test_only_the_workers_number_reaches_a_factory_that_asks(tmp_path: Path) -> None:
-    options = ("gripper=-1",)
-    still = "python:support.own_policies:Still"
-    run_one(tmp_path / "run", policy=still, policy_options=options)
-    assert header(tmp_path / "run")["identity"]["policy_options"] == {"gripper": -1.0}
-
-
 # --- resume ------------------------------------------------------------------------------------
 
 
 def test_finished_rollouts_are_not_run_again(tmp_path: Path) -> None:
     first = run(tmp_path / "run")
-    text = (tmp_path / "run" / "rollouts.jsonl").read_text()
-    again = run(tmp_path / "run", workers=2)
-    assert again.rows == first.rows
-    assert (tmp_path / "run" / "rollouts.jsonl").read_text() == text
+    log = tmp_path / "run" / "rollouts.jsonl"
+    text = log.read_bytes()
+    assert run(tmp_path / "run", workers=2).rows == first.rows
+    assert log.read_bytes() == text
     assert len(header(tmp_path / "run")["starts"]) == 2
+    log.write_bytes(text[:-20])  # torn
+    assert untimed(run(tmp_path / "run").rows) == untimed(first.rows)
+    assert len(log.read_bytes().splitlines()) == 4
 
 
 def test_a_run_may_grow_and_stands_for_all_its_plans(tmp_path: Path) -> None:
@@ -106,28 +98,29 @@ def test_a_run_may_grow_and_stands_for_all_its_plans(tmp_path: Path) -> None:
     assert (found["planned"], len(found["plans"]), found["status"]) == (4, 2, "complete")
 
 
-def test_after_a_torn_line_the_run_goes_on(tmp_path: Path) -> None:
-    first = run(tmp_path / "run")
-    log = tmp_path / "run" / "rollouts.jsonl"
-    log.write_bytes(log.read_bytes()[:-20])
-    again = run(tmp_path / "run")
-    assert untimed(again.rows) == untimed(first.rows)
-    assert len(log.read_bytes().splitlines()) == 4
-
-
 class Impatient:
-    """A listener that presses Ctrl-C at the first row."""
+    """A listener that looks at the header, and presses Ctrl-C at the first row."""
 
-    def start(self, items: Any, done: Any) -> None: ...
+    def __init__(self, out: Path):
+        self.out = out
+
+    def start(self, items: Any, done: Any) -> None:
+        self.seen = header(self.out)
 
     def row(self, row: Any) -> None:
         raise KeyboardInterrupt
 
 
-def test_ctrl_c_leaves_tables_and_a_header_that_say_how_the_folder_stands(tmp_path: Path) -> None:
+def test_the_header_says_how_the_folder_stands_from_the_start_and_after_ctrl_c(
+    tmp_path: Path,
+) -> None:
     out = tmp_path / "run"
+    impatient = Impatient(out)
     with pytest.raises(KeyboardInterrupt):
-        run(out, listener=Impatient())
+        run(out, listener=impatient)
+    begun = impatient.seen
+    assert (begun["status"], begun["planned"]) == ("running", 4)
+    assert set(begun["counts"].values()) == {0} and begun["starts"][0]["ended"] is None
     found = header(out)
     assert (found["status"], found["planned"], sum(found["counts"].values())) == (
         "incomplete",
@@ -139,21 +132,6 @@ def test_ctrl_c_leaves_tables_and_a_header_that_say_how_the_folder_stands(tmp_pa
     assert len((out / "rollouts.csv").read_text().splitlines()) == 2
     run(out)
     assert [one["stopped"] for one in header(out)["starts"]] == ["interrupted", None]
-
-
-def test_a_header_counts_from_the_first_moment_on(tmp_path: Path) -> None:
-    seen: list[dict[str, Any]] = []
-
-    class Looks:
-        def start(self, items: Any, done: Any) -> None:
-            seen.append(header(tmp_path / "run"))
-
-        def row(self, row: Any) -> None: ...
-
-    run(tmp_path / "run", listener=Looks())
-    assert (seen[0]["status"], seen[0]["planned"]) == ("running", 4)
-    assert seen[0]["counts"] == {"success": 0, "fail": 0, "timeout": 0, "error": 0}
-    assert seen[0]["starts"][0]["ended"] is None
 
 
 # --- what breaks -------------------------------------------------------------------------------
@@ -210,19 +188,13 @@ def test_what_broke_is_not_used_again(
     assert len(closed) == len(set(map(id, closed))) == 3
 
 
-def test_words_that_no_file_can_hold_end_no_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("BREAKS", "surrogate")
-    result = run(
-        tmp_path / "run", policy="python:support.own_policies:Broken", conditions=("no-history",)
-    )
-    assert [row.error for row in result.rows] == [
-        r"ValueError: no such file: caf\udce9 in two lines"
-    ] * 2
+def test_words_that_no_file_can_hold_end_no_run(tmp_path: Path) -> None:
+    (row,) = run_one(tmp_path / "run", policy="python:support.own_policies:Broken").rows
+    assert row.error == r"ValueError: no such file: caf\udce9 in two lines"
     assert r"caf\udce9" in (tmp_path / "run" / "errors.log").read_text()
     assert pq.read_table(tmp_path / "run" / "rollouts.parquet")["error"][0].as_py()
-    run_one(tmp_path / "said", policy="python:support.own_policies:with_surrogate")
+    says = "python:support.own_policies:says"
+    run_one(tmp_path / "said", policy=says, policy_options=("what=surrogate",))
     assert header(tmp_path / "said")["identity"]["policy_metadata"]["checkpoint"] == r"caf\udce9"
 
 
@@ -249,33 +221,23 @@ def test_without_any_worker_the_run_stops_with_why(tmp_path: Path) -> None:
 # --- folders -----------------------------------------------------------------------------------
 
 
-def test_a_run_may_be_refused_if_one_is_there(tmp_path: Path) -> None:
-    run_one(tmp_path / "run")
+def test_folders_that_are_refused(tmp_path: Path) -> None:
+    out, other = tmp_path / "run", tmp_path / "other"
+    run_one(out)
     with pytest.raises(RunFolderError, match="holds a run already"):
-        run_one(tmp_path / "run", no_resume=True)
-
-
-def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "thesis.tex").write_text("…")
-    with pytest.raises(RunFolderError, match=r"holds other files \(thesis\.tex\)"):
-        run_one(tmp_path / "run")
-    assert [p.name for p in (tmp_path / "run").iterdir()] == ["thesis.tex"]
-
-
-def test_a_folder_that_is_being_written_is_refused(tmp_path: Path) -> None:
-    run_one(tmp_path / "run")
-    with (tmp_path / "run" / ".lock").open("a") as lock:
+        run_one(out, no_resume=True)
+    with (out / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(RunFolderError, match="another process is writing"):
-            run_one(tmp_path / "run")
-
-
-def test_a_folder_that_has_lost_its_record_is_refused(tmp_path: Path) -> None:
-    run_one(tmp_path / "run")
-    (tmp_path / "run" / "rollouts.jsonl").unlink()
+            run_one(out)
+    (out / "rollouts.jsonl").unlink()
     with pytest.raises(RunFolderError, match=r"rollouts\.jsonl is missing"):
-        run_one(tmp_path / "run")
+        run_one(out)
+    other.mkdir()
+    (other / "thesis.tex").write_text("…")
+    with pytest.raises(RunFolderError, match=r"holds other files \(thesis\.tex\)"):
+        run_one(other)
+    assert [path.name for path in other.iterdir()] == ["thesis.tex"]
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,13 @@
 """The table of systems: the paper's grid, its conditions, and names that do not pretend."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from robomme_interference_data.errors import (
-    HistoryTooLongError,
-    InvalidIdError,
-    InvalidOptionError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
 from robomme_interference_data.evaluate.systems import (
     PAPER_SYSTEMS,
     SYSTEMS,
-    check_condition,
+    base_of,
     check_history,
-    display_name,
     name_system,
 )
 
@@ -29,35 +21,19 @@ def test_names_are_unique_and_the_papers_come_first() -> None:
     assert len({system.display for system in SYSTEMS.values()}) == len(SYSTEMS)
 
 
-def applies(name: str) -> list[str]:
-    found = []
-    for condition in CONDITIONS:
-        try:
-            check_condition(name_system(name), condition)
-        except InvalidOptionError:
-            continue
-        found.append(condition)
-    return found
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", [*SYSTEMS, "my-memory"])
 def test_conditions(name: str) -> None:
     expected = {"pi05_baseline": ["no-history"]}.get(name, list(CONDITIONS))
     if name.startswith("retrieval-"):
         expected = ["k0", "k1", "k3", "k7"]
-    assert applies(name) == expected
+    assert [one for one in CONDITIONS if name_system(name).applies(one)] == expected
 
 
-def test_a_refused_condition_says_what_to_do() -> None:
-    with pytest.raises(InvalidOptionError, match="pi05_baseline has no memory"):
-        check_condition(name_system("pi05_baseline"), "k3")
-    for name, plain in [
-        ("retrieval-framesamp-modul", "perceptual-framesamp-modul"),
-        ("retrieval-replay-window", "replay-window"),
-    ]:
-        with pytest.raises(InvalidOptionError, match=f"Run {plain} under no-history"):
-            check_condition(name_system(name), "no-history")
-        assert plain in SYSTEMS
+def test_a_retrieval_system_has_one_without() -> None:
+    assert base_of("retrieval-framesamp-modul") == "perceptual-framesamp-modul"
+    assert base_of("retrieval-replay-window") == "replay-window"
+    assert base_of("replay-window") is base_of("my-memory") is None
+    assert all((base_of(name) in SYSTEMS) == one.retrieval for name, one in SYSTEMS.items())
 
 
 def test_position_limits_are_told_condition_by_condition() -> None:
@@ -78,8 +54,6 @@ def test_position_limits_are_told_condition_by_condition() -> None:
 def test_own_names() -> None:
     own = name_system("my-memory.v2")
     assert (own.name, own.display, own.paper) == ("my-memory.v2", "my-memory.v2", False)
-    for condition in CONDITIONS:
-        check_condition(own, condition)
     assert name_system("memer") is SYSTEMS["memer"]
     assert name_system("holdout").display == "holdout"  # near hold, but no slip of it
 
@@ -106,13 +80,3 @@ def test_own_names_do_not_pretend(name: str, system: str) -> None:
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(InvalidIdError, match="is not the name of a system"):
         name_system(name)
-
-
-@given(st.text(max_size=30))
-def test_any_text_is_a_system_or_a_clear_error(name: str) -> None:
-    try:
-        system = name_system(name)
-    except (InvalidIdError, UnknownNameError):
-        return
-    assert system.name == name
-    assert display_name(name) == system.display

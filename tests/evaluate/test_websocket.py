@@ -1,5 +1,6 @@
 """The websocket adapter against a server that keeps its own account of the memory."""
 
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -8,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.policy_calls import INFER, RESET, added, client, info, observation, rollout, section
-from support.policy_server import Memory, PolicyServer
+from support.policy_server import PolicyServer
+from support.runs import run
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.identity import plain
@@ -134,42 +136,12 @@ def test_every_answer_is_checked(server: PolicyServer, call: str, answer: Any, t
         rollout(policy, 2, [2], [])
 
 
-# --- the server itself -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("calls", "text"),
-    [
-        ("add 1 0", "reset first"),
-        ("reset, infer", "history feats is empty"),
-        ("reset, add 3 2, add 1 3", "another length of the history"),
-        ("reset, add 1 0, add 1 3", "history after other frames"),
-        ("reset, add 2 1, infer, add 1 1", "history after the first answer"),
-        ("reset, add 2 2, infer", "0 live frames before the first answer"),
-        ("reset, add 1 0, infer, infer", "0 frames since the last answer"),
-        ("reset, add 1 0, infer, add 17 0, infer", "17 frames since the last answer"),
-        ("reset, add 4097 0", "index 4096 is out of bounds"),
-    ],
-)
-def test_the_servers_account_refuses_a_wrong_order(calls: str, text: str) -> None:
-    memory, seen = Memory(keep=False), observation(0)
-    images = {"observation/image": seen.images["front"]}
-    images |= {"observation/wrist_image": seen.images["wrist"]}
-
-    def play(call: str) -> None:
-        name, *numbers = call.split()
-        if name == "reset":
-            memory.reset()
-        elif name == "infer":
-            memory.infer({**images, "observation/state": seen.state, "prompt": "pick"})
-        else:
-            frames, start = map(int, numbers)
-            added = np.zeros((frames, 1, 2, 2, 3), np.uint8)
-            states = np.zeros((frames, 8), np.float32)
-            memory.add_buffer({"images": added, "state": states, "exec_start_idx": start})
-
-    *before, last = calls.split(", ")
-    for call in before:
-        play(call)
-    with pytest.raises(AssertionError, match=text):
-        play(last)
+def test_a_run_keeps_the_servers_account(tmp_path: Path, world: None, server: PolicyServer) -> None:
+    """With history and without: the server checks the order of its calls."""
+    system, names = "perceptual-framesamp-modul", ("no-history", "k1")
+    result = run(tmp_path / "run", policy=server.url, system=system, conditions=names)
+    # The policy holds still, so every episode ends after 40 steps: asked three times a rollout.
+    assert [(row.status, row.error) for row in result.rows] == [("fail", None)] * 4
+    assert {call.get("exec_start_idx") for call in server.calls} == {None, 0, 80}
+    kinds = [call["call"] for call in server.calls]
+    assert (kinds.count("reset"), kinds.count("infer")) == (4, 4 * 3)

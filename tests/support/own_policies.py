@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 
 
@@ -44,10 +43,6 @@ def still(gripper: float) -> Still:
     return Still(gripper)
 
 
-def nothing() -> object:
-    return object()
-
-
 def lacking(name: str) -> object:
     """Return a policy without one of its attributes or methods."""
     members = {key: value for key, value in vars(Still).items() if key != name}
@@ -64,36 +59,24 @@ def changed(name: str, value: Any) -> Still:
 NUMBER = 3
 
 
-def with_array() -> Still:
-    return changed("metadata", lambda: {"policy": "still", "sizes": np.arange(3), 4: np.float32(5)})
+SAID: dict[str, Any] = {
+    "array": {"policy": "still", "sizes": np.arange(3), 4: np.float32(5)},
+    "text": "still",
+    "nan": {"policy": "still", "scales": [1.0, np.float32("nan")]},
+    "surrogate": {"policy": "still", "checkpoint": "caf\udce9"},
+}
 
 
-def with_text() -> Still:
-    return changed("metadata", lambda: "still")
-
-
-def with_nan() -> Still:
-    return changed("metadata", lambda: {"policy": "still", "scales": [1.0, np.float32("nan")]})
-
-
-def with_surrogate() -> Still:
-    return changed("metadata", lambda: {"policy": "still", "checkpoint": "caf\udce9"})
-
-
-def wants_top() -> Still:
-    return changed("history_cameras", ("top",))
+def says(what: str) -> Still:
+    """Return a policy that says one of these of itself."""
+    return changed("metadata", lambda: SAID[what])
 
 
 class Broken(Still):
-    """Breaks in the way that BREAKS names."""
+    """Breaks with words that no file can hold."""
 
     def act(self, observation: Any, goal: str) -> Any:
-        kind = os.environ["BREAKS"]
-        if kind == "surrogate":
-            raise ValueError("no such file: caf\udce9\nin two lines")
-        if kind == "server":
-            raise PolicyServerError("the server is gone", "Start it.")
-        return super().act(observation, goal)
+        raise ValueError("no such file: caf\udce9\nin two lines")
 
 
 class Filler(Still):
@@ -106,6 +89,10 @@ class Filler(Still):
 class Talker(Still):
     """Writes to stdout wherever it can, and a line to the file of CLOSED when it is closed."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        sys.stdout.write("made\n")
+
     def reset(self, info: Any) -> None:
         sys.stdout.write("reset\n")
 
@@ -115,36 +102,25 @@ class Talker(Still):
             file.write(f"{os.getpid()}\n")
 
 
-def talker() -> Talker:
-    sys.stdout.write("made\n")
-    return Talker()
-
-
 def with_object(name: str = "x", value: Any = sys) -> Still:
     return Still()
 
 
-def insider() -> Still:
-    return changed("privileged", True)
-
-
 class Served(WebsocketPolicy):
-    """Says nothing of where its server listens, which is no part of what it is."""
+    """One of the servers of SERVERS, host:port with commas between; waited for a second.
+
+    It says nothing of where it listens, which is no part of what it is.
+    """
+
+    def __init__(self, worker: int = 0):
+        host, port = os.environ["SERVERS"].split(",")[worker].split(":")
+        super().__init__(host, int(port), connect_s=1.0)
 
     def metadata(self) -> dict[str, Any]:
         return {name: value for name, value in super().metadata().items() if name != "server"}
 
 
-def served(worker: int = 0) -> Served:
-    """One of the servers of SERVERS, host:port with commas between; waited for a second."""
-    host, port = os.environ["SERVERS"].split(",")[worker].split(":")
-    return Served(host, int(port), connect_s=1.0)
-
-
-CHECKPOINT = "OWN_POLICIES_CHECKPOINT"
-
-
 def from_checkpoint() -> Still:
-    """Return a policy that says which checkpoint an environment variable names."""
-    said = {"policy": "still", "checkpoint": os.environ[CHECKPOINT]}
+    """Return a policy that says which checkpoint CHECKPOINT names."""
+    said = {"policy": "still", "checkpoint": os.environ["CHECKPOINT"]}
     return changed("metadata", lambda: said)

@@ -1,5 +1,6 @@
 """Runs over the tiny split, on the simulator and with the cheat of `worlds`."""
 
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,11 @@ def run_one(out: Path, **changes: Any) -> RunResult:
     """A run of one rollout."""
     one: dict[str, Any] = {"conditions": ("no-history",), "families": ("MoveCube",)}
     return run(out, **one | changes)
+
+
+def header(folder: Path) -> dict[str, Any]:
+    """What `run.json` of a run says."""
+    return json.loads((folder / "run.json").read_text())  # type: ignore[no-any-return]
 
 
 def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) -> Rollout:

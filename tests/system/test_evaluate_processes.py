@@ -154,7 +154,7 @@ def test_policies_are_closed_and_what_they_print_is_not_among_the_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CLOSED", str(tmp_path / "closed"))
-    running = start(tmp_path / "run", policy="python:support.own_policies:talker")
+    running = start(tmp_path / "run", policy="python:support.own_policies:Talker")
     out, err = running.communicate(timeout=120)
     assert [row["status"] for row in json.loads(out)] == ["fail", "fail"]
     words = err.split()
@@ -196,7 +196,7 @@ class Killer:
 
 def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) -> None:
     """The policy holds still: all rollouts fail. Another server does the rest, or a later run."""
-    served: dict[str, Any] = {"policy": "python:support.own_policies:served", "workers": 2}
+    served: dict[str, Any] = {"policy": "python:support.own_policies:Served", "workers": 2}
     served |= {"conditions": CONDITIONS}
     with servers(2) as (processes, urls):
         monkeypatch.setenv("SERVERS", urls)

@@ -1,4 +1,4 @@
-"""The memory policy without weights: what it keeps, where it takes up, what it follows."""
+"""The policies without weights: what replay keeps, where it takes up, what it follows; ends."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.base import RolloutInfo
-from robomme_interference_data.evaluate.policies.replay import (
+from robomme_interference_data.evaluate.policies.builtin import (
     MEMORIES,
+    Hold,
+    Privileged,
     ReplayPolicy,
     follow,
     thumbnails,
@@ -41,8 +43,7 @@ def test_what_memories_keep() -> None:
 @given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 5000))
 def test_a_memory_keeps_frames_that_were_there(name: str, live: int) -> None:
     kept = list(MEMORIES[name](live))
-    assert kept == sorted(set(kept))
-    assert all(0 <= index < live for index in kept)
+    assert kept == sorted(set(kept)) and set(kept) <= set(range(live))
     assert len(kept) == min(live, 31) or name == "full"
 
 
@@ -125,8 +126,13 @@ def test_it_goes_on_from_call_to_call_then_holds_and_a_reset_forgets() -> None:
     policy.reset(RolloutInfo("goal", 0, 0))
     held = policy.act(seen(0, 0.2, 0.0), "goal")  # without history
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, -1], (16, 1)))
-    with pytest.raises(PolicyError, match="not reset"):
-        ReplayPolicy().act(seen(0, 0.0), "goal")
+
+
+def test_hold_holds_and_a_script_needs_the_simulator() -> None:
+    held = Hold().act(seen(0, 0.2, 0.0), "goal")
+    np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, 1], (16, 1)))
+    with pytest.raises(PolicyError, match="needs the simulator itself"):
+        Privileged("oracle").act(seen(0, 0.0), "goal")
 
 
 def test_thumbnails_are_mean_colours_of_tiles() -> None:

@@ -1,0 +1,29 @@
+"""Public names of a package, imported when they are asked for.
+
+The command line and workers import packages first, and need few of their names.
+"""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+__all__ = ["lazily"]
+
+
+def lazily(package: str, *modules: str) -> Callable[[str], Any]:
+    """Return a package's `__getattr__`, which looks for a name in `__all__` of its modules.
+
+    Args:
+        package: Its `__name__`.
+        modules: Where its names are, in the order of looking, such as `.split`.
+    """
+
+    def find(name: str) -> Any:
+        if name in import_module(package).__all__:
+            for module in modules:
+                found = import_module(module, package)
+                if name in found.__all__:
+                    return getattr(found, name)
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return find
