@@ -83,18 +83,17 @@ def reasons(
     closest = start + int(np.argmax(alike[start:stop]))
     outside = np.concatenate([np.arange(start), np.arange(stop, len(alike))])
     other = int(outside[np.argmax(alike[outside])]) if len(outside) else None
-    session = buffer.session_index
-    touched = buffer.sessions[int(session[start]) : int(session[stop - 1]) + 1]
+    touched = [one for one in buffer.sessions if one.start < stop and one.stop > start]
     return Reasons(
         encoder,
         camera,
         grade(measured, rule),
-        dict(zip(choice.segments, choice.scores, strict=True)).get((start, stop)),
+        choice.scores.get(choice.span),
         tuple(f"{one.role} {one.source}" for one in touched),
         closest,
         float(alike[closest]),
         other,
         None if other is None else float(alike[other]),
-        None if other is None else str(buffer.sessions[session[other]].source),
+        None if other is None else str(buffer.sessions[buffer.session_index[other]].source),
         measured.lesson,
     )

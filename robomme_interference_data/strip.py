@@ -122,8 +122,7 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
         camera: Name of the camera.
 
     Raises:
-        InvalidOptionError: `out` has another suffix or cannot be written.
-        MissingExtraError: matplotlib is not installed.
+        InvalidOptionError, MissingExtraError: See `open_page`.
         UnknownNameError: There is no such camera.
         MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
     """

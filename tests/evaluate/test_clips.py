@@ -102,9 +102,8 @@ def test_a_clip_is_told_what_the_policy_is_given(
         step=lambda *_: None,
     )
     if selector is not None:
-        shares = dict.fromkeys(("lesson_fraction", "filler_fraction", "query_fraction"), 0.0)
-        chosen = SimpleNamespace(start=selector[0], stop=selector[1], **shares)
-        selector = SimpleNamespace(name="one", camera="front", select=lambda *_: chosen)
+        span = selector
+        selector = SimpleNamespace(name="one", camera="front", select=lambda *_: span)
     policy = Cheat()
     roll(condition, policy, clip=clip, selector=selector)
     assert notes == [begun]

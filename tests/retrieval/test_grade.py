@@ -1,24 +1,11 @@
 """Grades and cells against values worked out by hand, wherever the lesson lies."""
 
-import csv
-import io
-
 import pytest
 from support.retrieval import made
 
-from robomme_interference_data.retrieval.grade import (
-    ALL,
-    Cell,
-    Grade,
-    cell_table,
-    cells,
-    grade,
-    verdict,
-)
+from robomme_interference_data.retrieval.grade import ALL, Grade, cell_table, cells, grade, verdict
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.rows import from_dict, to_dict
 from robomme_interference_data.stats import wilson
-from robomme_interference_data.tables import Table
 
 MAX = Rule("max", 0.5)
 
@@ -125,13 +112,6 @@ def test_cells_by_hand() -> None:
     assert verdict(found).endswith("pass: max/0.5: 1 of 3")
 
 
-def test_conditions_are_in_the_order_of_tables() -> None:
-    grades = [
-        grade(made(condition=name, cuts={}, high={1: 1}), MAX) for name in ("k10", "k7", "k0")
-    ]
-    assert [cell.condition for cell in cells(grades)] == ["k0", "k7", "k10"] * 2
-
-
 @pytest.mark.parametrize(("first", "passed"), [(1, True), (2, False)])
 def test_the_pass_mark(first: int, passed: bool) -> None:
     # Chosen are `first` to 10; the lesson is 0 to 9. From 1 on, 9 of 10 frames are of the lesson,
@@ -159,18 +139,3 @@ def test_tables() -> None:
     last = [grade(made(cuts={}, high={1: 1}), Rule("last", 0.5))]
     lines = cell_table(list(cells(grades + last)), "Title").text().splitlines()
     assert [line.split()[0] for line in lines[4:6]] == ["max/0.5", "last/0.5"]
-
-
-def test_rows_and_cells_are_declared_once() -> None:
-    grades = [*four(), grade(made(cuts={}, high={1: 1}, lessons=()), MAX)]
-    text = Table.of(Grade, grades, "rows", "Title").csv()
-    found = list(csv.DictReader(io.StringIO(text)))
-    assert list(found[0])[:7] == [
-        *("rule", "threshold", "episode_id", "family", "split", "index", "condition")
-    ]
-    assert (found[1]["episode_id"], found[1]["index"]) == ("MoveCube/test/1", "1")
-    assert (found[1]["purity"], found[1]["hit"]) == ("0.400000", "yes")
-    assert found[-1]["coverage"] == ""
-    assert from_dict(Grade, to_dict(grades[1]), "here") == grades[1]
-    single = next(csv.DictReader(io.StringIO(Table.of(Cell, cells(four()), "", "").csv())))
-    assert (single["purity"], single["purity_low"], single["passed"]) == ("1.000000", "", "yes")
