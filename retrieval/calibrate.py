@@ -33,8 +33,7 @@ class Trial:
         threshold: The threshold.
         family: Whose queries it was tried on, or `ALL`.
         condition: Under which condition, or `ALL`.
-        purity: Mean over these buffers.
-        coverage: The same.
+        purity, coverage: Means over these buffers.
     """
 
     threshold: float

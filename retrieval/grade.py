@@ -76,17 +76,11 @@ class Cell:
     over episodes for the others, None for a single episode.
 
     Attributes:
-        rule: The rule.
         family: A family, or `ALL`.
-        condition: Name of the condition.
         queries: Query episodes.
         hit: Share of them with a frame of the lesson chosen.
-        purity: Mean purity.
-        coverage: Mean coverage.
-        false_sessions: Mean number of false sessions.
-        true_cuts: Borders between true sessions, in all its queries together.
-        found_cuts: How many of them are borders of segments.
-        false_cuts: Borders of segments inside true sessions.
+        purity, coverage, false_sessions: Means of what `Grade` has.
+        true_cuts, found_cuts, false_cuts: Sums of what `Grade` has.
         passed: Whether mean purity and mean coverage reach the pass mark.
     """
 
