@@ -33,13 +33,7 @@ def test_a_grade_by_hand() -> None:
         false_cuts=2,
     )
     last = grade(one, Rule("last", 0.5))
-    assert (last.start, last.stop, last.purity, last.coverage) == (11, 15, 0, 0)
-    assert (last.hit, last.false_sessions) == (False, 1)
-    everything = grade(one, Rule("max", -1.0))
-    assert (everything.purity, everything.coverage) == (6 / 15, 1)
-    assert (everything.false_sessions, everything.segments) == (2, 1)
-    truth = grade(one, Rule("oracle", 0.5))
-    assert (truth.start, truth.stop, truth.purity, truth.coverage) == (0, 6, 1, 1)
+    assert (last.start, last.stop, last.hit, last.purity, last.coverage) == (11, 15, False, 0, 0)
 
 
 @pytest.mark.parametrize(

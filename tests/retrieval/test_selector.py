@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.retrieval import remade
 from support.splits import QUERIES
 
 from robomme_interference_data import load_buffer, load_split
@@ -20,16 +19,6 @@ def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
     for buffer in load_split(indexed).buffers(condition="k3"):
         stored = choose(measure(buffer, "thumbnail"), selector.rule)
         assert selector.select(buffer, buffer.query.frame()) == stored.span
-
-
-def test_the_oracle_needs_a_lesson(indexed: Path) -> None:
-    planned = load_buffer(QUERIES[0], "k1", split=indexed)
-    lesson, unit = planned.manifest.sessions
-    oracle = Selector("thumbnail", rule="oracle")
-    turned = remade(indexed, [unit, lesson])
-    assert oracle.select(turned, planned.query.frame()) == (32, 80)
-    with pytest.raises(InvalidOptionError, match="no lesson"):
-        oracle.select(remade(indexed, [unit]), planned.query.frame())
 
 
 def test_what_identifies_a_selector(indexed: Path) -> None:
