@@ -21,12 +21,12 @@ from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
-from robomme_interference_data.sampling import lesson_frames, lesson_share
+from robomme_interference_data.sampling import even_sample, lesson_frames, lesson_share
 from robomme_interference_data.simulators.base import Observation, Simulator, action_array
 from robomme_interference_data.split import Split
 
 if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.selector import Selection, Selector
+    from robomme_interference_data.retrieval.selector import Selector
 
 __all__ = ["read_ahead", "run_rollout"]
 
@@ -71,7 +71,6 @@ def run_rollout(
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)  # no time limit
     buffer = split.load(item.episode, item.condition)
-    chosen: Selection | None = None
     start, stop = 0, len(buffer)
     with ExitStack() as stack:
         history = None
@@ -87,8 +86,7 @@ def run_rollout(
             check_lesson(buffer.query, demonstration, first)
         with clock.part("history_s"):
             if selector is not None and len(buffer):
-                chosen = selector.select(buffer, first.images[selector.camera])
-                start, stop = chosen.start, chosen.stop
+                start, stop = selector.select(buffer, first.images[selector.camera])
                 check_history(name_system(run.system), {item.condition: stop - start})
         if clip is not None:
             clip.begin(buffer, start, stop, first, info)
@@ -114,7 +112,7 @@ def run_rollout(
         history_frames=stop - start,
         lesson_frames=lesson_frames(buffer.sessions, start, stop),
         lesson_share=lesson_share(buffer.sessions, start, stop) if stop > start else None,
-        **_retrieval_columns(selector, chosen),
+        **_retrieval_columns(selector, buffer, start, stop),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
@@ -163,12 +161,16 @@ def _checked(actions: Any) -> NDArray[np.float32]:
         raise PolicyError(f"the policy's answer: {error.message}", error.hint) from None
 
 
-def _retrieval_columns(selector: "Selector | None", chosen: "Selection | None") -> dict[str, Any]:
+def _retrieval_columns(
+    selector: "Selector | None", buffer: Buffer, start: int, stop: int
+) -> dict[str, Any]:
     columns: dict[str, Any] = {"retrieval_model": selector.name} if selector else {}
-    if chosen is not None:
-        columns |= {"retrieval_start": chosen.start, "retrieval_stop": chosen.stop}
-        for part in ("lesson", "filler", "query"):
-            columns[f"retrieval_selected_{part}_fraction"] = getattr(chosen, f"{part}_fraction")
+    if selector is not None and len(buffer):
+        columns |= {"retrieval_start": start, "retrieval_stop": stop}
+        frames, share = len(even_sample(stop - start)), lesson_share(buffer.sessions, start, stop)
+        filler = (frames - 1 - round(share * frames)) / frames
+        for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
+            columns[f"retrieval_selected_{part}_fraction"] = fraction
     return columns
 
 

@@ -9,17 +9,16 @@ threshold that is fitted on a split must not be graded on the same split without
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.records import Session
 from robomme_interference_data.retrieval.grade import ALL, grade
 from robomme_interference_data.retrieval.select import Measured, Rule
-from robomme_interference_data.tables import Column, Table
+from robomme_interference_data.tables import Table
 
 __all__ = ["Calibration", "Trial", "calibrate", "sweep_steps"]
 
@@ -34,8 +33,7 @@ class Trial:
         threshold: The threshold.
         family: Whose queries it was tried on, or `ALL`.
         condition: Under which condition, or `ALL`.
-        purity: Mean over these buffers.
-        coverage: The same.
+        purity, coverage: Means over these buffers.
     """
 
     threshold: float
@@ -73,56 +71,41 @@ class Calibration:
     held_out: tuple[Trial, ...]
     sweep: tuple[Trial, ...]
 
-    @property
-    def conditions(self) -> tuple[str, ...]:
-        """Names of the conditions, in order."""
-        return tuple(dict.fromkeys(trial.condition for trial in self.sweep))
-
     def text(self, title: str) -> str:
         """Say it for a terminal."""
         apart = self.lowest_percentile - self.cut_percentile
         gap = f"they overlap by {-apart:.3f}: no threshold parts them"
         if apart >= 0:
             gap = f"{apart:.3f} lie between them"
-        lines = (
-            f"{title}\n",
+        said = (
             f"Fitted by the released rule: {self.threshold:.3f}; in use ({self.rule}): "
-            f"{self.in_use:.3f}",
+            f"{self.in_use:.3f}\n"
             f"99th percentile of {len(self.cuts)} true cuts: {self.cut_percentile:.3f}; 1st "
             f"percentile of the lowest cosine inside {len(self.lowest)} sessions: "
-            f"{self.lowest_percentile:.3f}; {gap}",
+            f"{self.lowest_percentile:.3f}; {gap}\n"
             "Each stored span counts once, and each cut between the same two. Fitted and tried on "
-            "the same split; only the families left out below are unseen.",
+            "the same split; only the families left out below are unseen."
         )
-        parts = ["\n".join(lines)]
+        parts = [title, said]
         if self.held_out:
             fitted = [one.threshold for one in self.held_out]
             head = (
                 "Fitted without any frame of one family, tried on it: thresholds from "
                 f"{min(fitted):.3f} to {max(fitted):.3f}"
             )
-            columns = [Column("left_out"), Column("threshold", "ratio"), *_shares()]
+            columns = "left_out threshold:ratio purity:rate coverage:rate"
             rows = [(o.family, o.threshold, o.purity, o.coverage) for o in self.held_out]
-            parts.append(Table("held_out", head, tuple(columns), tuple(rows)).text())
-        by_cut: dict[float, list[Trial]] = {}
-        for trial in self.sweep:
-            by_cut.setdefault(trial.threshold, []).append(trial)
+            parts.append(Table.make("held_out", head, columns, rows).text())
+        conditions = dict.fromkeys(one.condition for one in self.sweep)
+        names = [f"{part}_{name}:rate" for part in ("purity", "coverage") for name in conditions]
         swept = [
-            (f"{cut:.2f}", *(t.purity for t in trials), *(t.coverage for t in trials))
-            for cut, trials in by_cut.items()
+            (f"{cut:.2f}", *(one.purity for one in trials), *(one.coverage for one in trials))
+            for cut, found in groupby(self.sweep, key=lambda one: one.threshold)
+            for trials in [list(found)]
         ]
-        columns = [Column("threshold"), *_shares(*(f"_{name}" for name in self.conditions))]
         head = "Other thresholds, all families"
-        parts.append(Table("sweep", head, tuple(columns), tuple(swept)).text())
+        parts.append(Table.make("sweep", head, " ".join(["threshold", *names]), swept).text())
         return "\n\n".join(parts)
-
-
-def _shares(*endings: str) -> list[Column]:
-    return [
-        Column(share + ending, "rate")
-        for share in ("purity", "coverage")
-        for ending in endings or ("",)
-    ]
 
 
 def calibrate(measured: Sequence[Measured], rule: Rule, thresholds: Sequence[float]) -> Calibration:
@@ -136,36 +119,37 @@ def calibrate(measured: Sequence[Measured], rule: Rule, thresholds: Sequence[flo
     Raises:
         InvalidOptionError: There is no true cut, or no session with two frames.
     """
-    threshold, cut_percentile, lowest_percentile = _fit(measured)
+    threshold, high, low = _fit(measured)
     families = dict.fromkeys(one.episode_id.family for one in measured)
-    by_family = {f: [m for m in measured if m.episode_id.family == f] for f in families}
-    held_out = [
-        _trial(_fit(measured, family)[0], family, ALL, within)
-        for family, within in by_family.items()
-        if len(families) > 1
-    ]
-    names = [one.name for one in in_order({one.condition for one in measured})]
-    by_condition = {name: [m for m in measured if m.condition == name] for name in names}
-    sweep = [
-        _trial(cut, ALL, name, within)
-        for cut in thresholds
-        for name, within in by_condition.items()
-    ]
+    conditions = [one.name for one in in_order({one.condition for one in measured})]
+    cuts, lowest = _true_cosines(measured)
     return Calibration(
-        str(rule),
-        rule.threshold(measured[0].typical),
-        threshold,
-        tuple(_true_cuts(measured)),
-        tuple(_lowest_inside(measured)),
-        cut_percentile,
-        lowest_percentile,
-        tuple(held_out),
-        tuple(sweep),
+        rule=str(rule),
+        in_use=rule.threshold(measured[0].typical),
+        threshold=threshold,
+        cuts=tuple(cuts),
+        lowest=tuple(lowest),
+        cut_percentile=high,
+        lowest_percentile=low,
+        held_out=tuple(
+            _trial(measured, _fit(measured, family)[0], family=family)
+            for family in families
+            if len(families) > 1
+        ),
+        sweep=tuple(
+            _trial(measured, cut, condition=name) for cut in thresholds for name in conditions
+        ),
     )
 
 
-def _trial(cut: float, family: str, condition: str, measured: Iterable[Measured]) -> Trial:
-    grades = [grade(one, Rule(cut=cut)) for one in measured]
+def _trial(
+    measured: Sequence[Measured], cut: float, *, family: str = ALL, condition: str = ALL
+) -> Trial:
+    grades = [
+        grade(one, Rule(cut=cut))
+        for one in measured
+        if family in (ALL, one.episode_id.family) and condition in (ALL, one.condition)
+    ]
     purity, coverage = np.array([(g.purity, g.coverage) for g in grades], float).mean(axis=0)
     return Trial(cut, family, condition, float(purity), float(coverage))
 
@@ -176,7 +160,7 @@ def _fit(measured: Sequence[Measured], without: str | None = None) -> tuple[floa
     `without` is a family to leave out: its queries, and every session and cut of it elsewhere.
     """
     kept = [one for one in measured if one.episode_id.family != without]
-    cuts, lowest = _true_cuts(kept, without), _lowest_inside(kept, without)
+    cuts, lowest = _true_cosines(kept, without)
     if not cuts or not lowest:
         missing = "cut between sessions" if not cuts else "session of two frames or more"
         raise InvalidOptionError(
@@ -187,32 +171,27 @@ def _fit(measured: Sequence[Measured], without: str | None = None) -> tuple[floa
     return round((high + low) / 2, _DIGITS), round(high, _DIGITS), round(low, _DIGITS)
 
 
-def _stored(session: Session) -> tuple[Any, ...]:
-    """Return what names the stored frames of a session, the same in every buffer of a split."""
-    entry = session.entry
-    return entry.dataset, entry.episode_index, entry.start, entry.stop, entry.repeat
+def _true_cosines(
+    measured: Iterable[Measured], without: str | None = None
+) -> tuple[list[float], list[float]]:
+    """Return the cosines across true cuts, and the lowest inside each session, both ascending.
 
-
-def _true_cuts(measured: Iterable[Measured], without: str | None = None) -> list[float]:
-    """Return the cosines across true cuts, ascending; each pair of stored spans once."""
-    found = {
-        (_stored(before), _stored(after)): float(one.adjacent[after.start - 1])
-        for one in measured
-        for before, after in pairwise(one.sessions)
-        if without not in (before.family, after.family)
-    }
-    return sorted(found.values())
-
-
-def _lowest_inside(measured: Iterable[Measured], without: str | None = None) -> list[float]:
-    """Return the lowest cosine of adjacent frames inside each session, each once, ascending."""
-    found = {
-        _stored(session): float(one.adjacent[session.start : session.stop - 1].min())
-        for one in measured
-        for session in one.sessions
-        if len(session) > 1 and session.family != without
-    }
-    return sorted(found.values())
+    Each stored span counts once, and each cut between the same two.
+    """
+    cuts: dict[Any, float] = {}
+    lowest: dict[Any, float] = {}
+    for one in measured:
+        before: tuple[Any, ...] | None = None
+        for session in one.sessions:
+            entry = session.entry
+            stored = entry.dataset, entry.episode_index, entry.start, entry.stop, entry.repeat
+            here = None if session.family == without else stored
+            if before and here:
+                cuts[before, here] = float(one.adjacent[session.start - 1])
+            if here and len(session) > 1:
+                lowest[here] = float(one.adjacent[session.start : session.stop - 1].min())
+            before = here
+    return sorted(cuts.values()), sorted(lowest.values())
 
 
 def sweep_steps(first: float, last: float) -> list[float]:
@@ -224,5 +203,4 @@ def sweep_steps(first: float, last: float) -> list[float]:
     if not -1 <= first <= last <= 1:
         expected = "two cosines, the lower one first, such as 0.80 0.99"
         raise InvalidOptionError.expected("sweep", (first, last), expected)
-    count = int((last - first) / 0.01 + 1e-6) + 1
-    return [round(first + step / 100, _DIGITS) for step in range(count)]
+    return np.arange(first, last + 1e-6, 0.01).round(_DIGITS).tolist()

@@ -22,22 +22,20 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
     """Draw purity and coverage by condition: of one rule by family, or of several, all families.
 
     Raises:
-        InvalidOptionError: `out` has another suffix than `.png` or `.svg`, or cannot be written.
-        MissingExtraError: matplotlib is not installed.
+        InvalidOptionError, MissingExtraError: See `open_figure` and `save_figure`.
     """
-    rules = list(dict.fromkeys(cell.rule for cell in cells))
-    every = [cell for cell in cells if cell.family == ALL]
-    panels: list[tuple[str, list[tuple[str, str, list[Cell]]]]] = []
+    rules = dict.fromkeys(cell.rule for cell in cells)
+    panels: dict[str, list[tuple[str, str, list[Cell]]]] = {}
     if len(rules) == 1:
-        for family in [ALL, *dict.fromkeys(c.family for c in cells if c.family != ALL)]:
+        for family in dict.fromkeys([ALL, *(cell.family for cell in cells)]):
             here = [cell for cell in cells if cell.family == family]
             name = "All families" if family == ALL else family
-            panels.append((f"{name} (n = {_most(here)})", [(s, s, here) for s in _SHARES]))
+            panels[name] = [(share, share, here) for share in _SHARES]
         wide, width, height = min(5, len(panels)), 2.0, 1.9
     else:
+        every = {rule: [c for c in cells if (c.rule, c.family) == (rule, ALL)] for rule in rules}
         for share in _SHARES:
-            lines = [(rule, share, [c for c in every if c.rule == rule]) for rule in rules]
-            panels.append((f"{share}, all families (n = {_most(every)})", lines))
+            panels[f"{share}, all families"] = [(rule, share, every[rule]) for rule in rules]
         wide, width, height = 2, 4.2, 3.0
     high = -(-len(panels) // wide)
     names = [one.name for one in in_order({cell.condition for cell in cells})]
@@ -46,8 +44,9 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
         grid = figure.subplots(high, wide, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()
-        for axes, (head, lines) in zip(grid.flat, panels, strict=False):
-            axes.set_title(head, size=8, color=INK)
+        for axes, (name, lines) in zip(grid.flat, panels.items(), strict=False):
+            most = max(cell.queries for *_, here in lines for cell in here)
+            axes.set_title(f"{name} (n = {most})", size=8, color=INK)
             for number, (label, share, here) in enumerate(lines):
                 shift = 0.08 * (number - (len(lines) - 1) / 2)
                 places = {name: place + shift for place, name in enumerate(names)}
@@ -63,10 +62,6 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
         look = {"loc": "lower center", "ncols": min(4, len(named)), "frameon": False}
         figure.legend(list(named.values()), list(named), fontsize=8, **look)
         save_figure(figure, out)
-
-
-def _most(cells: Sequence[Cell]) -> int:
-    return max(cell.queries for cell in cells)
 
 
 def _line(
@@ -142,9 +137,9 @@ def _distributions(axes: Any, found: Calibration) -> None:
 
 def _sweep(axes: Any, found: Calibration) -> None:
     for number, share in enumerate(_SHARES):
-        for name in found.conditions:
+        for name in dict.fromkeys(trial.condition for trial in found.sweep):
             here = [trial for trial in found.sweep if trial.condition == name]
-            last = name == found.conditions[-1]
+            last = name == found.sweep[-1].condition
             axes.plot(
                 [trial.threshold for trial in here],
                 [100 * getattr(trial, share) for trial in here],

@@ -44,8 +44,7 @@ def draw_retrieval(
         out: File to write, `.png` or `.svg`.
 
     Raises:
-        InvalidOptionError: `out` has another suffix or cannot be written.
-        MissingExtraError: matplotlib is not installed.
+        InvalidOptionError, MissingExtraError: See `open_page`.
         MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
     """
     with open_page(out, _WIDTH) as page:
@@ -166,17 +165,16 @@ class _Picture:
         axes.plot(np.arange(len(values)) + 0.5, values, color=_CURVE_INK, linewidth=0.9)
         span = self.choice.span
         axes.axvspan(*span, facecolor="none", edgecolor=_CHOSEN, linewidth=1.2, zorder=3)
-        for segment, score in zip(self.choice.segments, self.choice.scores, strict=True):
-            if score is not None:
-                color = _CHOSEN if segment == span else GREY
-                axes.plot(segment, (score, score), color=color, linewidth=1.2)
-        label = f"closest frame, {found.closest}"
-        mark = {"color": _CHOSEN, "markersize": 9, "zorder": 4, "label": label}
-        axes.plot(found.closest + 0.5, found.cosine, "*", **mark)
-        if found.other is not None:
-            label = f"closest outside, {found.other}"
-            mark = {"color": GREY, "markersize": 4.5, "zorder": 4, "label": label}
-            axes.plot(found.other + 0.5, found.other_cosine, "o", **mark)
+        for segment, score in self.choice.scores.items():
+            color = _CHOSEN if segment == span else GREY
+            axes.plot(segment, (score, score), color=color, linewidth=1.2)
+        for name, frame, cosine, color, marker, size in (
+            ("closest frame", found.closest, found.cosine, _CHOSEN, "*", 9),
+            ("closest outside", found.other, found.other_cosine, GREY, "o", 4.5),
+        ):
+            if frame is not None:
+                mark = {"color": color, "markersize": size, "label": f"{name}, {frame}"}
+                axes.plot(frame + 0.5, cosine, marker, zorder=4, **mark)
         _name(
             axes, "cosine of each frame with what the robot sees now; bars: score of each segment"
         )

@@ -7,26 +7,18 @@ least `PASS_MARK` (released reference).
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.conditions import parse_condition
+from robomme_interference_data.conditions import in_order
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.select import Measured, Rule, choose
-from robomme_interference_data.stats import Interval, Resampler, mean, wilson
-from robomme_interference_data.tables import Column, Table, percent
+from robomme_interference_data.stats import Resampler, mean, wilson
+from robomme_interference_data.tables import Table, percent
 
-__all__ = [
-    "ALL",
-    "PASS_MARK",
-    "Cell",
-    "Grade",
-    "cell_table",
-    "cells",
-    "grade",
-    "verdict",
-]
+__all__ = ["ALL", "PASS_MARK", "Cell", "Grade", "cell_table", "cells", "grade", "verdict"]
 
 PASS_MARK = 0.9
 """Least mean purity and mean coverage of a good cell (released reference)."""
@@ -84,17 +76,11 @@ class Cell:
     over episodes for the others, None for a single episode.
 
     Attributes:
-        rule: The rule.
         family: A family, or `ALL`.
-        condition: Name of the condition.
         queries: Query episodes.
         hit: Share of them with a frame of the lesson chosen.
-        purity: Mean purity.
-        coverage: Mean coverage.
-        false_sessions: Mean number of false sessions.
-        true_cuts: Borders between true sessions, in all its queries together.
-        found_cuts: How many of them are borders of segments.
-        false_cuts: Borders of segments inside true sessions.
+        purity, coverage, false_sessions: Means of what `Grade` has.
+        true_cuts, found_cuts, false_cuts: Sums of what `Grade` has.
         passed: Whether mean purity and mean coverage reach the pass mark.
     """
 
@@ -159,15 +145,16 @@ def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
     Rules and families keep the order in which they first occur. The grades are of buffers that
     hold frames of the lesson.
     """
+    groups: dict[tuple[str, str, str], list[Grade]] = {}
+    for one in grades:
+        for family in (one.episode_id.family, ALL):
+            groups.setdefault((one.rule, family, one.condition), []).append(one)
     rules = dict.fromkeys(one.rule for one in grades)
-    families = dict.fromkeys(one.episode_id.family for one in grades)
-    conditions = {one.condition for one in grades}
-    for rule in rules:
-        for family in [*families, ALL]:
-            here = [g for g in grades if g.rule == rule and family in (ALL, g.episode_id.family)]
-            for condition in sorted(conditions, key=lambda name: parse_condition(name).sort_key):
-                if found := [one for one in here if one.condition == condition]:
-                    yield _cell(rule, family, condition, found)
+    families = [*dict.fromkeys(one.episode_id.family for one in grades), ALL]
+    conditions = [one.name for one in in_order({one.condition for one in grades})]
+    for key in product(rules, families, conditions):
+        if key in groups:
+            yield _cell(*key, groups[key])
 
 
 def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Cell:
@@ -175,27 +162,11 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
     # One key: equal values have equal intervals, whatever the rule, family and condition.
     drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
-    purity, coverage, false_sessions = map(_bounds, drawn)
-    return Cell(
-        rule,
-        family,
-        condition,
-        count,
-        hits / count,
-        *wilson(hits, count),
-        *purity,
-        *coverage,
-        *false_sessions,
-        sum(one.true_cuts for one in grades),
-        sum(one.found_cuts for one in grades),
-        sum(one.false_cuts for one in grades),
-        min(purity[0], coverage[0]) >= PASS_MARK,
-    )
-
-
-def _bounds(one: Interval) -> tuple[Any, Any, Any]:
-    low, high = (None if math.isnan(bound) else bound for bound in (one.low, one.high))
-    return one.value, low, high
+    bounds = (None if math.isnan(number) else number for one in drawn for number in one)
+    cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
+    passed = min(one.value for one in drawn[:2]) >= PASS_MARK
+    found: list[Any] = [hits / count, *wilson(hits, count), *bounds, *cuts, passed]
+    return Cell(rule, family, condition, count, *found)
 
 
 # --- in words ----------------------------------------------------------------------------------
@@ -223,15 +194,10 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
     """Return the table for the terminal: one rule by family, or several rules, by condition."""
     several = len({cell.rule for cell in cells}) > 1
     columns = (
-        *(Column(name) for name in ("rule" if several else "family", "condition")),
-        Column("queries", "count"),
-        *(Column(name) for name in ("hit", "purity", "coverage")),
-        Column("false_sessions", "ratio"),
-        Column("cuts_found"),
-        Column("false_cuts", "count"),
-        Column("pass", "flag"),
+        f"{'rule' if several else 'family'} condition queries:count hit purity coverage "
+        "false_sessions:ratio cuts_found false_cuts:count pass:flag"
     )
-    rows = tuple(
+    rows = (
         (
             cell.rule if several else cell.family,
             cell.condition,
@@ -245,7 +211,7 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
         for cell in cells
         if not several or cell.family == ALL
     )
-    return Table("retrieval", title, columns, rows, _NOTE)
+    return Table.make("retrieval", title, columns, rows, _NOTE)
 
 
 def _share(cell: Cell, name: str) -> str:

@@ -8,7 +8,7 @@ import shutil
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -123,7 +123,10 @@ def build_index(
     works = [_Work(root, one, encoder, camera) for root, one in zip(roots, datasets, strict=True)]
     with ExitStack() as held:
         for work in works:
-            held.enter_context(work.held())
+            work.hidden.mkdir(parents=True, exist_ok=True)
+            what = f"another process makes {work.folder}"
+            busy = BuildError(what, "Wait for it to end, or stop it.")
+            held.enter_context(hold(work.hidden / "lock", busy))
         progress.start(encoder.name, sum(sum(work.lengths) for work in works))
         pool: EmbeddingIndex | None = None
         reports = {}
@@ -190,12 +193,6 @@ class _Work:
         kept = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
         self.features = [kept / episode_file(episode) for episode in range(len(self.lengths))]
 
-    def held(self) -> AbstractContextManager[None]:
-        """Keep other processes from making this index."""
-        self.hidden.mkdir(parents=True, exist_ok=True)
-        busy = BuildError(f"another process makes {self.folder}", "Wait for it to end, or stop it.")
-        return hold(self.hidden / "lock", busy)
-
     def found(self, pool: EmbeddingIndex | None) -> IndexHeader | None:
         """Return the header of the index that is there, if it is right."""
         files, revision = self.dataset.files, self.dataset.revision
@@ -237,19 +234,20 @@ class _Work:
 
     def write(self, pool: EmbeddingIndex | None) -> IndexHeader:
         """Write the index, and give it its name."""
-        made, encoder = self.hidden / "made", self.encoder
+        made, encoder, centre = self.hidden / "made", self.encoder, pool.centre if pool else None
         shutil.rmtree(made, ignore_errors=True)
-        centre = pool.centre if pool else self._mean() if encoder.centred else None
+        if pool is None and encoder.centred:  # on the mean, each episode weighing the same
+            means = (np.load(path).mean(axis=0, dtype=np.float64) for path in self.features)
+            centre = np.asarray(sum(means) / len(self.features), np.float32)
         names = [episode_file(episode) for episode in range(len(self.lengths))]
         for name, path in zip(names, self.features, strict=True):
             (made / name).parent.mkdir(parents=True, exist_ok=True)
             embeddings = normalised(np.load(path), centre)
             np.save(made / name, embeddings)
-        typical = (
-            pool.header.typical_cosine
-            if pool
-            else typical_cosine(len(names), lambda episode: np.load(made / names[episode]))
-        )
+        if pool:
+            typical = pool.header.typical_cosine
+        else:
+            typical = typical_cosine(len(names), lambda episode: np.load(made / names[episode]))
         if centre is not None:
             names.append(CENTRE_FILE)
             np.save(made / CENTRE_FILE, centre)
@@ -271,8 +269,3 @@ class _Work:
         shutil.rmtree(self.folder, ignore_errors=True)
         made.rename(self.folder)
         return header
-
-    def _mean(self) -> NDArray[np.float32]:
-        """Return the mean of the features, `(D,) float32`, each episode weighing the same."""
-        means = (np.load(path).mean(axis=0, dtype=np.float64) for path in self.features)
-        return np.asarray(sum(means) / len(self.features), np.float32)

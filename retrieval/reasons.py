@@ -23,11 +23,9 @@ class Reasons:
         grade: The choice, compared with the true lesson.
         score: What the chosen segment was scored by, or None if the rule scores none.
         sessions: Role and source of each session that the chosen part touches, in order.
-        closest: Chosen frame closest to what the robot sees.
-        cosine: Its cosine.
-        other: Frame closest to it outside the chosen part, or None if all was chosen.
-        other_cosine: Its cosine, or None.
-        other_source: Episode that this frame is of, or None.
+        closest, cosine: Chosen frame closest to what the robot sees, and its cosine.
+        other, other_cosine, other_source: Frame closest to it outside the chosen part, its cosine
+            and episode; None if all was chosen.
         lesson: First frame of each part of the true lesson, and the one after its last.
     """
 
@@ -45,7 +43,7 @@ class Reasons:
 
     def text(self) -> str:
         """Say it in a few lines."""
-        one = self.grade
+        one, method = self.grade, self.grade.rule.partition("/")[0]
         score = "" if self.score is None else f", {self.score:.3f}"
         parts = f"{one.segments} segment{'s' if one.segments > 1 else ''}"
         outside = "nothing lies outside"
@@ -58,7 +56,7 @@ class Reasons:
             f"{one.history_frames} history frames, cut into {parts} where the cosine of "
             f"adjacent frames is below {one.threshold:.3f}",
             f"Chosen: frames {one.start} to {one.stop - 1}, of {', '.join(self.sessions)}",
-            f"Why: {one.rule.partition('/')[0]} takes {METHODS[one.rule.partition('/')[0]]}{score}",
+            f"Why: {method} takes {METHODS[method]}{score}",
             f"What the robot sees now is closest to frame {self.closest} of these, with cosine "
             f"{self.cosine:.3f}; {outside}",
             f"The lesson is frames {lesson}: {self.graded()}" if lesson else self.graded(),
@@ -83,18 +81,17 @@ def reasons(
     closest = start + int(np.argmax(alike[start:stop]))
     outside = np.concatenate([np.arange(start), np.arange(stop, len(alike))])
     other = int(outside[np.argmax(alike[outside])]) if len(outside) else None
-    session = buffer.session_index
-    touched = buffer.sessions[int(session[start]) : int(session[stop - 1]) + 1]
+    touched = [one for one in buffer.sessions if one.start < stop and one.stop > start]
     return Reasons(
         encoder,
         camera,
         grade(measured, rule),
-        dict(zip(choice.segments, choice.scores, strict=True)).get((start, stop)),
+        choice.scores.get(choice.span),
         tuple(f"{one.role} {one.source}" for one in touched),
         closest,
         float(alike[closest]),
         other,
         None if other is None else float(alike[other]),
-        None if other is None else str(buffer.sessions[session[other]].source),
+        None if other is None else str(buffer.sessions[buffer.session_index[other]].source),
         measured.lesson,
     )

@@ -4,7 +4,7 @@ Every rule is a function of the history's cosines and a threshold. The true sess
 `oracle` alone, which is there to compare with.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, Final, Literal, Self
@@ -17,24 +17,10 @@ from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Session
-from robomme_interference_data.retrieval.segment import (
-    Span,
-    adjacent_cosines,
-    cosines,
-    segments,
-)
+from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines, segments
 
-__all__ = [
-    "ADAPTIVE",
-    "METHODS",
-    "MIN_FRAMES",
-    "Choice",
-    "Measured",
-    "Rule",
-    "choose",
-    "measure",
-    "parse_rules",
-]
+__all__ = ["METHODS", "MIN_FRAMES", "Choice", "Measured", "Rule"]
+__all__ += ["choose", "measure", "parse_rules"]
 
 ADAPTIVE: Final = "adaptive"
 
@@ -88,13 +74,8 @@ class Rule:
     def parse(cls, text: str, published: float | None = None) -> Self:
         """Read `METHOD` or `METHOD/CUT`, such as `max`, `mean/0.9` or `max/adaptive`.
 
-        Args:
-            text: The rule.
-            published: The cut that stands where the text names none: the one published for the
-                encoder, or None for the adaptive one.
-
-        Raises:
-            UnknownNameError, InvalidOptionError: See the class.
+        Where the text names no cut it is `published`, the encoder's own, or adaptive if that is
+        None.
         """
         method, slash, text = text.partition("/")
         if not slash:
@@ -116,12 +97,9 @@ class Rule:
 
 
 def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
-    """Read rules as `Rule.parse` does; `all` stands for every method, and for both cuts.
+    """Read rules as `Rule.parse` does, each once, in the order given.
 
-    A text may hold several, with commas between them.
-
-    Returns:
-        The rules in the order given, each once.
+    A text may hold several, with commas between them; `all` is every method, and both cuts.
     """
     every = [*METHODS, f"max/{ADAPTIVE}"]
     given = (name for text in texts for name in text.split(","))
@@ -167,8 +145,8 @@ def measure(
 
     Args:
         buffer: The buffer.
-        encoder: Name of the encoder whose index is looked up.
-        camera: Camera whose index is looked up.
+        encoder: Name of the encoder.
+        camera: Name of the camera.
         query: Embedding of the query frame, `(D,)`, of length 1; None for the stored first live
             observation.
 
@@ -194,14 +172,14 @@ class Choice:
         threshold: Cosine of adjacent frames below which the history was cut.
         frames: The chosen frames, ascending, `(n,) int64`, n at least 1.
         segments: All segments in order.
-        scores: What each segment was scored by; None for those too short to be chosen, and for
-            all if the method scores none.
+        scores: What segments were scored by; without those too short to be chosen, and empty if
+            the method scores none.
     """
 
     threshold: float
     frames: NDArray[np.int64]
     segments: tuple[Span, ...]
-    scores: tuple[float | None, ...]
+    scores: Mapping[Span, float]
 
     @property
     def span(self) -> Span:
@@ -239,12 +217,11 @@ def choose(measured: Measured, rule: Rule) -> Choice:
     candidates = [(a, b) for a, b in spans if b - a >= MIN_FRAMES] or list(spans)
     scores: dict[Span, float] = {}
     if rule.method == "top32":
-        order = np.argsort(-measured.alike, kind="stable")[:SAMPLE_FRAMES]
-        return Choice(threshold, np.sort(order), spans, (None,) * len(spans))
-    if rule.method in _SCORES:
-        score = _SCORES[rule.method]
+        closest = np.argsort(-measured.alike, kind="stable")[:SAMPLE_FRAMES]
+        return Choice(threshold, np.sort(closest), spans, scores)
+    if score := _SCORES.get(rule.method):
         scores = {span: score(measured.alike[slice(*span)]) for span in candidates}
-        chosen = max(candidates, key=lambda span: scores[span])  # the first of equal ones
+        chosen = max(scores, key=lambda span: scores[span])  # the first of equal ones
     elif rule.method == "last":
         chosen = candidates[-1]
     elif rule.method == "random":
@@ -255,5 +232,4 @@ def choose(measured: Measured, rule: Rule) -> Choice:
         chosen = measured.lesson[0]
     else:
         raise InvalidOptionError(f"{about}: there is no lesson that oracle could choose")
-    frames = np.arange(*chosen, dtype=np.int64)
-    return Choice(threshold, frames, spans, tuple(map(scores.get, spans)))
+    return Choice(threshold, np.arange(*chosen), spans, scores)

@@ -1,6 +1,5 @@
 """The retrieval step of a rollout: embed what the robot sees, look its session up."""
 
-from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
 
@@ -9,42 +8,17 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.embeddings import (
-    EmbeddingIndex,
-    encoder_id,
-    index_folder,
-    normalised,
-)
+from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
 from robomme_interference_data.errors import InvalidOptionError, StaleIndexError
 from robomme_interference_data.retrieval.encoders import (
     encoder_digest,
     make_encoder,
     published_threshold,
 )
+from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.sampling import even_sample, lesson_share
 
-__all__ = ["Selection", "Selector"]
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The span of a history that is handed to the policy.
-
-    Attributes:
-        start: First frame in the buffer.
-        stop: Frame after the last one.
-        lesson_fraction: Share of lesson frames in an even 32-frame sample of the span and the
-            first live observation, as in the released CSV.
-        filler_fraction: The same for frames of other sessions.
-        query_fraction: The same for the first live observation.
-    """
-
-    start: int
-    stop: int
-    lesson_fraction: float
-    filler_fraction: float
-    query_fraction: float
+__all__ = ["Selector"]
 
 
 class Selector:
@@ -102,7 +76,7 @@ class Selector:
         """
         header = self._index(buffer).header
         return {
-            "encoder": encoder_id(self._encoder.name),
+            "encoder": header.encoder.name,
             "fingerprint": header.encoder.sha256,
             "camera": self.camera,
             "method": self.rule.method,
@@ -110,12 +84,15 @@ class Selector:
             "threshold": self.rule.threshold(header.typical_cosine),
         }
 
-    def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Selection:
+    def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Span:
         """Choose the span of a buffer that goes with an image.
 
         Args:
             buffer: The history.
             image: The first live observation, `(H, W, 3) uint8` RGB.
+
+        Returns:
+            First frame in the buffer, and the one after the last.
 
         Raises:
             MissingIndexError: The data has no embeddings of this encoder.
@@ -129,12 +106,7 @@ class Selector:
             raise InvalidOptionError.expected("image", given, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = normalised(features, index.centre)[0]
-        measured = measure(buffer, self._encoder.name, self.camera, query)
-        start, stop = choose(measured, self.rule).span
-        frames = len(even_sample(stop - start))
-        lesson = lesson_share(buffer.sessions, start, stop)
-        others = frames - 1 - round(lesson * frames)
-        return Selection(start, stop, lesson, others / frames, 1 / frames)
+        return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).span
 
     def _index(self, buffer: Buffer) -> EmbeddingIndex:
         """Return the index of the query, made with this very encoder."""

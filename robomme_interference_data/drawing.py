@@ -16,17 +16,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
 from robomme_interference_data.files import atomic_path
 
-__all__ = [
-    "GREY",
-    "INK",
-    "Page",
-    "ink_on",
-    "open_figure",
-    "open_page",
-    "save_figure",
-    "tidy",
-    "tint",
-]
+__all__ = ["GREY", "INK", "Page", "ink_on", "open_figure", "open_page", "save_figure"]
+__all__ += ["tidy", "tint"]
 
 INK, GREY = "#222222", "#767676"
 
@@ -50,13 +41,13 @@ def open_page(out: Path, width: float) -> Iterator["Page"]:
         InvalidOptionError: `out` has another suffix or cannot be written.
         MissingExtraError: matplotlib is not installed.
     """
-    _check(out)
+    _suffix(out)  # before anything is drawn
     with open_figure() as figure:
         page = Page(figure, width)
         yield page
-        page.figure.set_size_inches(width, page.height)
+        figure.set_size_inches(width, page.height)
         page.axes.set(xlim=(0, width), ylim=(page.height, 0))
-        save_figure(page.figure, out)
+        save_figure(figure, out)
 
 
 @contextmanager
@@ -89,8 +80,7 @@ def save_figure(figure: Any, out: Path) -> None:
     Raises:
         InvalidOptionError: `out` has another suffix or cannot be written.
     """
-    _check(out)
-    suffix = out.suffix.lower()
+    suffix = _suffix(out)
     try:
         with atomic_path(out) as partial:
             metadata = dict.fromkeys(_METADATA[suffix])
@@ -101,16 +91,16 @@ def save_figure(figure: Any, out: Path) -> None:
         ) from error
 
 
-def _check(out: Path) -> None:
-    if out.suffix.lower() not in _METADATA:
+def _suffix(out: Path) -> str:
+    suffix = out.suffix.lower()
+    if suffix not in _METADATA:
         raise InvalidOptionError.expected(
             "picture",
             str(out),
             f"a name that ends in {' or '.join(_METADATA)}",
             f"For example: {out.with_suffix('.png') if out.name else out / 'strip.png'}",
         )
-    if out.is_dir():
-        raise InvalidOptionError(f"{out} is a folder; expected the name of a file to write")
+    return suffix
 
 
 class Page:
@@ -122,7 +112,6 @@ class Page:
 
     def __init__(self, figure: Any, width: float):
         self.figure = figure
-        self.width = width
         self.height = width
         self.axes = figure.add_axes((0, 0, 1, 1))
         self.axes.set_axis_off()

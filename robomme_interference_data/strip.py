@@ -14,16 +14,7 @@ from robomme_interference_data.sampling import even_sample, spread
 __all__ = ["Block", "arrange", "draw_strip", "session_colors"]
 
 LESSON_COLOR = "#D55E00"
-COLORS = (
-    "#56B4E9",
-    "#E69F00",
-    "#009E73",
-    "#CC79A7",
-    "#0072B2",
-    "#F0E442",
-    "#999999",
-    "#000000",
-)
+COLORS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#0072B2", "#F0E442", "#999999", "#000000")
 """Okabe and Ito's palette, which people with a colour vision deficiency can tell apart too, and
 grey; its vermilion is the lesson's."""
 
@@ -122,8 +113,7 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
         camera: Name of the camera.
 
     Raises:
-        InvalidOptionError: `out` has another suffix or cannot be written.
-        MissingExtraError: matplotlib is not installed.
+        InvalidOptionError, MissingExtraError: See `open_page`.
         UnknownNameError: There is no such camera.
         MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
     """
@@ -192,20 +182,14 @@ def _draw_sessions(
 
 
 def _draw_card(
-    page: Page,
-    session: Session,
-    number: int,
-    color: str,
-    place: tuple[float, float, float, float],
+    page: Page, session: Session, number: int, color: str, place: tuple[float, ...]
 ) -> None:
     """Draw all of a session but its frames; `place` is x, y, width and height."""
-    x, y, width, height = place
-    lesson = session.role == "lesson"
-    left, right, inner = x, x + width, width
-    x, width = x - _EDGE, width + 2 * _EDGE
+    left, y, inner, height = place
+    right, lesson = left + inner, session.role == "lesson"
     edge, line = (color, 1.8) if lesson else (_GREY, 0.5)
-    page.box(x, y, width, height, fill=tint(color, 0.13), edge=edge, line=line)
-    page.box(x, y, width, _BAND, fill=color, edge=edge, line=line)
+    for tall, fill in ((height, tint(color, 0.13)), (_BAND, color)):
+        page.box(left - _EDGE, y, inner + 2 * _EDGE, tall, fill=fill, edge=edge, line=line)
     role = f"{number}  {session.role.upper() if lesson else session.role}"
     frames = len(session)
     count = f"{frames} frame{'s' if frames > 1 else ''}"

@@ -15,8 +15,8 @@ __all__ = ["Encoder", "encoder_digest", "encoder_name", "make_encoder", "publish
 
 _KINDS = ("siglip", "thumbnail")
 
-_PUBLISHED = {"siglip": 0.923}
-"""Encoder to the paper's cut (section "Adding Retrieval"), which was made for it alone."""
+_PAPER_CUT = 0.923
+"""The paper's cut (section "Adding Retrieval"), which was made for its encoder alone."""
 
 
 class Encoder(Protocol):
@@ -30,21 +30,16 @@ class Encoder(Protocol):
         centred: Whether the mean over a data set is taken off the features before they are
             normalised.
         batch: Images that it takes best at a time.
+        computed_in: Where and in which precision it computes, such as `cpu, float32`.
+        fingerprint: What determines the features up to that precision, as plain values: model,
+            weights, preprocessing.
     """
 
     name: str
     centred: bool
     batch: int
-
-    @property
-    def fingerprint(self) -> dict[str, Any]:
-        """What determines the features, as plain values: model, weights, preprocessing."""
-        ...
-
-    @property
-    def computed_in(self) -> str:
-        """Where and in which precision it computes, in words."""
-        ...
+    computed_in: str
+    fingerprint: dict[str, Any]
 
     def prepare(self, images: NDArray[np.uint8]) -> Any:
         """Preprocess images, `(N, H, W, 3) uint8` RGB; may be called from several threads."""
@@ -87,7 +82,7 @@ def published_threshold(name: str) -> float | None:
 
     A folder is not known to hold the published weights, whatever its name: None.
     """
-    return _PUBLISHED.get(encoder_id(encoder_name(name)))
+    return _PAPER_CUT if encoder_id(encoder_name(name)) == "siglip" else None
 
 
 def make_encoder(name: str, *, device: str | None = None, batch: int | None = None) -> Encoder:
@@ -112,4 +107,4 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
         return Thumbnail()
     from robomme_interference_data.retrieval.encoders.siglip import Siglip
 
-    return Siglip(model or PAPER_ENCODER, device=device, batch=batch)
+    return Siglip(model or PAPER_ENCODER, device, batch)

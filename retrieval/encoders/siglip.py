@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -52,9 +51,7 @@ class Siglip:
 
     centred = False
 
-    def __init__(
-        self, model: str = PAPER_ENCODER, *, device: str | None = None, batch: int | None = None
-    ):
+    def __init__(self, model: str, device: str | None = None, batch: int | None = None):
         try:
             import PIL  # noqa: F401 - the image processor needs it
             import torch
@@ -64,16 +61,14 @@ class Siglip:
             raise MissingExtraError.needs("the encoder siglip", library, "retrieval") from error
         self._given = model, device, batch
         self._torch = torch
-        self._transformers_version = str(transformers.__version__)
         self.name = encoder_name(f"siglip:{model}")
-        self._model: str | None = None
-        self._revision: str | None = None
         files = locate(model, "model")
+        origin: dict[str, str | None] = {"model": None, "revision": None}
         if isinstance(files, LocalFiles):
             folder = files.root
         else:
             folder = files.snapshot(*_FILES)
-            self._model, self._revision = files.repo_id, files.commit
+            origin = {"model": files.repo_id, "revision": files.commit}
         try:
             self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
             torch.empty(0, device=self._device)
@@ -83,36 +78,28 @@ class Siglip:
         self.batch = batch or (32 if self._device.type == "cuda" else 8)
         with _quiet(transformers):
             self._vision, self._processor = _load(transformers, model, folder)
-        self._weights_sha256 = _weights_digest(self._vision)
+        tower = json.loads(self._vision.config.to_json_string())
+        self.fingerprint: dict[str, Any] = {
+            "name": "siglip",
+            "version": _VERSION,
+            "transformers": str(transformers.__version__),
+            **origin,
+            "weights_sha256": _weights_digest(self._vision),
+            "tower": {key: tower[key] for key in tower if key not in _NOT_COMPUTING},
+            "preprocessing": {
+                "class": type(self._processor).__name__,
+                **json.loads(self._processor.to_json_string()),
+            },
+        }
         self._dtype = torch.float32
         if self._device.type == "cuda":
             self._dtype = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
         self._vision.to(self._device, self._dtype)
+        self.computed_in = f"{self._device.type}, {str(self._dtype).removeprefix('torch.')}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let a worker process load the model itself."""
-        return partial(Siglip, self._given[0], device=self._given[1], batch=self._given[2]), ()
-
-    @property
-    def fingerprint(self) -> dict[str, Any]:
-        """What determines the features, up to the precision in which they are computed."""
-        tower = json.loads(self._vision.config.to_json_string())
-        settings = json.loads(self._processor.to_json_string())
-        return {
-            "name": "siglip",
-            "version": _VERSION,
-            "transformers": self._transformers_version,
-            "model": self._model,
-            "revision": self._revision,
-            "weights_sha256": self._weights_sha256,
-            "tower": {key: tower[key] for key in tower if key not in _NOT_COMPUTING},
-            "preprocessing": {"class": type(self._processor).__name__, **settings},
-        }
-
-    @property
-    def computed_in(self) -> str:
-        """Device and precision, such as `cpu, float32`."""
-        return f"{self._device.type}, {str(self._dtype).removeprefix('torch.')}"
+        return Siglip, self._given
 
     def prepare(self, images: NDArray[np.uint8]) -> Any:
         """Preprocess images as the model's own image processor does."""

@@ -30,10 +30,8 @@ class Thumbnail:
     batch = 16  # the distance of key frames, from which threads decode
     computed_in = "numpy"
 
-    @property
-    def fingerprint(self) -> dict[str, Any]:
-        """What determines the features."""
-        return {"name": self.name, "version": 1, "cells": CELLS}
+    def __init__(self) -> None:
+        self.fingerprint: dict[str, Any] = {"name": self.name, "version": 1, "cells": CELLS}
 
     def prepare(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features, `(N, 528) float32`: colours from 0 to 1, then differences."""

@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Generator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,8 +104,7 @@ class Chooses:
     name, camera = "chooses", "front"
 
     def __init__(self, start: int, stop: int):
-        shares = {"lesson_fraction": 0.25, "filler_fraction": 0.5, "query_fraction": 0.25}
-        self.chosen = SimpleNamespace(start=start, stop=stop, **shares)
+        self.chosen = start, stop
 
     def select(self, buffer: Buffer, image: np.ndarray) -> Any:
         return self.chosen
@@ -120,17 +118,17 @@ def test_retrieval_hands_over_the_span_that_it_chose_and_clips_show_it() -> None
     assert (row.retrieval_model, row.retrieval_start, row.retrieval_stop) == ("chooses", 40, 60)
     # 20 frames and the live one are all in the sample; 8 of them are of the 48 frames' lesson.
     assert (row.history_frames, row.lesson_frames, row.lesson_share) == (20, 8, 8 / 21)
-    assert row.retrieval_selected_filler_fraction == 0.5
+    assert row.retrieval_selected_lesson_fraction == 8 / 21
+    assert row.retrieval_selected_filler_fraction == 12 / 21
+    assert row.retrieval_selected_query_fraction == 1 / 21
     empty = roll("no-history", Cheat(), selector=Chooses(0, 0))
     assert (empty.retrieval_model, empty.retrieval_start) == ("chooses", None)
 
 
 def test_what_retrieval_chose_keeps_the_position_limit() -> None:
     system = "retrieval-framesamp-modul"  # 4096 positions less 1300 steps
-    long = SimpleNamespace(name="all", camera="front")
-    long.select = lambda *_: SimpleNamespace(start=0, stop=2797)
     with pytest.raises(HistoryTooLongError, match="2797 frames under k7"):
-        roll("k7", Cheat(), selector=long, system=system)
+        roll("k7", Cheat(), selector=Chooses(0, 2797), system=system)
 
 
 # --- the row -----------------------------------------------------------------------------------

@@ -85,15 +85,6 @@ def test_a_family_is_left_out_of_other_buffers_too() -> None:
     assert without.threshold == pytest.approx((0.4 + 0.902) / 2, abs=1e-6)
 
 
-def test_the_lesson_may_lie_anywhere() -> None:
-    cuts = {4: 0.1, 6: 0.9, 11: 0.8}
-    first, second = (made(cuts=cuts, high={5: 1}, lessons=lessons) for lessons in ((0,), (1,)))
-    assert found_in(first).cuts == found_in(second).cuts
-    # Cut before 4 alone, 4 to 14 are chosen: 2 of 11 and 2 of 6, or 5 of 11 and 5 of 5.
-    shares = [found_in(one).sweep[0] for one in (first, second)]
-    assert [(one.purity, one.coverage) for one in shares] == [(2 / 11, 2 / 6), (5 / 11, 1)]
-
-
 def test_nothing_to_fit() -> None:
     alone = made(condition="k0", cuts={}, high={}, spans=((0, 6),))
     with pytest.raises(InvalidOptionError, match="without any cut between sessions"):

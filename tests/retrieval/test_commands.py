@@ -127,25 +127,20 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
     assert first["queries"] == 1 and first["purity_low"] is None
 
 
-WITHOUT_INDEX = "robomme-interference index {bare} --encoder thumbnail"
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ("index nowhere", "build all --source KIND:PATH"),
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
         ("index {bare} --encoder thumbnail:x", "siglip:ID"),
+        ("index {bare} --encoder siglip:", "siglip:ID"),
         ("index {bare} --camera side", "camera 'side'"),
         ("index {bare} --batch 0", "batch 0"),
         ("index {bare} --threads 0", "threads 0"),
         ("index {bare} --workers 0", "workers 0"),
         ("index {bare}/demonstrations", "expected distractor units"),
-        ("retrieval-score {bare}", WITHOUT_INDEX),
-        ("calibrate {bare}", WITHOUT_INDEX),
-        (f"retrieve {EPISODE} k1 --split {{bare}}", WITHOUT_INDEX),
+        ("retrieval-score {bare}", "robomme-interference index {bare} --encoder thumbnail"),
         ("retrieval-score {split} --rules best", "there is no method 'best'"),
-        ("retrieval-score {split} --rules max/2", "cut of max 2.0"),
         ("retrieval-score {split} --encoder clip", "there is no encoder 'clip'"),
         (f"retrieve {EPISODE} k2 --split {{split}}", "condition 'k2'"),
         (f"retrieve {EPISODE} no-history --split {{split}}", "the history is empty"),
@@ -185,30 +180,20 @@ def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
     assert picture(out_file) == (1296, 1098)
 
 
-@pytest.mark.parametrize("rule", ["max/-1", "mean/-1", "last/-1", "random/-1"])
-def test_why_is_the_reason_of_the_rule_and_what_the_score_says(
-    rule: str, run: Run, tmp_path: Path, indexed: Path
-) -> None:
+@pytest.mark.parametrize("rule", ["max/-1", "mean/-1", "last/-1"])
+def test_why_is_the_reason_of_the_rule(rule: str, run: Run, indexed: Path) -> None:
     words = ("retrieve", EPISODE, "k1", "--split", indexed, "--rule", rule)
     code, out, _ = run(*words)
     method, why = rule.partition("/")[0], out.splitlines()[2]
     assert code == 0 and why.startswith(f"Why: {method} takes {select.METHODS[method]}")
     found = json.loads(run(*words, "--json")[1])
     score, grade = found["score"], found["grade"]
-    assert (score is None) == (method in ("last", "random"))
+    assert (score is None) == (method == "last")
     assert why.endswith(select.METHODS[method] if score is None else f", {score:.3f}")
     if method == "max":  # one segment: its score is that of the closest frame
         assert score == found["cosine"]
     assert found["other"] is None and 0 <= found["closest"] < 80
-    run("retrieval-score", indexed, "--rules", rule, "--json", "--out", tmp_path)
-    [row] = (
-        row
-        for row in rows_of(tmp_path / "rows.csv")
-        if (row["episode_id"], row["condition"]) == (EPISODE, "k1")
-    )
-    shown = {name: row[name] for name in row if name in ("start", "stop", "segments", "rule")}
-    assert {name: str(grade[name]) for name in shown} == shown
-    assert (grade["purity"], row["purity"]) == (0.6, "0.600000")  # 48 of 80
+    assert (grade["start"], grade["stop"], grade["purity"]) == (0, 80, 0.6)  # 48 of 80
 
 
 @pytest.mark.parametrize(

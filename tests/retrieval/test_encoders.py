@@ -7,13 +7,8 @@ import pytest
 
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.embeddings import encoder_id, index_folder, normalised
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.retrieval.encoders import (
-    encoder_digest,
-    encoder_name,
-    make_encoder,
-    published_threshold,
-)
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 
 
@@ -46,12 +41,6 @@ def test_normalising() -> None:
     assert rows[0] == pytest.approx([0.6, 0.8], abs=1e-3)
     # Nothing is left of the centre itself.
     assert normalised(np.array([[1, 1]]), np.array([1, 1], np.float32)).tolist() == [[0, 0]]
-
-
-def test_a_digest_is_of_encoder_and_centre() -> None:
-    encoder, centre = Thumbnail(), np.zeros(3, np.float32)
-    digests = {encoder_digest(encoder, one) for one in (None, centre, centre + 1)}
-    assert len(digests) == 3 and encoder_digest(Thumbnail(), centre.copy()) in digests
 
 
 @pytest.mark.parametrize(
@@ -90,16 +79,3 @@ def test_names_of_encoders() -> None:
     assert encoder_name(f"siglip:{PAPER_ENCODER}@main") == f"siglip:{PAPER_ENCODER}@main"
     assert published_threshold("siglip:google/siglip2-base-patch16-224") is None
     assert published_threshold("thumbnail") is None
-
-
-@pytest.mark.parametrize(
-    ("name", "error", "said"),
-    [
-        ("thumbnial", UnknownNameError, "'thumbnail'"),
-        ("thumbnail:x", InvalidOptionError, "encoder 'thumbnail:x'"),
-        ("siglip:", InvalidOptionError, "id or folder of a model"),
-    ],
-)
-def test_names_that_are_none(name: str, error: type[Exception], said: str) -> None:
-    with pytest.raises(error, match=said):
-        make_encoder(name)

@@ -44,6 +44,7 @@ class Interrupted(Thumbnail):
     """Thumbnails, until some batches are done."""
 
     def __init__(self, after: int):
+        super().__init__()
         self.left = after
 
     def features(self, prepared: Any) -> Any:

@@ -83,8 +83,8 @@ def test_siglip_makes_an_index(own_split: Path, model: str) -> None:
     live = encoder.features(encoder.prepare(buffer.query.frame()[None]))
     given = measure(buffer, model, query=normalised(live)[0])
     assert given.alike == pytest.approx(measure(buffer, model).alike, abs=2e-3)
-    chosen = selector.select(buffer, buffer.query.frame())
-    assert 0 <= chosen.start < chosen.stop <= len(buffer)
+    start, stop = selector.select(buffer, buffer.query.frame())
+    assert 0 <= start < stop <= len(buffer)
 
 
 def test_a_worker_process_loads_the_model_itself(model: str) -> None:
@@ -140,10 +140,6 @@ def test_a_model_without_all_its_weights_is_refused(model: str, tmp_path: Path) 
     with pytest.raises(FormatError, match=r"lacks 16 of the .* such as .*layers\.1") as caught:
         make_encoder(f"siglip:{folder}", device="cpu")
     assert "download or save it again" in str(caught.value.hint)
-    text = {name: value for name, value in tensors.items() if name.startswith("text")}
-    save_file(text, path, metadata={"format": "pt"})
-    with pytest.raises(FormatError, match="lacks"):
-        make_encoder(f"siglip:{folder}", device="cpu")
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(FormatError, match="cannot be loaded"):
         make_encoder(f"siglip:{folder}", device="cpu")
