@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from robomme_interference_data.bootstrap import Interval, bootstrap, mean
 from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.select import Measured, Rule, choose
-from robomme_interference_data.stats import Interval, Resampler, mean, wilson
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Column, Table, percent
 
 __all__ = [
@@ -174,7 +175,7 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     count, hits = len(grades), sum(one.hit for one in grades)
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
     # One key: equal values have equal intervals, whatever the rule, family and condition.
-    drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
+    drawn = bootstrap(values, [mean(column) for column in range(3)], "retrieval")
     purity, coverage, false_sessions = map(_bounds, drawn)
     return Cell(
         rule,

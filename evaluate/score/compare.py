@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from robomme_interference_data.bootstrap import bootstrap, difference
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of, success
-from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair
+from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.stats import Resampler, difference, holm, wilson
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 
 __all__ = ["Comparison", "compare"]
@@ -84,8 +85,8 @@ def compare(
         "simulator system_a system_b family condition n:count rate_a:rate rate_b:rate "
         f"difference:points {COLUMNS}",
         (
-            (*names, pairs.n, pairs.first, pairs.second, *pairs.tested, p)
-            for names, pairs, p in zip(own, found, holm([one.p for one in found]), strict=True)
+            (*names, pairs.n, pairs.first, pairs.second, *test)
+            for names, pairs, test in zip(own, found, tested(found), strict=True)
         ),
         f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
         f"b − a, gained and lost are from a to b. {how_to_read(found)}",
@@ -107,8 +108,7 @@ class _Side:
     def counted(self, condition: str) -> set[EpisodeId]:
         if condition not in self.conditions:
             return set()
-        counts = self.cube.counted[self.cube.cell(self.system, condition)]
-        return {self.cube.episodes[at] for at in np.flatnonzero(counts)}
+        return {*self.cube.chosen(self.cube.counted[self.cube.cell(self.system, condition)])}
 
 
 def _sides(rows: Rows) -> Iterator[_Side]:
@@ -169,7 +169,7 @@ def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
     )
     values = np.stack([success(first), success(second)], axis=1)
     values = values[~np.isnan(values).any(axis=1)]
-    (drawn,) = Resampler(values, a.cube.simulator).intervals([difference(0, 1)])
+    (drawn,) = bootstrap(values, [difference(0, 1)], a.cube.simulator)
     # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
     seeds = a.cube.model_seeds, b.cube.model_seeds
     matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]

@@ -65,6 +65,10 @@ class Cube:
         """Whether each episode is of a family, `(E,) bool`."""
         return np.array([one.family == family for one in self.episodes], bool)
 
+    def chosen(self, flags: Flags) -> list[EpisodeId]:
+        """Return the episodes of some flags, `(E,) bool`, in the canonical order."""
+        return [self.episodes[place] for place in np.flatnonzero(flags).tolist()]
+
     @cached_property
     def has_rows(self) -> Flags:
         """Whether a system has rows under a condition, `(S, C) bool`."""

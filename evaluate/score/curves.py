@@ -12,7 +12,7 @@ from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_con
 from robomme_interference_data.drawing import INK, tidy
 from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.paper import Published, published
+from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 
@@ -128,7 +128,7 @@ class Data:
         self.lift = [c for c in score.contrasts if c.simulator == simulator and c.is_lift]
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
         self.looks = looks_of([*self.systems, *bases])
-        self.cells: dict[tuple[str, str, str], Cell | Published] = {
+        self.cells: dict[tuple[str, str, str], Cell] = {
             (one.system, one.condition, one.part): one for one in found
         }
         self.absent, self.beside = list[str](), list[str]()
@@ -231,9 +231,9 @@ def short(condition: str) -> str:
 
 def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: str) -> str:
     """Return in words what the points of some cells mean, as far as it needs to be said."""
-    drawn = [c for (s, _, part), c in data.cells.items() if s in systems and part in parts]
-    hollow = any(not one.complete for one in drawn)
-    dashes = any(isinstance(one, Published) for one in drawn)
+    drawn = [(s, c) for (s, _, part), c in data.cells.items() if s in systems and part in parts]
+    hollow = any(not one.complete for _, one in drawn)
+    dashes = any(system in (*data.absent, *data.beside) for system, _ in drawn)
     said = ["hollow: cell not complete"] * hollow + ["dashes: published rates"] * dashes
     return "; ".join([*said, *filter(None, notes)])
 

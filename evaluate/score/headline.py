@@ -26,10 +26,7 @@ def headline(score: Score, simulator: str) -> str:
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_bound(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
-    if complete:
-        sentences = _leading(score, complete)
-    else:
-        sentences = [_nothing_complete(cells, int(score.cubes[simulator].expected.sum()))]
+    sentences = _leading(score, complete) if complete else [_nothing_complete(cells)]
     if not all(cell.complete for cell in found):
         done = sum(cell.complete for cell in found)
         sentences.append(f"{done} of {len(found)} cells are complete.")
@@ -72,16 +69,16 @@ def _listed(cells: Sequence[Cell]) -> str:
     return f"{', '.join(names)} and {last}" if names else last
 
 
-def _nothing_complete(cells: Sequence[Cell], expected: int) -> str:
+def _nothing_complete(cells: Sequence[Cell]) -> str:
     counting = [cell for cell in cells if cell.n]
     if not counting:
         return "No rollout counts yet."
-    nearest = min(counting, key=lambda cell: (cell.missing + cell.other, -cell.n))
-    other = f", and {nearest.other} that count are not of the grid" if nearest.other else ""
+    nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.other), -cell.n))
+    other = f", and {len(nearest.other)} that count are not of the grid" if nearest.other else ""
     return (
         f"No cell is complete, so no system leads. Nearest to it is "
-        f"{display_name(nearest.system)} under {_named(nearest.condition)}: {nearest.missing} of "
-        f"{expected} episodes are missing{other}."
+        f"{display_name(nearest.system)} under {_named(nearest.condition)}: {len(nearest.missing)} "
+        f"of {nearest.expected} episodes are missing{other}."
     )
 
 

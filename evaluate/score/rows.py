@@ -4,6 +4,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +131,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
         name_system(system)
     reader, sources = _Reader(system), find_sources(paths)
     for path, header in sources.items():
-        reader.add(read_part(path, with_system=system is not None), in_run=header is not None)
+        reader.add(read_part(path, system is not None), in_run=header is not None)
     rows = reader.checked()
     if rows.refused and not lenient:
         more = rows.refused - len(rows.refusals)
@@ -221,16 +222,13 @@ class _Reader:
         return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
 
     def _check_success(self, rows: Rows) -> None:
-        sound = self._sound(rows)
-        names, given = rows.values["status"], rows.values["success"]
-        status, success = (rows.codes[name][sound] for name in ("status", "success"))
-        expected = [None if one == Status.ERROR else one == Status.SUCCESS for one in names]
-        fits = np.array([one is other for one in expected for other in given], bool)
-        fits = fits.reshape(len(names), len(given))
-        for at in np.flatnonzero(~fits[status, success]).tolist():
-            self._reasons[int(sound[at])] = (
-                f"success {_shown(given[success[at]])} contradicts status {names[status[at]]!r}"
-            )
+        pairs = product(*(enumerate(rows.values[name]) for name in ("status", "success")))
+        for (status, name), (success, given) in pairs:
+            if given is not (None if name == Status.ERROR else name == Status.SUCCESS):
+                found = (rows.codes["status"] == status) & (rows.codes["success"] == success)
+                for row in np.flatnonzero(found).tolist():
+                    reason = f"success {_shown(given)} contradicts status {name!r}"
+                    self._reasons.setdefault(row, reason)
 
     def _check_alike(self, rows: Rows, name: str, of: Sequence[str], why: str) -> None:
         """Hold a value against that of the first row with the same values in other columns."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import BadRowsError
 from robomme_interference_data.evaluate.score import Against, Grid, Settings, cells, effects, paper
@@ -12,7 +13,6 @@ from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.files import write_text
-from robomme_interference_data.stats import DRAWS
 from robomme_interference_data.tables import Table
 
 __all__ = ["TABLES", "Score", "score", "write_score"]
@@ -90,7 +90,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         effects.contrast_table(contrasts),
         effects.decay_table(decays),
         effects.noise_table(cubes.values()),
-        cells.coverage_table(cubes.values()),
+        cells.coverage_table(every),
     ]
     if settings.against is Against.PAPER:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
