@@ -168,18 +168,10 @@ def dodged(systems: Sequence[str]) -> Iterator[tuple[str, float]]:
 def curve(
     axes: Any, data: Data, system: str, part: str, shift: float, *, bars: bool = True
 ) -> list[tuple[float, Look]]:
-    """Draw a system's rates over the conditions.
+    """Draw a system's rates over the conditions, in a part of the episodes or (empty) in all.
 
     Points of incomplete cells are hollow. no-history is joined by a thin line: it is the rate
     without memory, not a smaller k.
-
-    Args:
-        axes: Where to draw.
-        data: Of the simulator.
-        system: One of its systems.
-        part: Family or difficulty; empty for all episodes.
-        shift: On the x axis.
-        bars: Whether to draw intervals.
 
     Returns:
         The last rate in percent, and the system's look; nothing without any rate.
@@ -260,12 +252,8 @@ def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
 def label_ends(axes: Any, ends: Sequence[tuple[float, Look]], gap: float) -> None:
     """Write labels at the right ends of lines, moved apart to at least `gap` on the y axis.
 
-    Each stands behind the system's marker, in ink: not all colours can be read as letters.
-
-    Args:
-        axes: The axes, with their final limits.
-        ends: Where lines end on the y axis, and how they look.
-        gap: On the y axis.
+    Each stands behind the system's marker, in ink: not all colours can be read as letters. The
+    axes have their final limits.
     """
     from matplotlib.transforms import ScaledTranslation
 

@@ -103,20 +103,19 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     videos = _videos(score.rows)
     rows = []
     for cube in score.cubes.values():
-        known = cube.conditions
-        at = [known.index(one) if one in known else None for one in conditions]
         for place, system in enumerate(cube.systems):
             counts = cube.counts[place].transpose(1, 0, 2).tolist()
             rates = success(cube.status[place]).T.tolist()
             for number in np.flatnonzero(cube.there[place]).tolist():
                 episode, hard = cube.episodes[number], int(cube.difficulty[number])
+                came = dict(zip(cube.conditions, counts[number], strict=True))
                 found = [videos.get((cube.simulator, system, c, str(episode))) for c in conditions]
                 row = (
                     *(cube.simulator, display_name(system), episode.family),
                     *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
-                    ["" if one is None else _outcome(counts[number][one]) for one in at],
+                    [_outcome(came[c]) if c in came else "" for c in conditions],
                     flips(cube.conditions, rates[number]),
-                    ["" if one is None else _address(one, folder) for one in found],
+                    [_address(one, folder) if one else "" for one in found],
                 )
                 rows.append(row)
     text = json.dumps(rows, ensure_ascii=False, separators=(",", ":"))
