@@ -126,11 +126,12 @@ def _ranked(cells: Sequence[Cell]) -> list[Cell]:
     ]
 
 
-def rate_table(cells: Sequence[Cell], name: str, title: str, parts: Sequence[str] = ()) -> Table:
-    """Return cells as a table, a row each: of all episodes, or by the parts that give its name.
+def rate_table(cells: Sequence[Cell], name: str) -> Table:
+    """Return cells as the table `main`, a row each, or their parts as `family` or `difficulty`.
 
-    The latter are of cells that have any rollout.
+    Parts are shown of those that have any rollout.
     """
+    parts = {"family": FAMILIES, "difficulty": DIFFICULTIES}.get(name, ())
     ran = {(c.simulator, c.system, c.condition) for c in cells if any(c.counts)}
     rows = []
     for cell in cells:
@@ -142,7 +143,7 @@ def rate_table(cells: Sequence[Cell], name: str, title: str, parts: Sequence[str
             rows.append((*own, cell.n, cell.rate, *bounds, *cell.counts, *more))
     return Table.make(
         name,
-        title,
+        f"Success by {name if parts else 'system and condition'}",
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
         "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
         "rank:count",

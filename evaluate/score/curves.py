@@ -10,9 +10,7 @@ from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.drawing import INK, tidy
-from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 
@@ -122,8 +120,6 @@ class Data:
     def __init__(self, score: Score, simulator: str):
         self.simulator = simulator
         found = [one for one in score.cells if one.simulator == simulator and one.n]
-        known = [one for one in published() if one.simulator == simulator]
-        known = known if score.settings.against is Against.PAPER else []
         self.systems = list(dict.fromkeys(one.system for one in found))
         self.lift = [c for c in score.contrasts if c.simulator == simulator and c.is_lift]
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
@@ -132,8 +128,8 @@ class Data:
             (one.system, one.condition, one.part): one for one in found
         }
         self.absent, self.beside = list[str](), list[str]()
-        for one in known:
-            if one.system in self.looks:
+        for one in score.published:
+            if one.simulator == simulator and one.system in self.looks:
                 name = f"{one.system}, published"
                 names = self.absent if one.system in bases else self.beside
                 names += [name] if name not in names else []

@@ -4,10 +4,8 @@ import math
 from collections.abc import Sequence
 
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
-from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import START, Contrast
-from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.tables import percent, points
@@ -103,8 +101,9 @@ def _from_start(leader: Cell, contrast: Contrast) -> str:
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     """Say how a system with retrieval stands to the published one without, if that is wanted."""
     own = (contrast.simulator, base_of(contrast.system))
-    rates = {one.condition: one.rate for one in published() if (one.simulator, one.system) == own}
-    if score.settings.against is not Against.PAPER or not {START, contrast.condition} <= {*rates}:
+    found = [one for one in score.published if (one.simulator, one.system) == own]
+    rates = {one.condition: one.rate for one in found}
+    if not {START, contrast.condition} <= {*rates}:
         return []
     return [
         f"Without retrieval, {display_name(own[1] or '')} falls from {percent(rates[START])} to "

@@ -78,6 +78,11 @@ class Rows:
         """Return some of the rows: their numbers, or a flag for each."""
         return replace(self, codes={name: codes[rows] for name, codes in self.codes.items()})
 
+    def by(self, column: str) -> dict[Any, "Rows"]:
+        """Return the rows of each value of a column, by value, sorted."""
+        places = self.places(column, names := self.names(column))
+        return {name: self.chosen(places == place) for place, name in enumerate(names)}
+
 
 def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = False) -> Rows:
     """Read rows from folders of runs and files, and check each of them.

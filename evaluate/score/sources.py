@@ -185,7 +185,7 @@ def _read_csv(path: Path, with_system: bool) -> Part:
     return Part(path, columns, len(lines), lines.__getitem__, malformed)
 
 
-def _read_record(path: Path, _: bool) -> Part:
+def _read_record(path: Path, with_system: bool) -> Part:
     """Read the record of a run: of a rollout that broke and ran again, the last row counts."""
     whole, _, _ = path.read_bytes().rpartition(b"\n")  # a crash can leave a part of a line
     if not whole:

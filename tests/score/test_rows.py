@@ -381,9 +381,8 @@ def test_rows_of_one_system_with_and_without_a_revision_do_not_mix(tmp_path: Pat
 
 def test_reading_never_imports_pandas(tmp_path: Path) -> None:
     """It would take seconds, and a Ctrl-C meanwhile would be lost."""
-    (tmp_path / "pandas").mkdir()
     mark = tmp_path / "imported"
-    (tmp_path / "pandas" / "__init__.py").write_text(f"open({str(mark)!r}, 'w').close()")
+    (tmp_path / "pandas.py").write_text(f"open({str(mark)!r}, 'w').close()")
     rows = made.rows()
     rows[0] = replace(rows[0], seed=None, video="videos/0.mp4")
     paths = [
