@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.stats import Floats, newcombe_paired
+from robomme_interference_data.stats import newcombe_paired
 
-__all__ = ["DRAWS", "LEAST", "Interval", "bootstrap", "enough", "paired_interval"]
+__all__ = ["DRAWS", "LEAST", "Floats", "Interval", "bootstrap", "enough", "paired_interval"]
 __all__ += ["Statistic", "difference", "mean", "retention", "slope"]
+
+Floats = NDArray[np.float64]
 
 DRAWS = 10_000
 """Bootstrap samples."""
@@ -38,7 +40,8 @@ class Statistic(NamedTuple):
 
     Attributes:
         columns: Places of the columns.
-        combine: From their means, `(D, M) float64`, to the statistic, `(D,) float64`.
+        combine: From their means, `(D, M) float64`, to the statistic, `(D,) float64`. Of single
+            episodes in their place it is what each adds to a difference or a slope.
     """
 
     columns: tuple[int, ...]
@@ -68,8 +71,24 @@ def retention(none: int, start: int, end: int) -> Statistic:
     return Statistic((none, start, end), lambda m: (m[:, 2] - m[:, 0]) / (m[:, 1] - m[:, 0]))
 
 
-def slope(columns: Sequence[int], weights: Floats) -> Statistic:
-    """Return the weighted sum of the columns' means (see `slope_weights`)."""
+def slope(columns: Sequence[int], ks: Sequence[int]) -> Statistic:
+    """Return the log-linear slope of the columns' means, of conditions with these k.
+
+    The slope b is that of the least-squares line rate = a + b · log₂(k + 1): k + 1 is the number
+    of sessions in the buffer, the lesson included, so b is the change of the success rate with
+    each doubling of the history's sessions. With x = log₂(k + 1): b = Σ (x − x̄) rate / Σ (x − x̄)².
+    Every condition weighs the same, as all run the same episodes.
+
+    Source: ordinary least squares; the logarithm is our choice, after the paper's k 0, 1, 3, 7,
+    which doubles the sessions from one condition to the next.
+
+    Args:
+        columns: Places of the columns.
+        ks: At least two different k, one a column.
+    """
+    x = np.log2(np.asarray(ks, float) + 1)
+    centred = x - x.mean()
+    weights = centred / (centred**2).sum()
     return Statistic(tuple(columns), lambda m: m @ weights)
 
 
@@ -186,10 +205,9 @@ def _interval(statistic: Statistic, features: Floats, drawn: Floats) -> Interval
 
 @lru_cache(maxsize=2)
 def _drawn(key: str, episodes: int, draws: int) -> NDArray[np.uint8]:
-    """Return how often each draw takes each episode, `(draws, episodes) uint8`.
+    """Return how often each draw takes each episode, `(draws, episodes)`; no one 256 times.
 
-    All systems over the same episodes share the draws. That an episode is taken 256 times has no
-    probability to speak of.
+    All systems over the same episodes share the draws.
     """
     seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:16])
     generator = np.random.Generator(np.random.PCG64(seed))

@@ -8,13 +8,7 @@ which takes seconds to import; the tests hold both against SciPy's.
 import math
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-__all__ = ["Floats", "cohens_h", "holm", "mcnemar", "newcombe", "newcombe_paired"]
-__all__ += ["slope_weights", "wilson"]
-
-Floats = NDArray[np.float64]
+__all__ = ["cohens_h", "holm", "mcnemar", "newcombe", "newcombe_paired", "wilson"]
 
 _Z = 1.959963984540054  # the 97.5% quantile of the standard normal distribution
 
@@ -147,22 +141,3 @@ def cohens_h(rate: float, other: float) -> float:
     Source: Cohen (1988), Statistical Power Analysis for the Behavioral Sciences, chapter 6.
     """
     return 2 * math.asin(math.sqrt(rate)) - 2 * math.asin(math.sqrt(other))
-
-
-def slope_weights(ks: Sequence[int]) -> Floats:
-    """Return the weights by which rates at these k add up to the log-linear slope, `(K,) float64`.
-
-    The slope b is that of the least-squares line rate = a + b · log₂(k + 1): k + 1 is the number
-    of sessions in the buffer, the lesson included, so b is the change of the success rate with
-    each doubling of the history's sessions. With x = log₂(k + 1): b = Σ (x − x̄) rate / Σ (x − x̄)².
-    Every condition weighs the same, as all run the same episodes.
-
-    Source: ordinary least squares; the logarithm is our choice, after the paper's k 0, 1, 3, 7,
-    which doubles the sessions from one condition to the next.
-
-    Args:
-        ks: At least two different k.
-    """
-    x = np.log2(np.asarray(ks, float) + 1)
-    centred = x - x.mean()
-    return centred / (centred**2).sum()

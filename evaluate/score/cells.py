@@ -33,9 +33,7 @@ class Cell:
     """What came of one system under one condition, in all or in a part of the episodes.
 
     Attributes:
-        simulator: Name of the simulator.
-        system: Name of the system.
-        condition: Name of the condition.
+        simulator, system, condition: Their names.
         part: Family or difficulty; empty for all episodes.
         n: Episodes that count: at least one rollout that is no error.
         rate: Mean over them of the success of their repeats; NaN if n is 0.

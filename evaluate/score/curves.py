@@ -42,15 +42,7 @@ _LINES = ("-", "--", "-.", ":")
 
 @dataclass(frozen=True)
 class Look:
-    """How a system is drawn.
-
-    Attributes:
-        label: Its name.
-        colour: As `#rrggbb`.
-        marker: matplotlib's marker.
-        line: matplotlib's line style.
-        width: Line width in points.
-    """
+    """How a system is drawn: `#rrggbb`, matplotlib's marker and line style, width in points."""
 
     label: str
     colour: str
@@ -107,6 +99,7 @@ class Data:
     """What the figures of one simulator show.
 
     Attributes:
+        simulator: Its name.
         cells: System, condition and part to what is drawn: cells with rows, and published rates,
             whose systems are named `<system>, published`.
         systems: Those that have rows.
@@ -140,7 +133,7 @@ class Data:
         self.conditions = [one.name for one in in_order(conditions)] if conditions else []
 
     def x(self, condition: str) -> float:
-        """Place on the x axis: evenly, with a gap before another kind, which is no greater k."""
+        """Return the place on the x axis: even, with a gap before another kind."""
         kinds = [parse_condition(one).kind.name for one in self.conditions]
         place = self.conditions.index(condition)
         return place + 0.3 * len({*kinds[: place + 1]})

@@ -13,6 +13,7 @@ import numpy as np
 
 from robomme_interference_data.bootstrap import (
     LEAST,
+    Floats,
     Interval,
     Statistic,
     bootstrap,
@@ -24,7 +25,7 @@ from robomme_interference_data.bootstrap import (
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
-from robomme_interference_data.stats import Floats, cohens_h, slope_weights, wilson
+from robomme_interference_data.stats import cohens_h, wilson
 from robomme_interference_data.tables import Table
 
 __all__ = ["START", "SURE", "Contrast", "contrast_table", "decay_table", "effects_of"]
@@ -42,9 +43,7 @@ class Contrast:
     """One paired comparison: what changes from `against` to the condition.
 
     Attributes:
-        simulator: Name of the simulator.
-        system: Name of the system.
-        condition: Name of the condition.
+        simulator, system, condition: Their names.
         against: System and condition that it is compared with: the first side.
         pairs: The comparison.
         complete: Whether both cells are complete.
@@ -100,12 +99,11 @@ def effects_of(
     places = [(at[there], at[system, c]) for c, there in compared]
     kept = {c: (at[floor], at[system, START], at[system, c]) for floor in floors[:1] for c in later}
     falling = [at[system, c] for c in ks] if len(ks) > 1 else []
-    weights = slope_weights([parse_condition(c).k for c in ks]) if falling else np.zeros(0)
+    line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
 
     statistics: list[Statistic] = [difference(*two) for two in places]
     statistics += [retention(*three) for three in kept.values()]
-    statistics += [slope(falling, weights)] if falling else []
-    drawn = iter(bootstrap(values, statistics, cube.simulator, draws))
+    drawn = iter(bootstrap(values, [*statistics, *line], cube.simulator, draws))
     pairs = {
         one: pair(sides[first], sides[second], next(drawn))
         for one, (first, second) in zip(compared, places, strict=True)
@@ -126,13 +124,13 @@ def effects_of(
         )
         for (c, there), (first, second) in zip(compared, places, strict=True)
     ]
-    if not falling:
-        return contrasts, []
-    changing = _together(values, falling)
-    fall = next(drawn)
-    fall = fall if enough(changing @ weights) else Interval(fall.value)
-    whole = all(complete[place] for place in falling)
-    return contrasts, [(cube.simulator, system, " ".join(ks), len(changing), *fall, whole)]
+    decays = []
+    for one, fall in zip(line, drawn, strict=True):
+        changing = _together(values, one.columns)
+        known = fall if enough(one.combine(changing)) else Interval(fall.value)
+        whole = all(complete[place] for place in falling)
+        decays.append((cube.simulator, system, " ".join(ks), len(changing), *known, whole))
+    return contrasts, decays
 
 
 def _together(values: Floats, places: Sequence[int]) -> Floats:
@@ -142,11 +140,8 @@ def _together(values: Floats, places: Sequence[int]) -> Floats:
 
 
 def _retained(values: Floats, drawn: Interval) -> Interval:
-    """Give a retention its interval, if any two of its three conditions differ enough.
-
-    Where two hardly differ, the ratio sticks to 0 or 1 in most draws, or divides by next to
-    nothing.
-    """
+    """Give a retention its interval, if any two of its three conditions differ enough."""
+    # Where two hardly differ, the ratio sticks to 0 or 1 in most draws, or divides by next to 0.
     pairs = [values[:, i] - values[:, j] for i, j in ((1, 0), (2, 0), (2, 1))]
     sound = all(map(enough, pairs)) and drawn.low < drawn.high
     return drawn if sound else Interval(drawn.value)

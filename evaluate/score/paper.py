@@ -37,11 +37,7 @@ def published() -> tuple[Cell, ...]:
 
 
 def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
-    """Yield the cells that the paper has, each with the published one.
-
-    A system with retrieval comes a second time, with the published one without. The simulator is
-    compared too: rows of another simulator have no published counterpart.
-    """
+    """Yield cells with the published one; of retrieval also with the published one without it."""
     known = {(one.simulator, one.system, one.condition): one for one in published()}
     for cell in cells:
         for system in (cell.system, base_of(cell.system)):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.errors import BadRowsError, InterferenceError, InvalidOptionError
+from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score.sources import (
     COLUMNS,
     Codes,
@@ -50,7 +51,7 @@ class Rows:
 
     codes: dict[str, Codes]
     values: dict[str, list[Any]]
-    sources: Mapping[Path, Mapping[str, Any] | None]
+    sources: Mapping[Path, RunHeader | None]
     revisions: dict[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
     refusals: tuple[str, ...] = ()
@@ -218,10 +219,7 @@ class _Joined:
             self._reasons[int(sound[at])] = f"{name} {found!r} beside {known!r}: {why}"
 
     def _check_repeats(self) -> None:
-        """Leave one row of each rollout, and none where its rows contradict each other.
-
-        So what a score says does not depend on the order of files.
-        """
+        """Leave one row of each rollout, and none where its rows contradict each other."""
         sound = self._sound()
         key = self._joint(_ROLLOUT, sound)
         order = np.argsort(key, kind="stable")

@@ -15,6 +15,8 @@ from support.browser import open_page
 from support.scoring import BASE, OWN, cells
 
 from robomme_interference_data.drawing import open_figure, save_figure
+from robomme_interference_data.evaluate.log import Start
+from robomme_interference_data.evaluate.plan import Plan
 from robomme_interference_data.evaluate.score.curves import Data
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure, draw_figures
 from robomme_interference_data.evaluate.score.headline import headline
@@ -33,16 +35,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = next(i for i, r in enumerate(rows) if (r.system, r.condition) == (BASE, "k0"))
     rows[place] = replace(rows[place], video=VIDEO)
     rows[place + 1] = replace(rows[place + 1], video="videos/gone.mp4")
-    starts = [
-        {
-            "command": [f"robomme-interference evaluate --out 'my run' --shard {shard}/2"],
-            "versions": {"python": "3.12.0", "numpy": "2.2.0"},
-            "git": "0" * 40,
-            "policy": {"name": "<script>alert(1)</script>"},
-        }
+    starts = tuple(
+        Start(
+            command=(f"robomme-interference evaluate --out 'my run' --shard {shard}/2",),
+            settings={},
+            plan=Plan({"MoveCube/test": "0-5"}, ("k0",)),
+            versions={"python": "3.12.0", "numpy": "2.2.0"},
+            git="0" * 40,
+            machine="x86_64",
+            policy={"name": "<script>alert(1)</script>"},
+            started="2026-01-31T12:00:00Z",
+        )
         for shard in (1, 2)
-    ]
-    made.write_run(folder, rows, split="made-up", status="complete", starts=starts)
+    )
+    made.write_run(folder, rows, status="complete", starts=starts)
     (folder / VIDEO).parent.mkdir(parents=True)
     (folder / VIDEO).write_bytes(b"video")
     return folder
