@@ -31,8 +31,8 @@ class Score:
         notes: What a reader must know, such as that two systems are not paired.
         cubes: What came of the rollouts, by simulator.
         contrasts: Lifts and effects of all systems, in the order of tables.
-        cells: System × condition, over all episodes, by family and by difficulty.
         published: Rates of the paper, if the score is set against them.
+        cells: System × condition, over all episodes, by family and by difficulty.
         tables: All tables by name, the paper's main table aside.
         grids: The paper's main table of each simulator.
     """
@@ -43,8 +43,8 @@ class Score:
     notes: tuple[str, ...]
     cubes: Mapping[str, Cube]
     contrasts: Sequence[effects.Contrast]
-    cells: Sequence[cells.Cell]
     published: Sequence[cells.Cell]
+    cells: Sequence[cells.Cell]
     tables: Mapping[str, Table]
     grids: Sequence[Table]
 
@@ -109,8 +109,8 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         tuple(notes),
         cubes,
         contrasts,
-        every,
         published,
+        every,
         {table.name: table for table in tables},
         cells.main_grids(every),
     )
