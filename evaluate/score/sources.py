@@ -7,15 +7,16 @@ which takes seconds, to make arrays of its own or to give them away as numpy's.
 import codecs
 import csv
 import io
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pa_csv
 import pyarrow.json as pa_json
 from numpy.typing import NDArray
 
@@ -153,29 +154,46 @@ def _read_parquet(path: Path, with_system: bool) -> Part:
 
 
 def _read_csv(path: Path, with_system: bool) -> Part:
-    text = path.read_bytes().removeprefix(codecs.BOM_UTF8).decode()
-    csv.field_size_limit(len(text) + 1)
-    reader = csv.reader(io.StringIO(text, newline=""))
-    names = next(reader, [])
+    data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    # Decoded here: of a byte that is no text pyarrow would show a traceback of its own.
+    text = data.decode()
+    csv.field_size_limit(len(data) + 1)
+    names = next(csv.reader(io.StringIO(text, newline="")), [])
     chosen = _match(path, names, with_system)
-    at = [names.index(there) for there in chosen.values()]
-    codes, places = [array("q") for _ in at], [dict[str, int]() for _ in at]
-    lines, malformed = array("q"), list[tuple[int, str]]()
-    begin = reader.line_num + 1  # quoted text may hold line breaks
-    for row in reader:
-        if len(row) == len(names):
-            lines.append(begin)
-            for place, known, found in zip(at, places, codes, strict=True):
-                found.append(known.setdefault(row[place], len(known)))
-        else:
-            told = f"the line has {len(row)} fields; expected {len(names)}"
-            malformed.append((begin, told))
-        begin = reader.line_num + 1
-    columns = {
-        name: (np.array(found, np.int64), [text or None for text in known])
-        for name, known, found in zip(chosen, places, codes, strict=True)
-    }
-    return Part(path, columns, len(lines), lines.__getitem__, malformed)
+    ragged: dict[int, str] = {}  # by number of the record; the header is 1
+
+    def note(row: Any) -> str:
+        told = f"the line has {row.actual_columns} fields; expected {row.expected_columns}"
+        ragged[row.number] = told
+        return "skip"
+
+    table = pa_csv.read_csv(
+        pa.BufferReader(data),
+        read_options=pa_csv.ReadOptions(use_threads=False),  # else it tells no numbers
+        parse_options=pa_csv.ParseOptions(
+            ignore_empty_lines=False, newlines_in_values=True, invalid_row_handler=note
+        ),
+        # All as text: what a number should be is judged row by row.
+        convert_options=pa_csv.ConvertOptions(
+            column_types=dict.fromkeys(chosen.values(), pa.string()),
+            include_columns=list(chosen.values()),
+            strings_can_be_null=True,
+            null_values=[""],
+        ),
+    )
+
+    @cache
+    def lines() -> list[int]:  # on which records begin: quoted text may hold line breaks
+        reader = csv.reader(io.StringIO(text, newline=""))
+        return [1, *(reader.line_num + 1 for _ in reader)]
+
+    @cache
+    def kept() -> list[int]:
+        return [line for record, line in enumerate(lines(), 1) if record not in ragged][1:]
+
+    columns = {name: _encoded(path, table[there]) for name, there in chosen.items()}
+    malformed = [(lines()[record - 1], told) for record, told in ragged.items()]
+    return Part(path, columns, len(table), lambda row: kept()[row], malformed)
 
 
 def _read_record(path: Path, with_system: bool) -> Part:

@@ -186,7 +186,7 @@ BAD = {
     "no system": (",MoveCube,k0,0,7,easy,fail,0,9", "'' is not the name of a system"),
     "too short": ("my-memory,MoveCube,k0,1,7,easy,fail,0", "the line has 8 fields; expected 9"),
     "twice": (GOOD, "the same rollout as"),
-    "blank": ("", "the line has 0 fields; expected 9"),
+    "blank": ("", "'' is not the name of a system"),
 }
 
 
