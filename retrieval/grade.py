@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from robomme_interference_data.bootstrap import bootstrap, mean
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.select import Measured, Rule, choose
-from robomme_interference_data.stats import Resampler, mean, wilson
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 
 __all__ = ["ALL", "PASS_MARK", "Cell", "Grade", "cell_table", "cells", "grade", "verdict"]
@@ -161,7 +162,7 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     count, hits = len(grades), sum(one.hit for one in grades)
     values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
     # One key: equal values have equal intervals, whatever the rule, family and condition.
-    drawn = Resampler(values, "retrieval").intervals([mean(column) for column in range(3)])
+    drawn = bootstrap(values, [mean(column) for column in range(3)], "retrieval")
     bounds = (None if math.isnan(number) else number for one in drawn for number in one)
     cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
     passed = min(one.value for one in drawn[:2]) >= PASS_MARK

@@ -1,9 +1,11 @@
 """Rates of cells: system × condition, and the same by family and by difficulty."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -31,14 +33,15 @@ class Cell:
     """What came of one system under one condition, in all or in a part of the episodes.
 
     Attributes:
-        simulator: Name of the simulator.
-        system: Name of the system.
-        condition: Name of the condition.
+        simulator, system, condition: Their names.
         part: Family or difficulty; empty for all episodes.
         n: Episodes that count: at least one rollout that is no error.
         rate: Mean over them of the success of their repeats; NaN if n is 0.
+        interval: Its 95% Wilson interval; `(0, 1)` if n is 0.
         counts: Rollouts by status, as `STATUSES`.
-        missing: Expected episodes that do not count with every model seed of the condition.
+        expected: How many episodes are expected.
+        missing: Those that do not count with every model seed of the condition.
+        broken: Episodes in which a rollout broke.
         other: Episodes that count without being expected.
         rank: Place among the complete cells of this simulator, condition and part, 1 for the
             highest rate; None for an incomplete cell, and for a system that is a bound.
@@ -50,9 +53,12 @@ class Cell:
     part: str
     n: int
     rate: float
-    counts: tuple[int, ...]
-    missing: int
-    other: int
+    interval: tuple[float, float]
+    counts: tuple[int, ...] = (0,) * len(STATUSES)
+    expected: int = 0
+    missing: Sequence[EpisodeId] = ()
+    broken: Sequence[EpisodeId] = ()
+    other: Sequence[EpisodeId] = ()
     rank: int | None = None
 
     @property
@@ -65,74 +71,77 @@ class Cell:
         """Rollouts that broke."""
         return self.counts[_ERROR]
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95% Wilson interval; `(0, 1)` if n is 0."""
-        return wilson(self.rate * self.n if self.n else 0, self.n)
-
 
 def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
     """Return the cells of every system and condition, in the order of tables.
 
-    Each comes over all episodes, then, if it has rows, by family and by difficulty. An expected
-    episode of unknown difficulty is missing in all three.
+    Each comes over all episodes, then by family and by difficulty. An expected episode of unknown
+    difficulty is missing in all three.
     """
     cells = []
     for cube in cubes:
         rates = success(cube.status)
         every: Flags = np.ones(len(cube.episodes), bool)
-        unknown: Flags = cube.difficulty < 0
         parts = [("", every, every)]  # name, its episodes, and those that are expected in it
         parts += [(name, here, here) for name in FAMILIES if (here := cube.of_family(name)).any()]
         for place, name in enumerate(DIFFICULTIES):
             here = cube.difficulty == place
-            parts.append((name, here, here | unknown))
+            parts.append((name, here, here | (cube.difficulty < 0)))
         for s, c in np.argwhere(cube.due).tolist():
-            for name, here, wanted in parts if cube.has_rows[s, c] else parts[:1]:
+            for name, here, wanted in parts:
                 if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
                     continue
                 known = rates[s, c][here & cube.counted[s, c]]
+                n, counts = len(known), cube.counts[s, c]
+                rate = float(known.sum() / n) if n else math.nan
                 cells.append(
                     Cell(
-                        cube.simulator,
-                        cube.systems[s],
-                        cube.conditions[c],
-                        name,
-                        len(known),
-                        float(known.sum() / len(known)) if len(known) else math.nan,
-                        tuple(cube.counts[s, c, here].sum(axis=0).tolist()),
-                        int((wanted & cube.missing[s, c]).sum()),
-                        int((here & cube.other[s, c]).sum()),
+                        *(cube.simulator, cube.systems[s], cube.conditions[c], name, n, rate),
+                        interval=wilson(rate * n if n else 0, n),
+                        counts=tuple(counts[here].sum(axis=0).tolist()),
+                        expected=int((wanted & cube.expected).sum()),
+                        missing=cube.chosen(wanted & cube.missing[s, c]),
+                        broken=cube.chosen(here & (counts[:, _ERROR] > 0)),
+                        other=cube.chosen(here & cube.other[s, c]),
                     )
                 )
     return _ranked(cells)
 
 
 def _ranked(cells: Sequence[Cell]) -> list[Cell]:
-    rates: dict[tuple[str, str, str], list[float]] = {}
-    places = []
-    for cell in cells:
-        group = rates.setdefault((cell.simulator, cell.condition, cell.part), [])
-        places.append(group if cell.complete and not is_bound(cell.system) else None)
-        group += [cell.rate] if places[-1] is not None else []
+    groups = [
+        (cell.simulator, cell.condition, cell.part)
+        if cell.complete and not is_bound(cell.system)
+        else None
+        for cell in cells
+    ]
+    rates = defaultdict[Any, list[float]](list)
+    for cell, group in zip(cells, groups, strict=True):
+        rates[group].append(cell.rate)
     return [
-        cell if group is None else replace(cell, rank=1 + sum(rate > cell.rate for rate in group))
-        for cell, group in zip(cells, places, strict=True)
+        replace(cell, rank=1 + sum(rate > cell.rate for rate in rates[group])) if group else cell
+        for cell, group in zip(cells, groups, strict=True)
     ]
 
 
-def rate_table(cells: Iterable[Cell], name: str, title: str, parts: Sequence[str] = ()) -> Table:
-    """Return cells as a table, a row each: of all episodes, or by the parts that give its name."""
+def rate_table(cells: Sequence[Cell], name: str) -> Table:
+    """Return cells as the table `main`, a row each, or their parts as `family` or `difficulty`.
+
+    Parts are shown of those that have any rollout.
+    """
+    parts = {"family": FAMILIES, "difficulty": DIFFICULTIES}.get(name, ())
+    ran = {(c.simulator, c.system, c.condition) for c in cells if any(c.counts)}
     rows = []
     for cell in cells:
-        if cell.part in (parts or ("",)):
-            own = (cell.simulator, cell.system, cell.condition, *([cell.part] if parts else []))
+        own: tuple[str, ...] = (cell.simulator, cell.system, cell.condition)
+        if cell.part in (parts or ("",)) and not (parts and own not in ran):
+            own += (cell.part,) if parts else ()
             bounds = cell.interval if cell.n else (math.nan, math.nan)
-            more = (cell.complete, cell.missing, cell.rank)
+            more = (cell.complete, len(cell.missing), cell.rank)
             rows.append((*own, cell.n, cell.rate, *bounds, *cell.counts, *more))
     return Table.make(
         name,
-        title,
+        f"Success by {name if parts else 'system and condition'}",
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
         "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
         "rank:count",
@@ -181,25 +190,20 @@ def _shown(cell: Cell | None, bold: bool) -> str:
     return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}] n={cell.n}{errors}"
 
 
-def coverage_table(cubes: Iterable[Cube]) -> Table:
+def coverage_table(cells: Iterable[Cell]) -> Table:
     """Return which episodes each cell of a family lacks, and in which the rollout broke.
 
     Expected cells without any rollout are listed as well: they lack all episodes.
     """
-    rows = []
-    for cube in cubes:
-        families = [(name, here) for name in FAMILIES if (here := cube.of_family(name)).any()]
-        for s, c in np.argwhere(cube.due).tolist():
-            for family, here in families:
-                if not (here & (cube.expected | cube.there[s])).any():
-                    continue
-                n, due = int((here & cube.counted[s, c]).sum()), int((here & cube.expected).sum())
-                errors = cube.counts[s, c, :, _ERROR] * here
-                missing, other = cube.missing[s, c] & here, cube.other[s, c] & here
-                complete = n > 0 and not (missing | other).any()
-                lists = (_numbers(cube.episodes, flags) for flags in (missing, errors > 0, other))
-                own = (cube.simulator, cube.systems[s], cube.conditions[c], family)
-                rows.append((*own, due, n, int(errors.sum()), complete, *lists))
+    rows = (
+        (
+            *(cell.simulator, cell.system, cell.condition, cell.part, cell.expected, cell.n),
+            *(cell.errors, cell.complete),
+            *map(_numbers, (cell.missing, cell.broken, cell.other)),
+        )
+        for cell in cells
+        if cell.part in FAMILIES
+    )
     return Table.make(
         "coverage",
         "Which episodes count",
@@ -211,9 +215,9 @@ def coverage_table(cubes: Iterable[Cube]) -> Table:
     )
 
 
-def _numbers(episodes: Sequence[EpisodeId], chosen: Flags) -> str:
+def _numbers(episodes: Iterable[EpisodeId]) -> str:
     """Return episodes of one family as text, such as `test 0-3,7`."""
     found: dict[str, list[int]] = {}
-    for place in np.flatnonzero(chosen).tolist():
-        found.setdefault(episodes[place].split, []).append(episodes[place].index)
+    for one in episodes:
+        found.setdefault(one.split, []).append(one.index)
     return "; ".join(f"{split} {format_numbers(indices)}" for split, indices in found.items())

@@ -1,19 +1,20 @@
 """Two runs, paired over the episodes that both have."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from robomme_interference_data.bootstrap import bootstrap, difference
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of, success
-from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair
+from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.stats import Resampler, difference, holm, wilson
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 
 __all__ = ["Comparison", "compare"]
@@ -58,8 +59,8 @@ def compare(
     """
     one, other = (read_rows([p], s, lenient) for p, s in zip((first, second), systems, strict=True))
     _check_scenes(one, other)
-    sides = [list(_sides(rows)) for rows in (one, other)]
-    met = list(_met(*sides))
+    sides = [_sides(rows) for rows in (one, other)]
+    met = list(_met((one, other), sides))
     notes, own, found = list(_differing(one, other)), [], []
     for a, b in met:
         conditions = [c for c in a.conditions if c in b.conditions]
@@ -76,16 +77,16 @@ def compare(
             f"{first} and {second} have no episode under a common condition that counts in both",
             "Compare runs over the same episodes.",
         )
-    notes += _left_out("a", sides[0], dict(met))
-    notes += _left_out("b", sides[1], {b: a for a, b in met})
+    notes += _left_out("a", sides[0].values(), dict(met))
+    notes += _left_out("b", sides[1].values(), {b: a for a, b in met})
     table = Table.make(
         "compare",
         "Two runs compared",
         "simulator system_a system_b family condition n:count rate_a:rate rate_b:rate "
         f"difference:points {COLUMNS}",
         (
-            (*names, pairs.n, pairs.first, pairs.second, *pairs.tested, p)
-            for names, pairs, p in zip(own, found, holm([one.p for one in found]), strict=True)
+            (*names, pairs.n, pairs.first, pairs.second, *test)
+            for names, pairs, test in zip(own, found, tested(found), strict=True)
         ),
         f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
         f"b − a, gained and lost are from a to b. {how_to_read(found)}",
@@ -107,19 +108,23 @@ class _Side:
     def counted(self, condition: str) -> set[EpisodeId]:
         if condition not in self.conditions:
             return set()
-        counts = self.cube.counted[self.cube.cell(self.system, condition)]
-        return {self.cube.episodes[at] for at in np.flatnonzero(counts)}
+        return {*self.cube.chosen(self.cube.counted[self.cube.cell(self.system, condition)])}
 
 
-def _sides(rows: Rows) -> Iterator[_Side]:
-    for cube in cubes_of(rows, Grid.GIVEN).values():
-        yield from (_Side(cube, system) for system in cube.systems)
+_Sides = dict[tuple[str, str], _Side]
 
 
-def _met(one: Sequence[_Side], other: Sequence[_Side]) -> Iterator[tuple[_Side, _Side]]:
+def _sides(rows: Rows) -> _Sides:
+    """Return the systems of a run by simulator and name, in the order of tables."""
+    cubes = cubes_of(rows, Grid.GIVEN).values()
+    return {
+        (cube.simulator, system): _Side(cube, system) for cube in cubes for system in cube.systems
+    }
+
+
+def _met(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side, _Side]]:
     """Yield what is compared, simulator by simulator, in the order of tables."""
-    simulators = [list(dict.fromkeys(s.cube.simulator for s in sides)) for sides in (one, other)]
-    systems = [list(dict.fromkeys(s.system for s in sides)) for sides in (one, other)]
+    simulators, systems = ([rows.names(name) for rows in runs] for name in ("simulator", "system"))
     if set(simulators[0]).isdisjoint(simulators[1]):
         raise InvalidOptionError(
             f"the rows are of different simulators: {' and '.join(map(', '.join, simulators))}",
@@ -131,11 +136,9 @@ def _met(one: Sequence[_Side], other: Sequence[_Side]) -> Iterator[tuple[_Side, 
             f"no system is in both: {' and '.join(map(', '.join, systems))}",
             "Compare runs of the same systems, or of one system each.",
         )
-    partners = common or {systems[0][0]: systems[1][0]}
-    there = {(side.cube.simulator, side.system): side for side in other}
-    for a in one:
-        b = there.get((a.cube.simulator, partners.get(a.system, "")))
-        if b is not None:
+    partners = common or dict(zip(*systems, strict=True))
+    for (simulator, system), a in sides[0].items():
+        if b := sides[1].get((simulator, partners.get(system, ""))):
             yield a, b
 
 
@@ -169,7 +172,7 @@ def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
     )
     values = np.stack([success(first), success(second)], axis=1)
     values = values[~np.isnan(values).any(axis=1)]
-    (drawn,) = Resampler(values, a.cube.simulator).intervals([difference(0, 1)])
+    (drawn,) = bootstrap(values, [difference(0, 1)], a.cube.simulator)
     # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
     seeds = a.cube.model_seeds, b.cube.model_seeds
     matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]
@@ -213,15 +216,12 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
     return [note] if shares else []
 
 
-def _left_out(name: str, sides: Sequence[_Side], met: Mapping[_Side, _Side]) -> list[str]:
+def _left_out(name: str, sides: Iterable[_Side], met: Mapping[_Side, _Side]) -> list[str]:
     """Say what one run has and the comparison leaves out, nothing if that is nothing."""
     parts = []
     for side in sides:
-        other = met.get(side)
-        counts = {
-            condition: len(side.counted(condition) - (other.counted(condition) if other else set()))
-            for condition in side.conditions
-        }
+        other = met[side].counted if side in met else (lambda condition: set())
+        counts = {c: len(side.counted(c) - other(c)) for c in side.conditions}
         if lone := ", ".join(f"{c} ({count:,})" for c, count in counts.items() if count):
             parts.append(f"{side.system} in {side.cube.simulator}, {lone}")
     return [f"Only in {name}, and left out (episodes): {'; '.join(parts)}."] if parts else []

@@ -65,6 +65,10 @@ class Cube:
         """Whether each episode is of a family, `(E,) bool`."""
         return np.array([one.family == family for one in self.episodes], bool)
 
+    def chosen(self, flags: Flags) -> list[EpisodeId]:
+        """Return the episodes of some flags, `(E,) bool`, in the canonical order."""
+        return [self.episodes[place] for place in np.flatnonzero(flags).tolist()]
+
     @cached_property
     def has_rows(self) -> Flags:
         """Whether a system has rows under a condition, `(S, C) bool`."""
@@ -119,9 +123,7 @@ def success(status: Statuses) -> NDArray[np.float64]:
 
 def cubes_of(rows: Rows, grid: Grid) -> dict[str, Cube]:
     """Return simulator to the outcomes in it, by name, with the cells that are expected."""
-    places = rows.places("simulator", names := rows.names("simulator"))
-    parts = [rows.chosen(places == place) for place in range(len(names))]
-    return {name: _cube(part, name, grid) for name, part in zip(names, parts, strict=True)}
+    return {name: _cube(part, name, grid) for name, part in rows.by("simulator").items()}
 
 
 def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
@@ -159,5 +161,4 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
 
 
 def _table_order(system: str) -> tuple[int, str]:
-    known = list(SYSTEMS)
-    return (known.index(system) if system in SYSTEMS else len(known), system)
+    return [*SYSTEMS].index(system) if system in SYSTEMS else len(SYSTEMS), system

@@ -10,9 +10,7 @@ from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_condition
 from robomme_interference_data.drawing import INK, tidy
-from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.paper import Published, published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 
@@ -44,15 +42,7 @@ _LINES = ("-", "--", "-.", ":")
 
 @dataclass(frozen=True)
 class Look:
-    """How a system is drawn.
-
-    Attributes:
-        label: Its name.
-        colour: As `#rrggbb`.
-        marker: matplotlib's marker.
-        line: matplotlib's line style.
-        width: Line width in points.
-    """
+    """How a system is drawn: `#rrggbb`, matplotlib's marker and line style, width in points."""
 
     label: str
     colour: str
@@ -109,6 +99,7 @@ class Data:
     """What the figures of one simulator show.
 
     Attributes:
+        simulator: Its name.
         cells: System, condition and part to what is drawn: cells with rows, and published rates,
             whose systems are named `<system>, published`.
         systems: Those that have rows.
@@ -122,18 +113,16 @@ class Data:
     def __init__(self, score: Score, simulator: str):
         self.simulator = simulator
         found = [one for one in score.cells if one.simulator == simulator and one.n]
-        known = [one for one in published() if one.simulator == simulator]
-        known = known if score.settings.against is Against.PAPER else []
         self.systems = list(dict.fromkeys(one.system for one in found))
         self.lift = [c for c in score.contrasts if c.simulator == simulator and c.is_lift]
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
         self.looks = looks_of([*self.systems, *bases])
-        self.cells: dict[tuple[str, str, str], Cell | Published] = {
+        self.cells: dict[tuple[str, str, str], Cell] = {
             (one.system, one.condition, one.part): one for one in found
         }
         self.absent, self.beside = list[str](), list[str]()
-        for one in known:
-            if one.system in self.looks:
+        for one in score.published:
+            if one.simulator == simulator and one.system in self.looks:
                 name = f"{one.system}, published"
                 names = self.absent if one.system in bases else self.beside
                 names += [name] if name not in names else []
@@ -144,7 +133,7 @@ class Data:
         self.conditions = [one.name for one in in_order(conditions)] if conditions else []
 
     def x(self, condition: str) -> float:
-        """Place on the x axis: evenly, with a gap before another kind, which is no greater k."""
+        """Return the place on the x axis: even, with a gap before another kind."""
         kinds = [parse_condition(one).kind.name for one in self.conditions]
         place = self.conditions.index(condition)
         return place + 0.3 * len({*kinds[: place + 1]})
@@ -168,18 +157,10 @@ def dodged(systems: Sequence[str]) -> Iterator[tuple[str, float]]:
 def curve(
     axes: Any, data: Data, system: str, part: str, shift: float, *, bars: bool = True
 ) -> list[tuple[float, Look]]:
-    """Draw a system's rates over the conditions.
+    """Draw a system's rates over the conditions, in a part of the episodes or (empty) in all.
 
     Points of incomplete cells are hollow. no-history is joined by a thin line: it is the rate
     without memory, not a smaller k.
-
-    Args:
-        axes: Where to draw.
-        data: Of the simulator.
-        system: One of its systems.
-        part: Family or difficulty; empty for all episodes.
-        shift: On the x axis.
-        bars: Whether to draw intervals.
 
     Returns:
         The last rate in percent, and the system's look; nothing without any rate.
@@ -231,9 +212,9 @@ def short(condition: str) -> str:
 
 def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: str) -> str:
     """Return in words what the points of some cells mean, as far as it needs to be said."""
-    drawn = [c for (s, _, part), c in data.cells.items() if s in systems and part in parts]
-    hollow = any(not one.complete for one in drawn)
-    dashes = any(isinstance(one, Published) for one in drawn)
+    drawn = [(s, c) for (s, _, part), c in data.cells.items() if s in systems and part in parts]
+    hollow = any(not one.complete for _, one in drawn)
+    dashes = any(system in (*data.absent, *data.beside) for system, _ in drawn)
     said = ["hollow: cell not complete"] * hollow + ["dashes: published rates"] * dashes
     return "; ".join([*said, *filter(None, notes)])
 
@@ -260,12 +241,8 @@ def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
 def label_ends(axes: Any, ends: Sequence[tuple[float, Look]], gap: float) -> None:
     """Write labels at the right ends of lines, moved apart to at least `gap` on the y axis.
 
-    Each stands behind the system's marker, in ink: not all colours can be read as letters.
-
-    Args:
-        axes: The axes, with their final limits.
-        ends: Where lines end on the y axis, and how they look.
-        gap: On the y axis.
+    Each stands behind the system's marker, in ink: not all colours can be read as letters. The
+    axes have their final limits.
     """
     from matplotlib.transforms import ScaledTranslation
 

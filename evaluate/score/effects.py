@@ -11,11 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data import stats
+from robomme_interference_data.bootstrap import (
+    LEAST,
+    Floats,
+    Interval,
+    Statistic,
+    bootstrap,
+    difference,
+    enough,
+    retention,
+    slope,
+)
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
-from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair
-from robomme_interference_data.stats import LEAST, Floats, Interval
+from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
+from robomme_interference_data.stats import cohens_h, wilson
 from robomme_interference_data.tables import Table
 
 __all__ = ["START", "SURE", "Contrast", "contrast_table", "decay_table", "effects_of"]
@@ -33,9 +43,7 @@ class Contrast:
     """One paired comparison: what changes from `against` to the condition.
 
     Attributes:
-        simulator: Name of the simulator.
-        system: Name of the system.
-        condition: Name of the condition.
+        simulator, system, condition: Their names.
         against: System and condition that it is compared with: the first side.
         pairs: The comparison.
         complete: Whether both cells are complete.
@@ -74,56 +82,55 @@ def effects_of(
     Returns:
         The comparisons, and the row of `decay_table`, if there are at least two `k<n>`.
     """
-    own = cube.ran(system)
-    cells = [(system, c) for c in own] + ([(base, c) for c in cube.ran(base)] if base else [])
+    cells = [(name, c) for name in (system, base) if name for c in cube.ran(name)]
     at = {cell: place for place, cell in enumerate(cells)}
     here = np.logical_or.reduce([cube.there[cube.systems.index(name)] for name, _ in cells])
     sides = [cube.status[cube.cell(*cell)][here] for cell in cells]
     values = np.stack([success(side) for side in sides], axis=1)
     complete = [bool(cube.complete[cube.cell(*cell)]) for cell in cells]
 
+    own = cube.ran(system)
     ks = [c for c in own if parse_condition(c).kind.name == "k"]
-    starts = START in ks
-    floor = next((cell for cell in ((system, NO_HISTORY), (base, NO_HISTORY)) if cell in at), None)
-    compared = [(c, floor) for c in ks if floor]
-    compared += [(c, (system, START)) for c in ks if starts and c != START]
+    later = [c for c in ks if c != START] if START in ks else []
+    floors = [(name, NO_HISTORY) for name in (system, base) if name and (name, NO_HISTORY) in at]
+    compared = [(c, floor) for floor in floors[:1] for c in ks]
+    compared += [(c, (system, START)) for c in later]
     compared += [(c, (base, c)) for c in own if base and (base, c) in at]
     places = [(at[there], at[system, c]) for c, there in compared]
-    ends = (at[floor], at[system, START]) if floor and starts else ()
-    kept = {c: (*ends, at[system, c]) for c in ks if ends and c != START}
+    kept = {c: (at[floor], at[system, START], at[system, c]) for floor in floors[:1] for c in later}
     falling = [at[system, c] for c in ks] if len(ks) > 1 else []
-    weights = stats.slope_weights([parse_condition(c).k for c in ks]) if falling else np.zeros(0)
+    line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
 
-    statistics: list[stats.Statistic] = [stats.difference(*two) for two in places]
-    statistics += [stats.retention(*three) for three in kept.values()]
-    statistics += [stats.slope(falling, weights)] if falling else []
-    drawn = iter(stats.Resampler(values, cube.simulator, draws).intervals(statistics))
-    tested = [pair(sides[one], sides[other], next(drawn)) for one, other in places]
-    retained = {c: _retained(_together(values, three), next(drawn)) for c, three in kept.items()}
+    statistics: list[Statistic] = [difference(*two) for two in places]
+    statistics += [retention(*three) for three in kept.values()]
+    drawn = iter(bootstrap(values, [*statistics, *line], cube.simulator, draws))
+    pairs = {
+        one: pair(sides[first], sides[second], next(drawn))
+        for one, (first, second) in zip(compared, places, strict=True)
+    }
+    retained = {
+        (c, floors[0]): _retained(_together(values, three), next(drawn))
+        for c, three in kept.items()
+    }
     # A lift that is not above zero beyond doubt is nothing to have a share of.
-    lift = dict(zip(compared, tested, strict=True)).get((START, floor)) if floor else None
+    lift = pairs.get((START, floors[0])) if floors else None
     if lift is None or not (lift.change.value > 0 and lift.p < SURE):
         retained = {}
-    nothing = Interval(math.nan)
     contrasts = [
         Contrast(
-            cube.simulator,
-            system,
-            c,
-            there,
-            pairs,
-            complete[one] and complete[other],
-            retained.get(c, nothing) if there == floor else nothing,
+            *(cube.simulator, system, c, there, pairs[c, there]),
+            complete=complete[first] and complete[second],
+            retention=retained.get((c, there), Interval(math.nan)),
         )
-        for (c, there), pairs, (one, other) in zip(compared, tested, places, strict=True)
+        for (c, there), (first, second) in zip(compared, places, strict=True)
     ]
-    if not falling:
-        return contrasts, []
-    changing = _together(values, falling)
-    fall = next(drawn)
-    fall = fall if stats.enough(changing @ weights) else Interval(fall.value)
-    whole = all(complete[place] for place in falling)
-    return contrasts, [(cube.simulator, system, " ".join(ks), len(changing), *fall, whole)]
+    decays = []
+    for one, fall in zip(line, drawn, strict=True):
+        changing = _together(values, one.columns)
+        known = fall if enough(one.combine(changing)) else Interval(fall.value)
+        whole = all(complete[place] for place in falling)
+        decays.append((cube.simulator, system, " ".join(ks), len(changing), *known, whole))
+    return contrasts, decays
 
 
 def _together(values: Floats, places: Sequence[int]) -> Floats:
@@ -133,13 +140,10 @@ def _together(values: Floats, places: Sequence[int]) -> Floats:
 
 
 def _retained(values: Floats, drawn: Interval) -> Interval:
-    """Give a retention its interval, if any two of its three conditions differ enough.
-
-    Where two hardly differ, the ratio sticks to 0 or 1 in most draws, or divides by next to
-    nothing.
-    """
+    """Give a retention its interval, if any two of its three conditions differ enough."""
+    # Where two hardly differ, the ratio sticks to 0 or 1 in most draws, or divides by next to 0.
     pairs = [values[:, i] - values[:, j] for i, j in ((1, 0), (2, 0), (2, 1))]
-    sound = all(map(stats.enough, pairs)) and drawn.low < drawn.high
+    sound = all(map(enough, pairs)) and drawn.low < drawn.high
     return drawn if sound else Interval(drawn.value)
 
 
@@ -149,13 +153,13 @@ def _retained(values: Floats, drawn: Interval) -> Interval:
 def lift_table(contrasts: Iterable[Contrast]) -> Table:
     """Return each condition's lift over the system's own rate without history."""
     found = [one for one in contrasts if one.is_lift]
+    pairs = [one.pairs for one in found]
     rows = [
         (
             *(c.simulator, c.system, c.condition, c.against[0]),
-            *(c.pairs.n, c.pairs.second, c.pairs.first, *c.pairs.tested, p),
-            *(*c.retention, c.complete),
+            *(c.pairs.n, c.pairs.second, c.pairs.first, *test, *c.retention, c.complete),
         )
-        for c, p in zip(found, stats.holm([one.pairs.p for one in found]), strict=True)
+        for c, test in zip(found, tested(pairs), strict=True)
     ]
     return Table.make(
         "lift",
@@ -165,7 +169,7 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
         "complete:flag",
         rows,
         "Over the n episodes that count on both sides. "
-        f"{how_to_read(one.pairs for one in found)} retention: lift divided by the lift at k0, "
+        f"{how_to_read(pairs)} retention: lift divided by the lift at k0, "
         f"where that one is above zero with p < {SURE}; its BCa interval, where any two of "
         f"no-history, k0 and the condition differ in at least {LEAST} episodes. A system with "
         "retrieval is, without history, the system without it.",
@@ -175,13 +179,14 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
 def contrast_table(contrasts: Iterable[Contrast]) -> Table:
     """Return effect sizes between conditions, and of retrieval."""
     found = [one for one in contrasts if not one.is_lift]
+    pairs = [one.pairs for one in found]
     rows = [
         (
             *(c.simulator, c.system, c.condition, *c.against),
-            *(c.pairs.n, c.pairs.second, c.pairs.first, *c.pairs.tested, p),
-            *(stats.cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
+            *(c.pairs.n, c.pairs.second, c.pairs.first, *test),
+            *(cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
         )
-        for c, p in zip(found, stats.holm([one.pairs.p for one in found]), strict=True)
+        for c, test in zip(found, tested(pairs), strict=True)
     ]
     return Table.make(
         "effects",
@@ -189,7 +194,7 @@ def contrast_table(contrasts: Iterable[Contrast]) -> Table:
         "simulator system condition against_system against_condition n:count rate:rate "
         f"against_rate:rate difference:points {COLUMNS} cohens_h:ratio complete:flag",
         rows,
-        f"Over the n episodes that count on both sides. {how_to_read(one.pairs for one in found)}",
+        f"Over the n episodes that count on both sides. {how_to_read(pairs)}",
     )
 
 
@@ -219,7 +224,7 @@ def noise_table(cubes: Iterable[Cube]) -> Table:
                 one, other = (((order == n) & (status == 0)).any(axis=-1) for n in (1, 2))
                 flips = int((one != other)[repeated].sum())
                 cell = (cube.simulator, cube.systems[s], cube.conditions[c])
-                rows.append((*cell, pairs, flips, flips / pairs, *stats.wilson(flips, pairs)))
+                rows.append((*cell, pairs, flips, flips / pairs, *wilson(flips, pairs)))
     return Table.make(
         "noise",
         "Flips between repeats",

@@ -1,9 +1,8 @@
 """Write rows in the layout of the released CSV."""
 
 import csv
-from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.rows import RELEASED_SIMULATOR, Rows
@@ -50,22 +49,21 @@ def export(rows: Rows, folder: Path) -> list[Path]:
             "model seed",
             "The released layout has no column for more: export such rows only.",
         )
-    values = {name: rows.values[name] for name in RELEASED_COLUMNS}
-    values["success"] = [{True: 1, False: 0}.get(one) for one in values["success"]]
-    values["status"] = [
-        Status.ONGOING if one == Status.TIMEOUT else one for one in values["status"]
-    ]
-    columns = [[found[code] for code in rows.codes[n].tolist()] for n, found in values.items()]
-    written: dict[Path, Any] = {}
-    with ExitStack() as stack:
-        names = zip(rows.list("simulator"), rows.list("system"), strict=True)
-        for (simulator, system), row in zip(names, zip(*columns, strict=True), strict=True):
-            path = folder / f"{system}-{simulator}_rollouts.csv"
-            more = [] if simulator == RELEASED_SIMULATOR else [simulator]
-            if path not in written:
-                partial = stack.enter_context(atomic_path(path))
-                file = stack.enter_context(partial.open("w", newline="", encoding="utf-8"))
-                written[path] = csv.writer(file)  # with CRLF, as released
-                written[path].writerow((*RELEASED_COLUMNS, *(["simulator"] if more else [])))
-            written[path].writerow((*row, *more))
+    told = {Status.TIMEOUT: Status.ONGOING}
+    values = {
+        "status": [told.get(one, one) for one in rows.values["status"]],
+        "success": [one if one is None else int(one) for one in rows.values["success"]],
+    }
+    written = []
+    for simulator, part in replace(rows, values=rows.values | values).by("simulator").items():
+        names = [*RELEASED_COLUMNS, *["simulator"] * (simulator != RELEASED_SIMULATOR)]
+        for system, own in part.by("system").items():
+            written.append(folder / f"{system}-{simulator}_rollouts.csv")
+            with (
+                atomic_path(written[-1]) as partial,
+                partial.open("w", newline="", encoding="utf-8") as file,
+            ):
+                writer = csv.writer(file)  # with CRLF, as released
+                writer.writerow(names)
+                writer.writerows(zip(*map(own.list, names), strict=True))
     return sorted(written)

@@ -1,7 +1,7 @@
 """Figures of a score, one set for each simulator."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from textwrap import fill
@@ -55,16 +55,9 @@ def draw_figures(score: Score, folder: Path) -> dict[str, Path]:
 
 def draw_figure(kind: str, figure: Any, data: Data) -> bool:
     """Draw one of `FIGURES`, and tell whether there is data for it."""
-    drawers: dict[str, Callable[[Any, Data], bool]] = {
-        "success": _success,
-        "families": _families,
-        "difficulty": _difficulty,
-        "retention": _retention,
-        "heatmap": _heatmap,
-        "retrieval": _retrieval,
-    }
+    drawers = (_success, _families, _difficulty, _retention, _heatmap, _retrieval)
     figure.set_layout_engine("constrained")
-    if not drawers[kind](figure, data):
+    if not dict(zip(FIGURES, drawers, strict=True))[kind](figure, data):
         return False
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")  # once, not again for each file
@@ -91,15 +84,12 @@ def _success(figure: Any, data: Data) -> bool:
 
 
 def _families(figure: Any, data: Data) -> bool:
-    _panels(figure, data, data.parts(FAMILIES), data.systems, wide=3, height=2.0)
-    return True
+    return _panels(figure, data, data.parts(FAMILIES), data.systems, wide=3, height=2.0)
 
 
 def _difficulty(figure: Any, data: Data) -> bool:
     parts = data.parts(DIFFICULTIES)
-    if parts:
-        _panels(figure, data, parts, data.systems, wide=len(parts), height=2.7)
-    return bool(parts)
+    return _panels(figure, data, parts, data.systems, wide=len(parts), height=2.7)
 
 
 def _retrieval(figure: Any, data: Data) -> bool:
@@ -107,29 +97,15 @@ def _retrieval(figure: Any, data: Data) -> bool:
     for system in data.systems:
         for base in (base_of(system), f"{base_of(system)}, published"):
             systems += [system, base] if base in (*data.systems, *data.absent) else []
-    if systems:
-        _panels(figure, data, ["", *data.parts(FAMILIES)], systems, wide=5, height=2.1)
-    return bool(systems)
+    return _panels(figure, data, ["", *data.parts(FAMILIES)], systems, wide=5, height=2.1)
 
 
 def _panels(
-    figure: Any,
-    data: Data,
-    parts: Sequence[str],
-    systems: Sequence[str],
-    wide: int,
-    height: float,
-) -> None:
-    """Draw a panel for each part.
-
-    Args:
-        figure: The figure.
-        data: Of its simulator.
-        parts: Families or difficulties; the empty one is all episodes.
-        systems: Those that are drawn.
-        wide: Panels in a row.
-        height: Of a panel, in inches.
-    """
+    figure: Any, data: Data, parts: Sequence[str], systems: Sequence[str], wide: int, height: float
+) -> bool:
+    """Draw a panel of `height` inches for each part, `wide` in a row; the empty one is all."""
+    if not (parts and systems):
+        return False
     rows = -(-len(parts) // wide)
     figure.set_size_inches(2 * wide if wide > 3 else 7.5, 0.9 + height * rows)
     panels = figure.subplots(rows, wide, sharex=True, sharey=True, squeeze=False)
@@ -147,6 +123,7 @@ def _panels(
     note = f"95% {'Wilson intervals' if bars else 'intervals: in the table'}"
     looks = [data.looks[system] for system in systems]
     legend(figure, looks, explained(data, systems, parts, note))
+    return True
 
 
 def _retention(figure: Any, data: Data) -> bool:

@@ -4,10 +4,8 @@ import math
 from collections.abc import Sequence
 
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
-from robomme_interference_data.evaluate.score import Against
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.effects import START, Contrast
-from robomme_interference_data.evaluate.score.paper import published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.tables import percent, points
@@ -26,10 +24,7 @@ def headline(score: Score, simulator: str) -> str:
     found = [one for one in score.cells if one.simulator == simulator and not one.part]
     cells = [cell for cell in found if not is_bound(cell.system)] or found
     complete = [cell for cell in cells if cell.complete]
-    if complete:
-        sentences = _leading(score, complete)
-    else:
-        sentences = [_nothing_complete(cells, int(score.cubes[simulator].expected.sum()))]
+    sentences = _leading(score, complete) if complete else [_nothing_complete(cells)]
     if not all(cell.complete for cell in found):
         done = sum(cell.complete for cell in found)
         sentences.append(f"{done} of {len(found)} cells are complete.")
@@ -72,16 +67,16 @@ def _listed(cells: Sequence[Cell]) -> str:
     return f"{', '.join(names)} and {last}" if names else last
 
 
-def _nothing_complete(cells: Sequence[Cell], expected: int) -> str:
+def _nothing_complete(cells: Sequence[Cell]) -> str:
     counting = [cell for cell in cells if cell.n]
     if not counting:
         return "No rollout counts yet."
-    nearest = min(counting, key=lambda cell: (cell.missing + cell.other, -cell.n))
-    other = f", and {nearest.other} that count are not of the grid" if nearest.other else ""
+    nearest = min(counting, key=lambda cell: (len(cell.missing) + len(cell.other), -cell.n))
+    other = f", and {len(nearest.other)} that count are not of the grid" if nearest.other else ""
     return (
         f"No cell is complete, so no system leads. Nearest to it is "
-        f"{display_name(nearest.system)} under {_named(nearest.condition)}: {nearest.missing} of "
-        f"{expected} episodes are missing{other}."
+        f"{display_name(nearest.system)} under {_named(nearest.condition)}: {len(nearest.missing)} "
+        f"of {nearest.expected} episodes are missing{other}."
     )
 
 
@@ -106,8 +101,9 @@ def _from_start(leader: Cell, contrast: Contrast) -> str:
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:
     """Say how a system with retrieval stands to the published one without, if that is wanted."""
     own = (contrast.simulator, base_of(contrast.system))
-    rates = {one.condition: one.rate for one in published() if (one.simulator, one.system) == own}
-    if score.settings.against is not Against.PAPER or not {START, contrast.condition} <= {*rates}:
+    found = [one for one in score.published if (one.simulator, one.system) == own]
+    rates = {one.condition: one.rate for one in found}
+    if not {START, contrast.condition} <= {*rates}:
         return []
     return [
         f"Without retrieval, {display_name(own[1] or '')} falls from {percent(rates[START])} to "

@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from robomme_interference_data.bootstrap import LEAST, Interval, paired_interval
 from robomme_interference_data.evaluate.score.cube import Statuses, counting, success
-from robomme_interference_data.stats import LEAST, Interval, mcnemar, paired_interval
+from robomme_interference_data.stats import holm, mcnemar
 
-__all__ = ["COLUMNS", "Pairs", "how_to_read", "pair"]
+__all__ = ["COLUMNS", "Pairs", "how_to_read", "pair", "tested"]
 
 COLUMNS = (
     "low:points high:points interval pairs:count gained:count lost:count flips:rate p:p p_holm:p"
 )
-"""Columns of a table of comparisons, after the difference: `Pairs.tested`, and p corrected."""
+"""Columns of a table of comparisons, after the difference (see `tested`)."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,6 @@ class Pairs:
         """Two-sided p-value of McNemar's exact test, NaN without pairs."""
         return mcnemar(self.gained, self.lost) if self.pairs else math.nan
 
-    @property
-    def tested(self) -> tuple[Any, ...]:
-        """The difference, and the values of `COLUMNS` but for the last."""
-        counts = (self.pairs, self.gained, self.lost, self.flips, self.p)
-        return (*self.change, self.interval, *counts)
-
 
 def pair(
     first: Statuses,
@@ -90,6 +85,14 @@ def pair(
     rates = [float(side.mean()) if len(values) else math.nan for side in values.T]
     gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
     return Pairs(len(values), rates[0], rates[1], change, interval, len(found), gained, lost)
+
+
+def tested(found: Sequence[Pairs]) -> list[tuple[Any, ...]]:
+    """Return for each comparison of a table the difference and the values of `COLUMNS`."""
+    return [
+        (*one.change, one.interval, one.pairs, one.gained, one.lost, one.flips, one.p, p)
+        for one, p in zip(found, holm([one.p for one in found]), strict=True)
+    ]
 
 
 def how_to_read(found: Iterable[Pairs]) -> str:

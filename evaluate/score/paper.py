@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
@@ -11,7 +10,7 @@ from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats import newcombe, wilson
 from robomme_interference_data.tables import Table
 
-__all__ = ["Published", "not_compared", "paper_table", "published"]
+__all__ = ["not_compared", "paper_table", "published"]
 
 _NOTE = (
     "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August "
@@ -21,60 +20,24 @@ _NOTE = (
 )
 
 
-@dataclass(frozen=True)
-class Published:
-    """A published rate.
-
-    Attributes:
-        table: Number of the paper's table: 3 the main one, 4 the one on retrieval.
-        simulator: `robomme`, always: the paper has no other.
-        system: Name of the system.
-        condition: Name of the condition.
-        percent: The rate as printed, to a tenth of a percent.
-        n: Episodes that it is over: the benchmark's, all of them.
-    """
-
-    table: int
-    simulator: str
-    system: str
-    condition: str
-    percent: float
-    n: int
-    complete = True
-
-    @property
-    def successes(self) -> int:
-        """The count behind the rate: of 450 episodes only one rounds to it."""
-        return round(self.percent * self.n / 100)
-
-    @property
-    def rate(self) -> float:
-        """The rate before rounding."""
-        return self.successes / self.n
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95% Wilson interval."""
-        return wilson(self.successes, self.n)
-
-
 @cache
-def published() -> tuple[Published, ...]:
-    """Return all published rates, in the paper's order."""
-    file = resources.files(__package__).joinpath("data", "published.csv")
-    _, *rows = csv.reader(file.read_text(encoding="utf-8").splitlines())
-    return tuple(
-        Published(int(table), simulator, system, condition, float(rate), int(n))
-        for table, simulator, system, condition, rate, n in rows
-    )
+def published() -> tuple[Cell, ...]:
+    """Return all published rates, in the paper's order, as complete cells of its simulator.
 
-
-def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Published]]:
-    """Yield the cells that the paper has, each with the published one.
-
-    A system with retrieval comes a second time, with the published one without. The simulator is
-    compared too: rows of another simulator have no published counterpart.
+    They are printed to a tenth of a percent: of 450 episodes only one count rounds to each.
     """
+    file = resources.files(__package__).joinpath("data", "published.csv")
+    cells = []
+    for row in csv.DictReader(file.read_text(encoding="utf-8").splitlines()):
+        n = int(row["episodes"])
+        won = round(float(row["percent"]) * n / 100)
+        names = (row["simulator"], row["system"], row["condition"])
+        cells.append(Cell(*names, "", n, won / n, wilson(won, n)))
+    return tuple(cells)
+
+
+def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
+    """Yield cells with the published one; of retrieval also with the published one without it."""
     known = {(one.simulator, one.system, one.condition): one for one in published()}
     for cell in cells:
         for system in (cell.system, base_of(cell.system)):
@@ -91,7 +54,7 @@ def paper_table(cells: Sequence[Cell]) -> Table:
     """
     rows = []
     for cell, paper in _comparable(cells):
-        bounds = newcombe(cell.rate * cell.n, cell.n, paper.successes, paper.n)
+        bounds = newcombe(cell.rate * cell.n, cell.n, round(paper.rate * paper.n), paper.n)
         ours = (cell.system, cell.condition, paper.system, cell.n, cell.rate, *cell.interval)
         change = (cell.rate - paper.rate, *bounds, cell.complete)
         rows.append((*ours, paper.n, paper.rate, *paper.interval, *change))

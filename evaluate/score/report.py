@@ -17,6 +17,7 @@ import numpy as np
 from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.cube import STATUSES, success
 from robomme_interference_data.evaluate.score.figures import FIGURES
@@ -25,6 +26,7 @@ from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import sha256_file, write_text
+from robomme_interference_data.rows import to_dict
 
 __all__ = ["flips", "load_jinja2", "write_report"]
 
@@ -103,20 +105,19 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     videos = _videos(score.rows)
     rows = []
     for cube in score.cubes.values():
-        known = cube.conditions
-        at = [known.index(one) if one in known else None for one in conditions]
         for place, system in enumerate(cube.systems):
             counts = cube.counts[place].transpose(1, 0, 2).tolist()
             rates = success(cube.status[place]).T.tolist()
             for number in np.flatnonzero(cube.there[place]).tolist():
                 episode, hard = cube.episodes[number], int(cube.difficulty[number])
+                came = dict(zip(cube.conditions, counts[number], strict=True))
                 found = [videos.get((cube.simulator, system, c, str(episode))) for c in conditions]
                 row = (
                     *(cube.simulator, display_name(system), episode.family),
                     *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
-                    ["" if one is None else _outcome(counts[number][one]) for one in at],
+                    [_outcome(came[c]) if c in came else "" for c in conditions],
                     flips(cube.conditions, rates[number]),
-                    ["" if one is None else _address(one, folder) for one in found],
+                    [_address(one, folder) if one else "" for one in found],
                 )
                 rows.append(row)
     text = json.dumps(rows, ensure_ascii=False, separators=(",", ":"))
@@ -153,7 +154,7 @@ def _outcome(counts: Sequence[int]) -> str:
 def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
     """Return the videos that are there, by simulator, system, condition and episode.
 
-    Of repeats it is the one with the lowest model seed among those that have one.
+    Of repeats it is that of the lowest model seed.
     """
     chosen = rows.chosen(rows.places("video", [None]) < 0)
     names = ("model_seed", "simulator", "system", "condition", "family", "episode_split", "episode")
@@ -169,17 +170,13 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
 # --- how it was made ---------------------------------------------------------------------------
 
 
-def _source(path: Path, run: Mapping[str, Any] | None) -> dict[str, list[str]]:
+def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
     """Return what there is to say of a file: commands to be copied, and all of `run.json`."""
     facts = {"SHA-256": [sha256_file(path)]}
     if run is not None:
-        starts = run.get("starts")
-        starts = (
-            [one for one in starts if isinstance(one, dict)] if isinstance(starts, list) else []
-        )
-        lines = [line for one in starts for line in one.get("command") or ()]
-        facts |= {"command": [*dict.fromkeys(map(str, lines))]} if lines else {}
-        facts["run.json"] = [json.dumps(run, indent=2, sort_keys=True, ensure_ascii=False)]
+        lines = [line for start in run.starts for line in start.command]
+        facts |= {"command": [*dict.fromkeys(lines)]} if lines else {}
+        facts["run.json"] = [json.dumps(to_dict(run), indent=2, sort_keys=True, ensure_ascii=False)]
     return facts
 
 

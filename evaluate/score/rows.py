@@ -1,30 +1,18 @@
 """Rows of rollouts, checked: each by itself, and against those of the same episode or rollout."""
 
-import re
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.conditions import parse_condition
-from robomme_interference_data.constants import (
-    DIFFICULTIES,
-    FAMILIES,
-    MAX_STEPS,
-    PROTOCOL_VERSION,
-    SPLITS,
-)
-from robomme_interference_data.errors import (
-    BadRowsError,
-    InterferenceError,
-    InvalidOptionError,
-    UnknownNameError,
-    nearest,
-)
+from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.errors import BadRowsError, InterferenceError, InvalidOptionError
+from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score.sources import (
     COLUMNS,
     Codes,
@@ -32,35 +20,19 @@ from robomme_interference_data.evaluate.score.sources import (
     find_sources,
     read_part,
 )
+from robomme_interference_data.evaluate.score.values import parsed, shown
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.records import FINAL, Status
-from robomme_interference_data.simulators.registry import SIMULATORS
+from robomme_interference_data.records import Status
 
 __all__ = ["RELEASED_SIMULATOR", "Rows", "read_rows"]
 
 RELEASED_SIMULATOR = "robomme"
 """The simulator of rows that name none."""
 
-_SHOWN = 10
-"""So many bad rows are named; the others are counted."""
+_SHOWN = 10  # so many bad rows are named; the others are counted
 
 _EPISODE = ("simulator", "family", "episode_split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
-
-_NAMES = {"family": FAMILIES, "episode_split": SPLITS, "difficulty": DIFFICULTIES}
-_NAMES["status"] = tuple(map(str, FINAL))
-_NUMBERS = {
-    **dict.fromkeys(("episode", "model_seed", "seed"), (0, 10**18 - 1)),  # as in episode ids
-    "steps": (0, MAX_STEPS),
-    "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION),
-}
-_WORDS = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
-_FRACTIONS = {name for name in COLUMNS if name.endswith("_fraction")}
-_OPTIONAL = {"seed", "difficulty", "steps", "success", "video", "retrieval_model", *_FRACTIONS}
-
-_WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # programs save some whole numbers as floats
-_SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
-"""Names of files hold it, so no `/`. A simulator of one's own is `module:function` in rows."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +51,7 @@ class Rows:
 
     codes: dict[str, Codes]
     values: dict[str, list[Any]]
-    sources: Mapping[Path, Mapping[str, Any] | None]
+    sources: Mapping[Path, RunHeader | None]
     revisions: dict[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
     refusals: tuple[str, ...] = ()
@@ -107,6 +79,11 @@ class Rows:
         """Return some of the rows: their numbers, or a flag for each."""
         return replace(self, codes={name: codes[rows] for name, codes in self.codes.items()})
 
+    def by(self, column: str) -> dict[Any, "Rows"]:
+        """Return the rows of each value of a column, by value, sorted."""
+        places = self.places(column, names := self.names(column))
+        return {name: self.chosen(places == place) for place, name in enumerate(names)}
+
 
 def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = False) -> Rows:
     """Read rows from folders of runs and files, and check each of them.
@@ -118,9 +95,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
             of rows that contradict each other none.
 
     Raises:
-        BadRowsError: A row is bad: unknown family, condition, status or system, numbers out of
-            range, a success that contradicts the status, the same rollout twice, rows of
-            different splits, or an episode with two seeds or difficulties.
+        BadRowsError: A row is bad (docs/score.md says what that is).
         InvalidIdError, UnknownNameError: `system` is no name of a system; see `name_system`.
         InvalidOptionError: Some rows of a system name the revision of their split, others none.
         MissingFileError: There is no such file.
@@ -128,86 +103,83 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     """
     if system is not None:
         name_system(system)
-    reader, sources = _Reader(system), find_sources(paths)
-    for path, header in sources.items():
-        reader.add(read_part(path, with_system=system is not None), in_run=header is not None)
-    rows = reader.checked()
+    sources = find_sources(paths)
+    parts = [read_part(path, system is not None) for path in sources]
+    rows = _Joined(parts, [run is not None for run in sources.values()], system).checked()
     if rows.refused and not lenient:
-        more = rows.refused - len(rows.refusals)
         lines = [f"{rows.refused:,} bad row{'s' * (rows.refused > 1)}:", *rows.refusals]
-        lines += [f"… and {more:,} more"] if more else []
+        if more := rows.refused - len(rows.refusals):
+            lines.append(f"… and {more:,} more")
         raise BadRowsError("\n".join(lines), "Mend them, or leave them out with --lenient.")
     named = {*zip(*(rows.list(name) for name in ("simulator", "system", "revision")), strict=True)}
     unpinned = frozenset((simulator, one) for simulator, one, revision in named if revision is None)
     revisions = {simulator: revision for simulator, _, revision in named if revision is not None}
-    for simulator, one, revision in named:
-        if revision is not None and (simulator, one) in unpinned:  # protocol, rule 5
-            raise InvalidOptionError(
-                f"some rows of {one} in {simulator} are of the split with revision {revision}, "
-                "others name no revision, as released rows do",
-                "Their histories may differ: score the files apart, or compare them.",
-            )
+    pinned = {(simulator, one) for simulator, one, revision in named if revision is not None}
+    for simulator, one in sorted(pinned & unpinned):  # protocol, rule 5
+        raise InvalidOptionError(
+            f"some rows of {one} in {simulator} are of the split with revision "
+            f"{revisions[simulator]}, others name no revision, as released rows do",
+            "Their histories may differ: score the files apart, or compare them.",
+        )
     return replace(rows, sources=sources, revisions=revisions, unpinned=unpinned)
 
 
-class _Reader:
-    """Joins the rows of files, and notes the first reason against each bad one."""
+class _Joined:
+    """The rows of files, and the first reason against each bad one."""
 
-    def __init__(self, system: str | None):
+    def __init__(self, parts: Sequence[Part], in_run: Sequence[bool], system: str | None):
+        self._parts, self._in_run = parts, in_run
+        self._starts = [0, *accumulate(part.count for part in parts)]
+        self._reasons: dict[int, str] = {}
         self._default = {
             **{"simulator": RELEASED_SIMULATOR, "system": system, "episode_split": "test"},
             **{"model_seed": 0, "protocol_version": PROTOCOL_VERSION},
         }
-        self._parts: list[Part] = []
-        self._starts = [0]  # of parts
-        self._codes: dict[str, list[Codes]] = {name: [np.zeros(0, np.int64)] for name in COLUMNS}
-        self._places: dict[str, dict[Any, int]] = {name: {} for name in COLUMNS}
-        self._reasons: dict[int, str] = {}
-
-    def add(self, part: Part, in_run: bool) -> None:
-        """Take the rows of a file, and judge each value by itself."""
-        start = self._starts[-1]
+        self._rows = Rows({}, {}, {})
         for name in COLUMNS:
-            default = np.zeros(part.count, np.int64), [self._default.get(name)]
-            codes, values = part.columns.get(name, default)
-            known, reasons = np.full(len(values), -1, np.int64), {}
-            for code, value in enumerate(values):
-                try:
-                    parsed = _parsed(name, value) if name in part.columns else value
-                    if name == "video" and parsed:  # its path is from the run's folder
-                        parsed = part.path.parent / parsed if in_run else None
-                    known[code] = self._places[name].setdefault(parsed, len(self._places[name]))
-                except InterferenceError as error:
-                    reasons[code] = f"{error.message}. {error.hint or ''}".strip()
-                except ValueError as error:
-                    reasons[code] = f"{name} {_shown(value)}; expected {error}"
-            self._codes[name].append(known[codes])
-            for row in np.flatnonzero(known[codes] < 0).tolist():
-                self._reasons.setdefault(start + row, reasons[int(codes[row])])
-        self._parts.append(part)
-        self._starts.append(start + part.count)
+            places: dict[Any, int] = {}
+            codes = [self._judged(name, number, places) for number in range(len(parts))]
+            self._rows.codes[name] = np.concatenate([np.zeros(0, np.int64), *codes])
+            self._rows.values[name] = list(places)
+
+    def _judged(self, name: str, number: int, places: dict[Any, int]) -> Codes:
+        """Judge the values of a column of one file, each by itself; −1 for a bad one."""
+        part, start = self._parts[number], self._starts[number]
+        if name not in part.columns:
+            default = self._default.get(name)
+            return np.full(part.count, places.setdefault(default, len(places)))
+        codes, values = part.columns[name]
+        known, reasons = np.full(len(values), -1, np.int64), {}
+        for code, value in enumerate(values):
+            try:
+                found = parsed(name, value)
+                if name == "video" and found:  # its path is from the run's folder
+                    found = part.path.parent / found if self._in_run[number] else None
+                known[code] = places.setdefault(found, len(places))
+            except InterferenceError as error:
+                reasons[code] = f"{error.message}. {error.hint or ''}".strip()
+            except ValueError as error:
+                reasons[code] = f"{name} {shown(value)}; expected {error}"
+        for row in np.flatnonzero(known[codes] < 0).tolist():
+            self._reasons.setdefault(start + row, reasons[int(codes[row])])
+        return known[codes]
 
     def checked(self) -> Rows:
         """Return the rows that are sound, beside each other too, and what is against the others."""
-        rows = Rows(
-            {name: np.concatenate(codes) for name, codes in self._codes.items()},
-            {name: list(places) for name, places in self._places.items()},
-            {},
-        )
-        self._check_success(rows)
-        self._check_alike(rows, "revision", ("simulator",), "rows of different splits do not mix")
+        self._check_success()
+        self._check_alike("revision", ("simulator",), "rows of different splits do not mix")
         for name in ("difficulty", "seed"):
-            self._check_alike(rows, name, _EPISODE, "an episode has one")
-        self._check_repeats(rows)
+            self._check_alike(name, _EPISODE, "an episode has one")
+        self._check_repeats()
         found = [(*self._where(row), reason) for row, reason in self._reasons.items()]
         for number, part in enumerate(self._parts):
             found += [(number, line, reason) for line, reason in part.malformed]
         refusals = [f"{self._place(n, line)}: {reason}" for n, line, reason in sorted(found)]
-        rows = rows.chosen(self._sound(rows))
+        rows = self._rows.chosen(self._sound())
         return replace(rows, refusals=tuple(refusals[:_SHOWN]), refused=len(refusals))
 
-    def _sound(self, rows: Rows) -> Codes:
-        sound = np.ones(len(rows), bool)
+    def _sound(self) -> Codes:
+        sound = np.ones(len(self._rows), bool)
         sound[list(self._reasons)] = False
         return np.flatnonzero(sound)
 
@@ -220,96 +192,43 @@ class _Reader:
         path = self._parts[number].path
         return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
 
-    def _check_success(self, rows: Rows) -> None:
-        sound = self._sound(rows)
-        names, given = rows.values["status"], rows.values["success"]
-        status, success = (rows.codes[name][sound] for name in ("status", "success"))
-        expected = [None if one == Status.ERROR else one == Status.SUCCESS for one in names]
-        fits = np.array([one is other for one in expected for other in given], bool)
-        fits = fits.reshape(len(names), len(given))
-        for at in np.flatnonzero(~fits[status, success]).tolist():
-            self._reasons[int(sound[at])] = (
-                f"success {_shown(given[success[at]])} contradicts status {names[status[at]]!r}"
-            )
+    def _joint(self, columns: Sequence[str], chosen: Codes) -> Codes:
+        """Return one number for what some rows have in several columns."""
+        codes, values = self._rows.codes, self._rows.values
+        sizes = [max(1, len(values[name])) for name in columns]
+        return np.ravel_multi_index([codes[name][chosen] for name in columns], sizes)
 
-    def _check_alike(self, rows: Rows, name: str, of: Sequence[str], why: str) -> None:
+    def _check_success(self) -> None:
+        codes, values = self._rows.codes, self._rows.values
+        pairs = product(*(enumerate(values[name]) for name in ("status", "success")))
+        for (status, name), (success, given) in pairs:
+            if given is not (None if name == Status.ERROR else name == Status.SUCCESS):
+                found = (codes["status"] == status) & (codes["success"] == success)
+                for row in np.flatnonzero(found).tolist():
+                    reason = f"success {shown(given)} contradicts status {name!r}"
+                    self._reasons.setdefault(row, reason)
+
+    def _check_alike(self, name: str, of: Sequence[str], why: str) -> None:
         """Hold a value against that of the first row with the same values in other columns."""
-        values = rows.values[name]
-        sound = self._sound(rows)
-        sound = sound[rows.places(name, [None])[sound] < 0]
-        codes = rows.codes[name][sound]
-        _, first, group = np.unique(_joint(rows, of, sound), return_index=True, return_inverse=True)
+        values, sound = self._rows.values[name], self._sound()
+        sound = sound[self._rows.places(name, [None])[sound] < 0]
+        codes = self._rows.codes[name][sound]
+        _, first, group = np.unique(self._joint(of, sound), return_index=True, return_inverse=True)
         for at in np.flatnonzero(codes != codes[first][group]).tolist():
             found, known = (values[code] for code in (codes[at], codes[first][group][at]))
             self._reasons[int(sound[at])] = f"{name} {found!r} beside {known!r}: {why}"
 
-    def _check_repeats(self, rows: Rows) -> None:
-        """Leave one row of each rollout, and none where its rows contradict each other.
-
-        So what a score says does not depend on the order of files.
-        """
-        sound = self._sound(rows)
-        key = _joint(rows, _ROLLOUT, sound)
+    def _check_repeats(self) -> None:
+        """Leave one row of each rollout, and none where its rows contradict each other."""
+        sound = self._sound()
+        key = self._joint(_ROLLOUT, sound)
         order = np.argsort(key, kind="stable")
         sound, begins = sound[order], np.diff(key[order], prepend=-1) != 0
         group = np.cumsum(begins) - 1
-        first, status = sound[begins][group], rows.codes["status"]
+        first, status = sound[begins][group], self._rows.codes["status"]
         contradicted = np.isin(group, group[status[sound] != status[first]])
         other = np.where(begins, np.roll(sound, -1), first)
         for at in np.flatnonzero(~begins | contradicted).tolist():
             more = "; its rows contradict each other" if contradicted[at] else ""
             place = self._place(*self._where(int(other[at])))
             self._reasons[int(sound[at])] = f"the same rollout as {place}{more}"
-
-
-def _joint(rows: Rows, columns: Sequence[str], chosen: Codes) -> Codes:
-    """Return one number for what some rows have in several columns."""
-    sizes = tuple(max(1, len(rows.values[name])) for name in columns)
-    return np.ravel_multi_index(tuple(rows.codes[name][chosen] for name in columns), sizes)
-
-
-# --- values ------------------------------------------------------------------------------------
-
-
-def _parsed(name: str, value: Any) -> Any:
-    """Return a value of a column as rows have it.
-
-    Raises:
-        InterferenceError, ValueError: It is none; the latter says what was expected.
-    """
-    text = "" if value is None or value != value else str(value)  # noqa: PLR0124 - NaN
-    if name in _OPTIONAL and text.lower() in ("", "nan", "none"):
-        return None
-    if name in _NUMBERS:
-        match = _WHOLE.fullmatch(text)
-        if not match or not _NUMBERS[name][0] <= int(match[1]) <= _NUMBERS[name][1]:
-            raise ValueError("a whole number from {} to {}".format(*_NUMBERS[name]))
-        return int(match[1])
-    if name in _NAMES:
-        # Released rows call a timeout what it is before the last step.
-        text = str(Status.TIMEOUT) if text == Status.ONGOING else text
-        if text not in _NAMES[name]:
-            raise InvalidOptionError.one_of(name, text, _NAMES[name])
-    elif name in _CHECKS:
-        _CHECKS[name](text)
-    elif name == "revision" and not text:
-        raise ValueError("the revision of a split")
-    elif name == "success":
-        if text.lower() not in _WORDS:
-            raise ValueError("1, 0, true, false or nothing")
-        return _WORDS[text.lower()]
-    return float(text) if name in _FRACTIONS else text
-
-
-def _check_simulator(name: str) -> None:
-    if name not in SIMULATORS and name.lower() in SIMULATORS:
-        raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
-    if not _SIMULATOR.fullmatch(name):
-        raise ValueError("up to 128 letters, digits, '.', '_', '-' and ':'")
-
-
-_CHECKS = {"system": name_system, "condition": parse_condition, "simulator": _check_simulator}
-
-
-def _shown(value: Any) -> str:
-    return "(empty)" if value is None else repr(value)

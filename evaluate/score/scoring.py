@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import BadRowsError
 from robomme_interference_data.evaluate.score import Against, Grid, Settings, cells, effects, paper
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.files import write_text
-from robomme_interference_data.stats import DRAWS
 from robomme_interference_data.tables import Table
 
 __all__ = ["TABLES", "Score", "score", "write_score"]
@@ -32,6 +31,7 @@ class Score:
         notes: What a reader must know, such as that two systems are not paired.
         cubes: What came of the rollouts, by simulator.
         contrasts: Lifts and effects of all systems, in the order of tables.
+        published: Rates of the paper, if the score is set against them.
         cells: System × condition, over all episodes, by family and by difficulty.
         tables: All tables by name, the paper's main table aside.
         grids: The paper's main table of each simulator.
@@ -43,6 +43,7 @@ class Score:
     notes: tuple[str, ...]
     cubes: Mapping[str, Cube]
     contrasts: Sequence[effects.Contrast]
+    published: Sequence[cells.Cell]
     cells: Sequence[cells.Cell]
     tables: Mapping[str, Table]
     grids: Sequence[Table]
@@ -74,25 +75,29 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     for cube in cubes.values():
         for system in cube.systems:
             base = base_of(system)
-            if base not in cube.systems:
-                base = None
-            elif reason := _apart(rows, cube.simulator, system, base or ""):
-                base, notes = None, [*notes, reason]
-            found, decay = effects.effects_of(cube, system, base, draws)
+            pair = [system, base] if base in cube.systems else []
+            # Of a split that one names and the other does not, nobody knows that it is the same.
+            unpinned = [one for one in pair if (cube.simulator, one) in rows.unpinned]
+            if len(unpinned) == 1:
+                pair = []
+                notes.append(
+                    f"{system} and {base} in {cube.simulator} are not paired: the rows of "
+                    f"{unpinned[0]} name no revision of a split, so their histories may differ."
+                )
+            found, decay = effects.effects_of(cube, system, base if pair else None, draws)
             contrasts += found
             decays += decay
     every = cells.cells_of(cubes.values())
     tables = [
-        cells.rate_table(every, "main", "Success by system and condition"),
-        cells.rate_table(every, "family", "Success by family", FAMILIES),
-        cells.rate_table(every, "difficulty", "Success by difficulty", DIFFICULTIES),
+        *(cells.rate_table(every, name) for name in ("main", "family", "difficulty")),
         effects.lift_table(contrasts),
         effects.contrast_table(contrasts),
         effects.decay_table(decays),
         effects.noise_table(cubes.values()),
-        cells.coverage_table(cubes.values()),
+        cells.coverage_table(every),
     ]
-    if settings.against is Against.PAPER:
+    published = paper.published() if settings.against is Against.PAPER else ()
+    if published:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
         whole = cells.cells_of(cubes_of(rows, Grid.BENCHMARK).values())
         tables.append(paper.paper_table(whole))
@@ -104,24 +109,10 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         tuple(notes),
         cubes,
         contrasts,
+        published,
         every,
         {table.name: table for table in tables},
         cells.main_grids(every),
-    )
-
-
-def _apart(rows: Rows, simulator: str, system: str, base: str) -> str | None:
-    """Say why a system is not paired with the one without retrieval; None if it is.
-
-    Of a split that one names and the other does not, nobody knows that it is the same: released
-    rows stand beside one's own, and are not paired with them.
-    """
-    unpinned = [one for one in (system, base) if (simulator, one) in rows.unpinned]
-    if len(unpinned) != 1:
-        return None
-    return (
-        f"{system} and {base} in {simulator} are not paired: the rows of {unpinned[0]} name no "
-        "revision of a split, so their histories may differ."
     )
 
 

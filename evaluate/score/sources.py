@@ -20,18 +20,12 @@ import pyarrow.csv as pa_csv
 import pyarrow.json as pa_json
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import (
-    FORMAT_VERSION,
-    RUN_HEADER,
-    RUN_RECORD,
-    RUN_TABLES,
-)
+from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
-from robomme_interference_data.evaluate.log import whole_lines
-from robomme_interference_data.files import read_json
+from robomme_interference_data.evaluate.log import RunHeader, whole_lines
 from robomme_interference_data.parquet import open_parquet, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
-from robomme_interference_data.rows import arrow_schema
+from robomme_interference_data.rows import arrow_schema, read_header
 
 __all__ = ["COLUMNS", "Codes", "Part", "find_sources", "read_part"]
 
@@ -70,7 +64,7 @@ class Part:
     malformed: Sequence[tuple[int, str]] = ()
 
 
-def find_sources(paths: Sequence[Path]) -> dict[Path, Mapping[str, Any] | None]:
+def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
     """Find the file of rows that each path stands for: of a run's folder it is the record.
 
     Returns:
@@ -78,10 +72,10 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, Mapping[str, Any] | None]:
 
     Raises:
         MissingFileError: There is no such file, or a folder holds no record.
-        FormatError: A run has another format version.
+        FormatError: A run's header is damaged, or of another format version.
         InvalidOptionError: A file is given twice.
     """
-    found: dict[Path, Mapping[str, Any] | None] = {}
+    found: dict[Path, RunHeader | None] = {}
     for given in paths:
         path = given / RUN_RECORD if given.is_dir() else given
         if not path.is_file():
@@ -91,11 +85,9 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, Mapping[str, Any] | None]:
             )
         if any(path.samefile(other) for other in found):
             raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
-        run, found[path] = path.parent / RUN_HEADER, None
-        if path.name in (RUN_RECORD, *RUN_TABLES) and run.is_file():
-            header = found[path] = read_json(run)
-            if header.get("format_version") != FORMAT_VERSION:
-                raise FormatError.version(run, header.get("format_version"), FORMAT_VERSION)
+        run = path.parent / RUN_HEADER
+        of_run = path.name in (RUN_RECORD, *RUN_TABLES) and run.is_file()
+        found[path] = read_header(run, RunHeader) if of_run else None
     return found
 
 
@@ -149,8 +141,8 @@ def _encoded(path: Path, column: Any) -> tuple[Codes, Sequence[Any]]:
     if pa.types.is_nested(kind):
         raise FormatError.damaged(path, f"a column holds {kind}; expected text and numbers")
     kind = pa.string() if pa.types.is_null(kind) else kind
-    array = column.cast(kind).combine_chunks().dictionary_encode("encode")
-    return np.from_dlpack(array.indices).astype(np.int64), array.dictionary.to_pylist()
+    coded = column.cast(kind).combine_chunks().dictionary_encode("encode")
+    return np.from_dlpack(coded.indices).astype(np.int64), coded.dictionary.to_pylist()
 
 
 def _read_parquet(path: Path, with_system: bool) -> Part:

@@ -187,18 +187,10 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
 def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path) -> None:
     kept = [made.row(OWN, "k0", "InsertPeg", i, letter) for i, letter in enumerate("sfte")]
     kept[1] = replace(kept[1], seed=None, difficulty=None)
-    rows = [
-        replace(
-            one,
-            simulator=simulator,
-            retrieval_model="thumbnail/max/adaptive",
-            retrieval_selected_lesson_fraction=0.0,
-            retrieval_selected_filler_fraction=0.46875,
-            retrieval_selected_query_fraction=1 / 32,
-        )
-        for simulator in ("robomme", "tabletop")
-        for one in kept
-    ]
+    fractions = {f"retrieval_selected_{name}_fraction": 1 / 32 for name in ("lesson", "query")}
+    fractions["retrieval_selected_filler_fraction"] = 0.46875
+    kept = made.changed(kept, retrieval_model="thumbnail/max/adaptive", **fractions)
+    rows = [*made.changed(kept, simulator="robomme"), *kept]
     # As pandas saves a column with a gap, and an author a number.
     path = made.write_csv(tmp_path / "a.csv", rows)
     text = path.read_text(encoding="utf-8")
@@ -208,17 +200,15 @@ def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path
         *("InsertPeg,k0,0,1000,easy,success,1,100", "InsertPeg,k0,1,,,fail,0,100"),
         *("InsertPeg,k0,2,1002,medium,ongoing,0,1300", "InsertPeg,k0,3,1003,medium,error,,100"),
     ]
+    more = "thumbnail/max/adaptive,0.03125,0.46875,0.03125"
     sources = (path, made.write_parquet(tmp_path / "a.parquet", rows))
     for number, source in enumerate((*sources, made.write_run(tmp_path / "run", rows))):
         folder = tmp_path / str(number)
         assert len(export(read_rows([source]), folder)) == 2
         for simulator, head, tail in (("robomme", "", ""), ("tabletop", ",simulator", ",tabletop")):
-            expected = [
-                ",".join(RELEASED_COLUMNS) + head,
-                *(f"{line},thumbnail/max/adaptive,0.0,0.46875,0.03125{tail}" for line in lines),
-            ]
-            found = (folder / f"{OWN}-{simulator}_rollouts.csv").read_bytes()
-            assert found == "".join(f"{line}\r\n" for line in expected).encode()
+            expected = [f"{line},{more}{tail}\r\n" for line in lines]
+            found = (folder / f"{OWN}-{simulator}_rollouts.csv").read_bytes().decode()
+            assert found == "".join([f"{','.join(RELEASED_COLUMNS)}{head}\r\n", *expected])
 
 
 def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -15,6 +15,8 @@ from support.browser import open_page
 from support.scoring import BASE, OWN, cells
 
 from robomme_interference_data.drawing import open_figure, save_figure
+from robomme_interference_data.evaluate.log import Start
+from robomme_interference_data.evaluate.plan import Plan
 from robomme_interference_data.evaluate.score.curves import Data
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure, draw_figures
 from robomme_interference_data.evaluate.score.headline import headline
@@ -33,16 +35,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = next(i for i, r in enumerate(rows) if (r.system, r.condition) == (BASE, "k0"))
     rows[place] = replace(rows[place], video=VIDEO)
     rows[place + 1] = replace(rows[place + 1], video="videos/gone.mp4")
-    starts = [
-        {
-            "command": [f"robomme-interference evaluate --out 'my run' --shard {shard}/2"],
-            "versions": {"python": "3.12.0", "numpy": "2.2.0"},
-            "git": "0" * 40,
-            "policy": {"name": "<script>alert(1)</script>"},
-        }
+    starts = tuple(
+        Start(
+            command=(f"robomme-interference evaluate --out 'my run' --shard {shard}/2",),
+            settings={},
+            plan=Plan({"MoveCube/test": "0-5"}, ("k0",)),
+            versions={"python": "3.12.0", "numpy": "2.2.0"},
+            git="0" * 40,
+            machine="x86_64",
+            policy={"name": "<script>alert(1)</script>"},
+            started="2026-01-31T12:00:00Z",
+        )
         for shard in (1, 2)
-    ]
-    made.write_run(folder, rows, split="made-up", status="complete", starts=starts)
+    )
+    made.write_run(folder, rows, status="complete", starts=starts)
     (folder / VIDEO).parent.mkdir(parents=True)
     (folder / VIDEO).write_bytes(b"video")
     return folder
@@ -70,73 +76,58 @@ def episodes(found: Score, folder: Path) -> list[list[Any]]:
 
 def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
     with open_page() as page:
+
+        def texts(selector: str) -> list[str]:
+            found = f"[...document.querySelectorAll({json.dumps(selector)})]"
+            return list(page.run(f"{found}.map(e => e.textContent)"))
+
         page.open(report)
         # Nothing but the file itself is asked for.
         assert page.requests() == [report.resolve().as_uri()]
-        shown = page.run("document.querySelector('.headline').textContent")
-        assert shown == headline(small, "tabletop")
-        found = page.run(
-            "[...document.querySelectorAll('#grid-tabletop tr')]"
-            ".map(r => [...r.cells].map(c => c.textContent))"
-        )
-        assert found[0] == ["tabletop", "no-history", "k0", "k1", "k3", "k7"]
-        expected = [[cell.replace("**", "") for cell in row] for row in small.grids[0].rows]
-        assert found[1:] == expected and found[1][1] == "8.3% [1.5, 35.4] n=12"
+        assert texts(".headline") == [headline(small, "tabletop")]
+        assert texts("#grid-tabletop thead th") == [
+            *("tabletop", "no-history", "k0", "k1", "k3", "k7")
+        ]
+        shown = texts("#grid-tabletop tbody :is(th, td)")
+        assert shown == [cell.replace("**", "") for row in small.grids[0].rows for cell in row]
+        assert shown[1] == "8.3% [1.5, 35.4] n=12"
         images = "[...document.images].map(i => i.complete && i.naturalWidth > 100)"
         assert page.run(images) == [True] * 6
 
         # Sorting by the rate: a click upwards, another downwards; a number, not a text.
-        rates = (
-            "[...document.querySelectorAll('#table-main tbody tr')]"
-            ".map(r => r.cells[4].textContent)"
-        )
-        before = page.run(rates)
-        page.click("#table-main th:nth-child(5) button")
-        upwards = page.run(rates)
+        rates, head = "#table-main tbody td:nth-child(5)", "#table-main th:nth-child(5)"
+        before = texts(rates)
+        page.click(f"{head} button")
         known = sorted(filter(None, before), key=lambda text: float(text.rstrip("%")))
-        assert upwards == [*known, *[""] * 5]  # five cells without a rollout
-        assert upwards[0] == "8.3%" and upwards != before
-        page.click("#table-main th:nth-child(5) button")
-        assert page.run(rates)[0] == "58.3%"
-        order = "document.querySelector('#table-main th:nth-child(5)').getAttribute('aria-sort')"
-        assert page.run(order) == "descending"
+        assert texts(rates) == [*known, *[""] * 5] != before  # five cells without a rollout
+        page.click(f"{head} button")
+        assert texts(rates)[0] == "58.3%"
+        order = page.run(f"document.querySelector('{head}').getAttribute('aria-sort')")
+        assert order == "descending"
 
         # Filtering a table by words.
         page.type("#table-family input", "retrieval insertpeg")
-        names = (
-            "[...document.querySelectorAll('#table-family tbody tr')].map("
-            "r => r.cells[1].textContent + ' ' + r.cells[3].textContent)"
-        )
-        assert page.run(names) == ["Retrieval-FrameSamp-Modul InsertPeg"] * 2
-        assert page.run("document.querySelector('#table-family .count').textContent") == (
-            "2 of 18 rows"
-        )
+        assert texts("#table-family tbody td:nth-child(2)") == ["Retrieval-FrameSamp-Modul"] * 2
+        assert texts("#table-family tbody td:nth-child(4)") == ["InsertPeg"] * 2
+        assert texts("#table-family .count") == ["2 of 18 rows"]
 
         # Every episode; then only those that flip; then of one system.
-        count = "document.querySelectorAll('#table-episodes tbody tr').length"
-        assert page.run(count) == 36
+        rows = "#table-episodes tbody tr"
+        assert len(texts(rows)) == 36
         page.click("#flipped")
-        assert page.run(count) == 5 + 2
+        assert len(texts(rows)) == 5 + 2
         page.type("#table-episodes input[type=search]", "Retrieval")
-        rows = page.run(
-            "[...document.querySelectorAll('#table-episodes tbody tr')].map("
-            "r => [...r.cells].map(c => c.textContent))"
-        )
-        assert [(row[2], row[3], row[-1]) for row in rows] == [
-            ("InsertPeg", "test/1", "k7 gained"),
-            ("InsertPeg", "test/2", "k7 lost"),
-        ]
-        assert rows[0][5:10] == ["", "fail", "", "", "success"]
+        assert texts(f"{rows} td:nth-child(4)") == ["test/1", "test/2"]
+        assert texts(f"{rows} td:last-child") == ["k7 gained", "k7 lost"]
+        assert texts(f"{rows}:first-child td")[5:10] == ["", "fail", "", "", "success"]
         page.click("#flipped")
-        assert page.run(count) == 12
+        assert len(texts(rows)) == 12
 
         # The one video that is there has a link that leads to it.
         page.run("document.querySelector('#table-episodes input[type=search]').select()")
         page.call("Input.insertText", text="framesamp-modul movecube")
-        ((text, address),) = page.run(
-            "[...document.querySelectorAll('#table-episodes a')].map(a => [a.textContent, a.href])"
-        )
-        assert text == "success"
+        assert texts("#table-episodes a") == ["success"]
+        address = page.run("document.querySelector('#table-episodes a').href")
         assert address == (report.parent.parent / "my run" / VIDEO).resolve().as_uri()
 
         # On a phone nothing sticks out.
@@ -171,13 +162,10 @@ def test_the_report_and_figures_are_the_same_bytes_each_time(
     report: Path, small: Score, tmp_path: Path
 ) -> None:
     folder = report.parent / "figures"
-    kinds = ("difficulty", "families", "heatmap", "retention", "retrieval", "success")
-    names = [f"{kind}-tabletop" for kind in kinds]
     suffixes = (".png", ".svg")
-    assert sorted(path.name for path in folder.iterdir()) == [
-        n + s for n in names for s in suffixes
-    ]
-    again = {name: folder / f"{name}.svg" for kind in FIGURES for name in [f"{kind}-tabletop"]}
+    names = [f"{kind}-tabletop" for kind in FIGURES]
+    assert {p.name for p in folder.iterdir()} == {n + s for n in names for s in suffixes}
+    again = {name: folder / f"{name}.svg" for name in names}
     write_report(small, again, report.parent / "again.html")
     assert (report.parent / "again.html").read_bytes() == report.read_bytes()
     for suffix in suffixes:

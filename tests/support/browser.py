@@ -17,6 +17,12 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+OPTIONS = (
+    *("--headless", "--disable-gpu", "--remote-debugging-port=0", "--no-first-run"),
+    # Else it asks for its maker's hosts at every start.
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--disable-quic", "--disable-dev-shm-usage"),
+)
 START_S, ANSWER_S = 60.0, 60.0
 
 
@@ -40,11 +46,6 @@ class Page:
                 return dict(answer["result"])
             self.events.append(answer)
 
-    def wait_for(self, event: str) -> None:
-        """Wait until an event has come."""
-        while not any(one.get("method") == event for one in self.events):
-            self.events.append(json.loads(self._socket.recv(ANSWER_S)))
-
     def run(self, script: str) -> Any:
         """Run a script in the page and return its value."""
         done = self.call("Runtime.evaluate", expression=script, returnByValue=True)
@@ -56,7 +57,8 @@ class Page:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait_for("Page.loadEventFired")
+        while not any(one.get("method") == "Page.loadEventFired" for one in self.events):
+            self.events.append(json.loads(self._socket.recv(ANSWER_S)))
 
     def click(self, selector: str) -> None:
         """Click, with the mouse, on the middle of the first element that a selector finds."""
@@ -65,15 +67,9 @@ class Page:
             "e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect();"
             "return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
+        button = {"x": place[0], "y": place[1], "button": "left", "clickCount": 1}
         for kind in ("mousePressed", "mouseReleased"):
-            self.call(
-                "Input.dispatchMouseEvent",
-                type=kind,
-                x=place[0],
-                y=place[1],
-                button="left",
-                clickCount=1,
-            )
+            self.call("Input.dispatchMouseEvent", type=kind, **button)
 
     def type(self, selector: str, text: str) -> None:
         """Click on a field and type."""
@@ -99,17 +95,10 @@ def open_page() -> Iterator[Page]:
     if found is None:
         pytest.skip(f"no Chromium here; looked for {', '.join(NAMES)}")
     with tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True) as profile:
-        options = ["--headless", "--disable-gpu", "--remote-debugging-port=0", "--no-first-run"]
-        options += ["--disable-dev-shm-usage", f"--user-data-dir={profile}"]
-        # Else it asks for its maker's hosts at every start.
-        options += ["--disable-background-networking", "--disable-component-update"]
-        options += ["--disable-sync", "--disable-quic"]
+        options = [*OPTIONS, f"--user-data-dir={profile}"]
         options += ["--no-sandbox"] if os.geteuid() == 0 else []
-        process = subprocess.Popen(
-            [found, *options, "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen([found, *options, "about:blank"], **quiet)
         try:
             port = _port(Path(profile) / "DevToolsActivePort", process)
             with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=ANSWER_S) as answer:
@@ -117,12 +106,8 @@ def open_page() -> Iterator[Page]:
             with connect(tabs[0]["webSocketDebuggerUrl"], max_size=None, proxy=None) as socket:
                 yield Page(socket)
         finally:
-            process.terminate()
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            process.kill()
+            process.wait()
 
 
 def _port(path: Path, process: subprocess.Popen[bytes]) -> int:

@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from robomme_interference_data.conditions import NO_HISTORY
+from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score import Against, Grid, Settings, commands
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.scoring import score as compute
@@ -115,7 +116,8 @@ def write_run(folder: Path, given: Sequence[Rollout], **header: Any) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     lines = [json.dumps(to_dict(one)) + "\n" for one in given]
     (folder / "rollouts.jsonl").write_text("".join(lines), encoding="utf-8")
-    (folder / "run.json").write_text(json.dumps({"format_version": 1, **header}))
+    run = RunHeader(1, {}, "made-up", **header)
+    (folder / "run.json").write_text(json.dumps(to_dict(run)))
     return folder
 
 
