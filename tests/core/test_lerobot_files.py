@@ -72,8 +72,6 @@ def test_values_frames_and_places(root: Path) -> None:
         frames = episode.images["front"]
         found = np.stack(list(lerobot.iter_frames(index, front, 2, 6)))
         np.testing.assert_array_equal(found, frames[2:6])
-        lerobot.read_frames(index, front, 1, found)
-        np.testing.assert_array_equal(found, frames[1:5])
     place = lerobot.place(2)
     assert (place.length, place.data, place.videos[front]) == PLACES[str(lerobot.version)]
     with pytest.raises(UnknownNameError, match="episode 3 is not in .* 3 episodes"):
@@ -90,7 +88,7 @@ def test_several_files_statistics_and_tasks_as_pandas_writes_them(v30: Path) -> 
     tasks = pa.table({"task_index": [0, 1], "__index_level_0__": ["one", "two"]})
     pq.write_table(tasks, v30 / "meta/tasks.parquet")
     lerobot = opened(v30)
-    assert [row["episode_index"] for row in lerobot.all_rows()] == [0, 1, 2]
+    assert lerobot.table["episode_index"].to_pylist() == [0, 1, 2]
     assert "stats/state/mean" not in lerobot.row(2)  # statistics are never read
     assert lerobot.tasks == {"one", "two"}
 
@@ -215,7 +213,7 @@ def test_lines_that_are_wrong(tmp_path: Path, text: str, message: str) -> None:
     root = write_lerobot(tmp_path, version="v2.1", stored=None)
     (root / "meta/episodes.jsonl").write_text(text)
     with pytest.raises(FormatError, match=message):
-        opened(root).all_rows()
+        _ = opened(root).table
 
 
 @pytest.mark.parametrize(
