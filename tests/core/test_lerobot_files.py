@@ -1,7 +1,6 @@
 """The one reader of LeRobot datasets: both layouts, and what may be wrong with them."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -149,40 +148,35 @@ def test_a_link_that_goes_round_is_missing(root: Path) -> None:
 # --- damage --------------------------------------------------------------------------------------
 
 
-def feature(**values: Any) -> Callable[[dict[str, Any]], Any]:
-    return lambda info: next(iter(info["features"].values())).update(values)
+INFO = {
+    "codebase_version": ("v2.0", ["v3.0"]),
+    "features": (None, {"state": "float32"}),
+    "fps": ("10", float("nan"), None),
+    "total_episodes": ("3", -1, 2, 10**12),
+    "chunks_size": (0,),
+    "data_path": (None,),
+    "video_path": (7,),
+}
+FEATURE = {
+    "dtype": (None,),
+    "shape": (None, [100_000, 100_000, 3], [-16, 24, 3], [32, 24, 3]),
+    "info": ("ffv1",),
+}
 
 
-def info(**values: Any) -> Callable[[dict[str, Any]], Any]:
-    return lambda found: found.update(values)
+@pytest.mark.parametrize(
+    ("of_feature", "name", "value"),
+    [
+        (known is FEATURE, name, value)
+        for known in (INFO, FEATURE)
+        for name, values in known.items()
+        for value in values
+    ],
+)
+def test_info_that_is_wrong(root: Path, of_feature: bool, name: str, value: Any) -> None:
+    def change(info: dict[str, Any]) -> None:
+        (next(iter(info["features"].values())) if of_feature else info)[name] = value
 
-
-INFO: list[Callable[[dict[str, Any]], Any]] = [
-    info(codebase_version="v2.0"),
-    info(codebase_version=["v3.0"]),
-    info(features=None),
-    info(features={"state": "float32"}),
-    info(fps="10"),
-    info(fps=float("nan")),
-    info(fps=None),
-    info(total_episodes="3"),
-    info(total_episodes=-1),
-    info(total_episodes=2),
-    info(total_episodes=10**12),
-    info(chunks_size=0),
-    info(data_path=None),
-    info(video_path=7),
-    feature(dtype=None),
-    feature(shape=None),
-    feature(shape=[100_000, 100_000, 3]),
-    feature(shape=[-16, 24, 3]),
-    feature(shape=[32, 24, 3]),
-    feature(info="ffv1"),
-]
-
-
-@pytest.mark.parametrize("change", INFO)
-def test_info_that_is_wrong(root: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     edit_info(root, change)
     with pytest.raises(FormatError) as caught:
         read_all(root)

@@ -118,11 +118,9 @@ def test_frames_are_the_callers(videos: dict[str, Video]) -> None:
 
 @pytest.mark.parametrize("start", [0, COUNT - 1, COUNT, 5000])
 def test_frames_after_the_end(videos: dict[str, Video], start: int) -> None:
-    stop = max(start, COUNT) + 1
     for video in videos.values():
-        with pytest.raises(TruncatedVideoError, match=f"expected frames {start} to") as caught:
-            list(iter_frames(video.path, start, stop, FPS))
-        assert str(video.path) in caught.value.message
+        with pytest.raises(TruncatedVideoError, match=f"expected frames {start} to"):
+            list(iter_frames(video.path, start, max(start, COUNT) + 1, FPS))
 
 
 @pytest.mark.parametrize(
