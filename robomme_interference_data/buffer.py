@@ -2,11 +2,11 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import repeat
+from itertools import groupby, repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,9 +179,9 @@ class Buffer:
         session = self.sessions[bisect_right(self.sessions, index, key=lambda s: s.start) - 1]
         entry = session.entry
         stored = entry.start + (index - session.start) // entry.repeat
-        out = np.empty((1, *self.query.dataset.shape(camera)), np.uint8)
-        self._datasets[entry.dataset].read_frames(entry.episode_index, camera, stored, out)
-        return out[0]
+        dataset = self._datasets[entry.dataset]
+        [frame] = dataset.iter_frames(entry.episode_index, camera, stored, stored + 1)
+        return frame
 
     def stream(
         self,
@@ -293,80 +293,68 @@ class Buffer:
         record = self._datasets[entry.dataset].record(entry.episode_index)
         return record.digests(entry.start, entry.stop)
 
-    def _cached_name(self, entry: SessionEntry, camera: str) -> str | None:
-        """Return the name of a session's frames in the cache; None without cache or digest."""
-        recorded = self._recorded(entry) if self._cache is not None else None
-        return recorded[camera_feature(camera)] if recorded else None
+    def _cached(
+        self, entry: SessionEntry, camera: str
+    ) -> tuple[str | None, NDArray[np.uint8] | None]:
+        """Return what the cache calls a session's frames, if it may keep them; and those it has."""
+        recorded = None if self._cache is None else self._recorded(entry)
+        if self._cache is None or recorded is None:
+            return None, None
+        name = recorded[camera_feature(camera)]
+        shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
+        return name, self._cache.get(name, shape)
+
+    def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
+        if self._cache is not None and name is not None:
+            self._cache.put(name, frames)
 
     def _start_reading(
         self, session: Session, camera: str, out: NDArray[np.uint8], pool: ThreadPoolExecutor
     ) -> Callable[[], None]:
         """Start to read a session into its place in `out`; the result waits until it is done."""
-        entry, cache = session.entry, self._cache
-        target = out[session.start : session.stop]
-        length = entry.stop - entry.start
-        name = self._cached_name(entry, camera)
-        if cache is not None and name is not None:
-            cached = cache.get(name, (length, *out.shape[1:]))
-            if cached is not None:
-                return pool.submit(_copy_repeated, target, cached, entry.repeat).result
-        span = target if entry.repeat == 1 else np.empty((length, *out.shape[1:]), np.uint8)
+        entry, target = session.entry, out[session.start : session.stop]
+        dataset, length = self._datasets[entry.dataset], entry.stop - entry.start
+        name, cached = self._cached(entry, camera)
         piece = _PIECE if self._threads > 1 else length
-        read = [
-            pool.submit(
-                self._datasets[entry.dataset].read_frames,
-                entry.episode_index,
-                camera,
-                entry.start + first,
-                span[first : first + piece],
+
+        def read(first: int) -> None:
+            start, last = entry.start + first, min(first + piece, length)
+            frames: Iterable[NDArray[np.uint8]] = (
+                dataset.iter_frames(entry.episode_index, camera, start, entry.start + last)
+                if cached is None
+                else cached[first:last]
             )
-            for first in range(0, length, piece)
-        ]
+            for number, frame in enumerate(frames, first):
+                target[number * entry.repeat : (number + 1) * entry.repeat] = frame
+
+        reading = [pool.submit(read, first) for first in range(0, length, piece)]
 
         def finish() -> None:
-            for future in read:
-                future.result()
-            if span is not target:
-                _copy_repeated(target, span, entry.repeat)
-            if cache is not None and name is not None:
-                cache.put(name, span)
+            for one in reading:
+                one.result()
+            if cached is None:
+                self._keep(name, target[:: entry.repeat])
 
         return finish
 
     def _iter_frames(self, camera: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
         """Yield frames `start` to `stop` (excluded), `(H, W, 3) uint8`, in order."""
         for session in self.sessions:
-            first, last = max(start, session.start), min(stop, session.stop)
-            if first >= last:
+            places = range(max(start, session.start), min(stop, session.stop))
+            if not places:
                 continue
-            entry = session.entry
-            stored = entry.start + (first - session.start) // entry.repeat
-            end = entry.start + -(-(last - session.start) // entry.repeat)
-            position = first
-            for frame in self._stored_frames(entry, camera, stored, end):
-                # A frame is shown until the next one's first place.
-                until = position + entry.repeat - (position - session.start) % entry.repeat
-                yield from repeat(frame, min(last, until) - position)
-                position = until
-
-    def _stored_frames(
-        self, entry: SessionEntry, camera: str, start: int, stop: int
-    ) -> Generator[NDArray[np.uint8]]:
-        """Yield stored frames, start inclusive, stop exclusive; with a cache, out of it."""
-        dataset, cache = self._datasets[entry.dataset], self._cache
-        name = self._cached_name(entry, camera)
-        if cache is None or name is None:
-            yield from dataset.iter_frames(entry.episode_index, camera, start, stop)
-            return
-        shape = (entry.stop - entry.start, *dataset.shape(camera))
-        frames = cache.get(name, shape)
-        if frames is None:
-            frames = np.empty(shape, np.uint8)
-            dataset.read_frames(entry.episode_index, camera, entry.start, frames)
-            cache.put(name, frames)
-        yield from frames[start - entry.start : stop - entry.start]
-
-
-def _copy_repeated(target: NDArray[np.uint8], frames: NDArray[np.uint8], repeat: int) -> None:
-    for offset in range(repeat):
-        target[offset::repeat] = frames
+            entry, dataset = session.entry, self._datasets[session.entry.dataset]
+            stored = [(place - session.start) // entry.repeat for place in places]
+            name, whole = self._cached(entry, camera)
+            frames: Iterator[NDArray[np.uint8]]
+            if name is None:
+                first, last = entry.start + stored[0], entry.start + stored[-1] + 1
+                frames = dataset.iter_frames(entry.episode_index, camera, first, last)
+            else:
+                if whole is None:
+                    whole = np.empty((entry.stop - entry.start, *dataset.shape(camera)), np.uint8)
+                    dataset.read_frames(entry.episode_index, camera, entry.start, whole)
+                    self._keep(name, whole)
+                frames = iter(whole[stored[0] : stored[-1] + 1])
+            for frame, (_, shown) in zip(frames, groupby(stored), strict=True):
+                yield from repeat(frame, len(list(shown)))

@@ -2,7 +2,6 @@
 
 import os
 import warnings
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,20 +87,13 @@ class DecodedCache:
         return self.folder / f"{sha256}.npy"
 
     def _shrink(self) -> None:
-        files = _stats(self.folder.glob("*.npy"))
+        files = []
+        for path in self.folder.glob("*.npy"):
+            with suppress(FileNotFoundError):  # removed by another process
+                files.append((path, path.stat()))
         size = sum(stat.st_size for _, stat in files)
         for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
             if size <= self.max_bytes:
                 return
             path.unlink(missing_ok=True)
             size -= stat.st_size
-
-
-def _stats(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
-    found = []
-    for path in paths:
-        try:
-            found.append((path, path.stat()))
-        except FileNotFoundError:  # removed by another process
-            continue
-    return found

@@ -1,6 +1,7 @@
 """Commands that look at splits and at this machine: `list`, `show` and `doctor`."""
 
 from dataclasses import asdict
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated
 
@@ -35,28 +36,19 @@ def list_buffers(
     if as_json:
         print_json([to_dict(manifest) for manifest in found])
         return
-    counts = tuple(Column(name, "count") for name in ("lesson", "history"))
+    columns = (
+        *(Column(name) for name in ("episode", "condition", "difficulty")),
+        *(Column(name, "count") for name in ("lesson", "history")),
+        Column("share", "ratio"),
+    )
+    values = attrgetter(
+        "episode_id", "condition", "difficulty", "lesson_frames", "history_frames", "lesson_share"
+    )
     table = Table(
         "buffers",
         str(opened.root),
-        (
-            Column("episode"),
-            Column("condition"),
-            Column("difficulty"),
-            *counts,
-            Column("share", "ratio"),
-        ),
-        tuple(
-            (
-                str(one.episode_id),
-                one.condition,
-                one.difficulty,
-                one.lesson_frames,
-                one.history_frames,
-                one.lesson_share,
-            )
-            for one in found
-        ),
+        columns,
+        tuple(map(values, found)),
         "lesson, history: frames; share: of lesson in an even 32-frame sample",
     )
     typer.echo(table.text())

@@ -117,7 +117,7 @@ class Dataset:
         """Yield the records of all episodes, by episode index."""
         if len(self._records) < len(self):
             where = self.files.describe()
-            for index, row in enumerate(self.lerobot.all_rows()):
+            for index, row in enumerate(self.lerobot.table.to_pylist()):
                 self._records[index] = from_dict(EpisodeRecord, row, where)
         return (self._records[index] for index in range(len(self)))
 
@@ -173,9 +173,11 @@ class Dataset:
         """Decode frames from `start` on into `out`, `(T, H, W, 3) uint8`.
 
         Raises:
-            MissingFileError, FormatError, TruncatedVideoError: See `video.decode_into`.
+            MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
         """
-        self.lerobot.read_frames(episode_index, self._camera(camera), start, out)
+        frames = self.iter_frames(episode_index, camera, start, start + len(out))
+        for target, frame in zip(out, frames, strict=True):
+            target[...] = frame
 
     def read_vectors(
         self, episode_index: int, feature: str, start: int, stop: int

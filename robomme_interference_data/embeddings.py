@@ -173,6 +173,8 @@ class EmbeddingIndex:
         self._files = files
         self._checked: set[str] = set()
         self._folder = index_folder(encoder, camera)
+        root = files.describe()
+        self._place = f"{root}/{self._folder}"
         camera = camera.removeprefix(CAMERA_PREFIX)
         of = f"encoder {encoder!r}" + ("" if camera == "front" else f" and camera {camera!r}")
         option = "" if camera == "front" else f" --camera {camera}"
@@ -182,9 +184,7 @@ class EmbeddingIndex:
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
-            raise MissingIndexError(
-                f"{self._root} has no embeddings of {of}", self._remedy
-            ) from None
+            raise MissingIndexError(f"{root} has no embeddings of {of}", self._remedy) from None
         try:
             self.header = read_header(path, IndexHeader)
         except FormatError as error:
@@ -192,20 +192,16 @@ class EmbeddingIndex:
         made = self.header.encoder.name, self.header.camera
         if made != (encoder_id(encoder), camera):
             raise StaleIndexError(
-                f"the embeddings in {self._root}/{self._folder} are of encoder {made[0]!r} and "
+                f"the embeddings in {self._place} are of encoder {made[0]!r} and "
                 f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
                 f"Give the encoder as {made[0]!r}, or make them anew. {self._remedy}",
             )
         if self.header.revision != revision:
             raise StaleIndexError(
-                f"the embeddings of {of} in {self._root} were made of data with "
+                f"the embeddings of {of} in {root} were made of data with "
                 f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
                 f"Make them again. {self._remedy}",
             )
-
-    @property
-    def _root(self) -> str:
-        return self._files.describe()
 
     @property
     def made(self) -> tuple[str, str, str]:
@@ -234,7 +230,7 @@ class EmbeddingIndex:
         if not 0 <= start <= stop <= len(found):
             raise UnknownNameError(
                 f"frames {start} to {stop - 1} of episode {episode_index} are not in "
-                f"{self._root}/{self._folder}, which has {len(found)} frames of that episode",
+                f"{self._place}, which has {len(found)} frames of that episode",
                 f"It is damaged: make it again. {self._remedy}",
             )
         return np.asarray(found)[start:stop].copy()
@@ -294,7 +290,7 @@ class EmbeddingIndex:
             raise self._damaged(error.message) from None
 
     def _damaged(self, what: str) -> FormatError:
-        return FormatError(f"{self._root}/{self._folder}: {what}", self._remedy)
+        return FormatError(f"{self._place}: {what}", self._remedy)
 
 
 def _data_of(files: Files) -> str:

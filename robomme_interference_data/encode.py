@@ -41,6 +41,8 @@ class Codec:
     min_side: int = 1
 
 
+_AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless=1"}
+
 CODECS = {
     codec.name: codec
     for codec in (
@@ -50,23 +52,8 @@ CODECS = {
             name="av1-lossless",
             vcodec="libaom-av1",
             pix_fmt="gbrp",
-            settings={
-                "g": 16,
-                "crf": None,
-                "extra_options": {
-                    "usage": 1,
-                    "cpu-used": 8,
-                    "row-mt": 1,
-                    "aom-params": "lossless=1",
-                },
-            },
-            options={
-                "g": "16",
-                "usage": "1",
-                "cpu-used": "8",
-                "row-mt": "1",
-                "aom-params": "lossless=1",
-            },
+            settings={"g": 16, "crf": None, "extra_options": _AOM_LOSSLESS},
+            options={"g": "16"} | {name: str(value) for name, value in _AOM_LOSSLESS.items()},
             exact=True,
         ),
         Codec(

@@ -17,7 +17,6 @@ from robomme_interference_data.worker_process import (
     Worker,
     WorkerProcess,
     attempt,
-    close,
     end_if_starting,
     end_workers,
     wait_for,
@@ -87,7 +86,7 @@ class Serial:
                         break
                 yield outcome
         finally:
-            close(function)
+            getattr(function, "close", lambda: None)()
 
 
 @dataclass(frozen=True)
@@ -125,8 +124,12 @@ class Processes:
         running: list[WorkerProcess] = []
         try:
             while waiting or any(worker.busy for worker in running):
-                while waiting and (worker := _idle(running, to_start, function)):
-                    worker.give(*waiting.popleft(), time_limit)
+                idle = [worker for worker in running if not worker.busy]
+                while waiting and (idle or to_start):
+                    if not idle:
+                        idle.append(WorkerProcess(function, to_start.popleft()))
+                        running.append(idle[-1])
+                    idle.pop().give(*waiting.popleft(), time_limit)
                 wait_for(running)
                 for worker in list(running):
                     outcome = worker.settle()
@@ -150,16 +153,3 @@ class Processes:
                         yield outcome
         finally:
             end_workers(running)
-
-
-def _idle(
-    running: list[WorkerProcess], to_start: deque[int], function: Task
-) -> WorkerProcess | None:
-    """Return a worker without a task, started if need be; None if all have one."""
-    for worker in running:
-        if not worker.busy:
-            return worker
-    if not to_start:
-        return None
-    running.append(WorkerProcess(function, to_start.popleft()))
-    return running[-1]

@@ -19,14 +19,9 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.files import LocalFiles, check_relative
 
-__all__ = ["HubFiles", "is_repo_id", "locate"]
+__all__ = ["HubFiles", "locate"]
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-
-
-def is_repo_id(text: str) -> bool:
-    """Tell whether a text reads `namespace/name`, as the id of a repository on the Hub does."""
-    return _REPO_ID.fullmatch(text) is not None
 
 
 def locate(location: str | os.PathLike[str], repo_type: str = "dataset") -> "LocalFiles | HubFiles":
@@ -44,7 +39,7 @@ def locate(location: str | os.PathLike[str], repo_type: str = "dataset") -> "Loc
     if folder.is_dir():
         return LocalFiles(folder)
     repo_id, at, revision = str(location).partition("@")
-    if not is_repo_id(repo_id) or (at and not revision):
+    if not _REPO_ID.fullmatch(repo_id) or (at and not revision):
         raise InvalidOptionError(
             f"{str(location)!r} is neither a folder nor a {repo_type} repository on the Hub",
             "Give an existing folder, namespace/name, or namespace/name@revision.",

@@ -136,11 +136,6 @@ class LeRobotFiles:
             row = self._rows[index] = self.table.slice(index, 1).to_pylist()[0]
         return row
 
-    def all_rows(self) -> list[dict[str, Any]]:
-        """Return `row` of every episode, by episode index."""
-        rows: list[dict[str, Any]] = self.table.to_pylist()
-        return rows
-
     def place(self, index: int) -> EpisodePlace:
         """Return where an episode lies.
 
@@ -199,19 +194,10 @@ class LeRobotFiles:
         Raises:
             MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
         """
-        path, first = self._video(index, column, start, stop)
-        return video.iter_frames(path, first + start, first + stop, self.fps, self.shape(column))
-
-    def read_frames(self, index: int, column: str, start: int, out: NDArray[np.uint8]) -> None:
-        """Decode frames from `start` on into `out`, `(T, H, W, 3) uint8`; errors as there."""
-        path, first = self._video(index, column, start, start + len(out))
-        video.decode_into(out, path, first + start, self.fps)
-
-    def _video(self, index: int, column: str, start: int, stop: int) -> tuple[Any, int]:
-        place = self.place(index)
+        relative, first = self.place(index).videos[column]
         self.check_span(index, start, stop)
-        path, first = place.videos[column]
-        return self.files.path(path), first
+        path, shape = self.files.path(relative), self.shape(column)
+        return video.iter_frames(path, first + start, first + stop, self.fps, shape)
 
     def check_span(self, index: int, start: int, stop: int) -> None:
         """Check that an episode has frames `start` to `stop` (excluded).

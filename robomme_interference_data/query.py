@@ -77,9 +77,9 @@ class Query:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError, TruncatedVideoError: Its video cannot be read.
         """
-        out = np.empty((1, *self.dataset.shape(camera)), np.uint8)
-        self.dataset.read_frames(self.record.episode_index, camera, self.lesson_frames, out)
-        return out[0]
+        start, index = self.lesson_frames, self.record.episode_index
+        [frame] = self.dataset.iter_frames(index, camera, start, start + 1)
+        return frame
 
     def state(self) -> NDArray[np.float32]:
         """Return the state at the first live observation, `(8,) float32`; see `Buffer.states`."""

@@ -6,7 +6,7 @@ field `episode_id` also has the columns `family`, `split` and `index`, to filter
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -15,20 +15,19 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import pyarrow as pa
 
 from robomme_interference_data.constants import FORMAT_VERSION
-from robomme_interference_data.errors import FormatError, InterferenceError
+from robomme_interference_data.errors import FormatError, first_line
 from robomme_interference_data.files import read_json
 from robomme_interference_data.ids import EpisodeId
 
 __all__ = ["arrow_schema", "from_dict", "from_table", "read_header", "to_dict", "to_table"]
 
-_SCALARS: dict[Any, tuple[pa.DataType, str]] = {
-    str: (pa.string(), "text"),
-    int: (pa.int64(), "a whole number"),
-    float: (pa.float64(), "a number"),
-    bool: (pa.bool_(), "true or false"),
-    EpisodeId: (pa.string(), "an episode id"),
+_SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
+    str: (pa.string(), (str,), "text"),
+    int: (pa.int64(), (int,), "a whole number"),
+    float: (pa.float64(), (float, int), "a number"),
+    bool: (pa.bool_(), (bool,), "true or false"),
 }
-_PARTS = ("family", "split", "index")
+_PARTS = {"family": pa.string(), "split": pa.string(), "index": pa.int64()}
 """Columns that the field `episode_id` has beside its own."""
 
 
@@ -39,19 +38,20 @@ def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
         record: The dataclass.
         keys: Names that maps of text to text have; Arrow has them as structs.
     """
-    return pa.schema(_arrow_fields(record, tuple(keys)))
+    return pa.schema(list(_codec(record).arrow(keys)))
 
 
 def to_dict(record: Any) -> dict[str, Any]:
     """Return a record as plain values, for JSON and Arrow: columns in order."""
-    plain: dict[str, Any] = _record_writer(type(record))(record, {})
+    write = _codec(type(record)).write
+    plain: dict[str, Any] = write(record, {}) if write else record
     return plain
 
 
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
     """Return records as a table; parts that records share are converted once."""
     kept = list(records)  # alive, so that an id is one object's
-    write = _record_writer(type(kept[0])) if kept else None
+    write = _codec(type(kept[0])).write if kept else None
     shared: dict[int, Any] = {}
     rows = [write(record, shared) for record in kept] if write else []
     columns = {field.name: [row.get(field.name) for row in rows] for field in schema}
@@ -85,10 +85,9 @@ def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]
             `path` is named.
     """
     names = _names(record)
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
+    if missing := [name for name in names if name not in table.column_names]:
         raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
-    return (from_dict(record, row, path) for row in table.select(list(names)).to_pylist())
+    return (from_dict(record, row, path) for row in table.select(names).to_pylist())
 
 
 def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = False) -> T:
@@ -105,17 +104,14 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
     """
     try:
         if strict and isinstance(value, Mapping):
-            known = set(_names(record))
-            known |= set(_PARTS) if "episode_id" in known else set()
+            names = _names(record)
+            known = {*names, *_PARTS} if "episode_id" in names else {*names}
             if unknown := sorted(map(str, value.keys() - known)):
                 raise ValueError(f"unknown {', '.join(unknown)}")
-        kind: Any = record
-        found: T = _reader(kind)(value)
+        found: T = _codec(record).read(value)
         return found
-    except InterferenceError as error:
-        raise FormatError.damaged(path, error.message) from None
     except ValueError as error:
-        raise FormatError.damaged(path, error) from None
+        raise FormatError.damaged(path, first_line(error)) from None
 
 
 def read_header[T](path: Path, record: type[T], *, strict: bool = True) -> T:
@@ -132,29 +128,120 @@ def read_header[T](path: Path, record: type[T], *, strict: bool = True) -> T:
     return from_dict(record, value, path, strict=strict)
 
 
-# --- to plain values and Arrow -----------------------------------------------------------------
+def _names(record: Any) -> list[str]:
+    return [field.name for field in fields(record)]
+
+
+# --- what follows from a type ------------------------------------------------------------------
 
 _Writer = Callable[[Any, dict[int, Any]], Any]
 """From a value to a plain one; what is shared by many rows is remembered by its id."""
 
 
-@cache
-def _writer(hint: Any) -> _Writer | None:
-    """Return what makes plain values of a type; None where they are plain already."""
-    plain, optional = _split(hint)
-    if plain is EpisodeId:
-        write: _Writer = _remembered(lambda value, shared: str(value))
-    elif is_dataclass(plain):
-        write = _remembered(_record_writer(plain))
-    elif get_origin(plain) is tuple:
-        write = _listed(_writer(get_args(plain)[0]))
-    elif get_origin(plain) is dict and _writer(get_args(plain)[1]) is not None:
-        write = _mapped(_writer(get_args(plain)[1]))
-    else:
-        return None
-    if not optional:
-        return write
-    return lambda value, shared: None if value is None else write(value, shared)
+@dataclass(frozen=True)
+class _Codec:
+    """How values of a type are kept: its Arrow type, given the keys of maps, and both ways.
+
+    There is no `write` where values are plain already.
+    """
+
+    arrow: Callable[[Sequence[str]], pa.DataType]
+    read: Callable[[Any], Any]
+    write: _Writer | None = None
+    optional: bool = False
+
+
+def _codec_of(hint: Any) -> _Codec:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (UnionType, Union):
+        return _or_none(_codec(next(part for part in arguments if part is not NoneType)))
+    if hint in _SCALARS:
+        kind, types, expected = _SCALARS[hint]
+        return _Codec(
+            lambda keys: kind,
+            lambda value: value if type(value) is hint else hint(_of(types, value, expected)),
+        )
+    if hint is EpisodeId:
+        write = _remembered(lambda value, shared: str(value))
+        return _Codec(lambda keys: pa.string(), EpisodeId.parse, write)
+    if is_dataclass(hint):
+        return _record(hint)
+    if origin in (tuple, dict):
+        return _list(_codec(arguments[0])) if origin is tuple else _map(_codec(arguments[1]))
+    return _Codec(lambda keys: pa.null(), lambda value: value)
+
+
+_codec: Callable[[Any], _Codec] = cache(_codec_of)
+
+
+def _or_none(plain: _Codec) -> _Codec:
+    read, write = plain.read, plain.write
+    return _Codec(
+        plain.arrow,
+        lambda value: None if value is None else read(value),
+        write and (lambda value, shared: None if value is None else write(value, shared)),
+        optional=True,
+    )
+
+
+def _list(item: _Codec) -> _Codec:
+    read, write = item.read, item.write
+    return _Codec(
+        lambda keys: pa.list_(pa.field("item", item.arrow(keys), nullable=False)),
+        lambda value: tuple(map(read, _of((list, tuple), value, "a list"))),
+        lambda value, shared: [write(one, shared) for one in value] if write else list(value),
+    )
+
+
+def _map(item: _Codec) -> _Codec:
+    read, write = item.read, item.write
+
+    def checked(value: Any) -> Any:
+        items = _of((dict,), value, "a map").items()
+        return {_of((str,), key, "text"): read(one) for key, one in items}
+
+    return _Codec(
+        lambda keys: pa.struct([pa.field(key, item.arrow(keys), nullable=False) for key in keys]),
+        checked,
+        write and (lambda value, shared: {key: write(one, shared) for key, one in value.items()}),
+    )
+
+
+def _record(record: Any) -> _Codec:
+    hints = get_type_hints(record)
+    codecs = {name: _codec(hints[name]) for name in _names(record)}
+    identified = "episode_id" in codecs
+
+    def arrow(keys: Sequence[str]) -> pa.DataType:
+        found = []
+        for name, codec in codecs.items():
+            found.append(pa.field(name, codec.arrow(keys), nullable=codec.optional))
+            if name == "episode_id":
+                found += [pa.field(part, kind, nullable=False) for part, kind in _PARTS.items()]
+        return pa.struct(found)
+
+    def read(value: Any) -> Any:
+        given = _of((dict,), value, "a map")
+        found = {}
+        for name, codec in codecs.items():
+            if name not in given and not codec.optional:
+                raise ValueError(f"{name} is missing")
+            try:
+                found[name] = codec.read(given.get(name))
+            except ValueError as error:
+                raise ValueError(f"{name}: {first_line(error)}") from None
+        return record(**found)
+
+    def write(value: Any, shared: dict[int, Any]) -> Any:
+        found = {}
+        for name, codec in codecs.items():
+            one = getattr(value, name)
+            found[name] = one if codec.write is None else codec.write(one, shared)
+        if identified:
+            found |= {part: getattr(value.episode_id, part) for part in _PARTS}
+        return found
+
+    return _Codec(arrow, read, _remembered(write))
 
 
 def _remembered(write: _Writer) -> _Writer:
@@ -167,136 +254,8 @@ def _remembered(write: _Writer) -> _Writer:
     return found
 
 
-def _record_writer(record: Any) -> _Writer:
-    writers = [(name, _writer(hint)) for name, hint in _hints(record).items()]
-    identified = "episode_id" in _hints(record)
-
-    def write(value: Any, shared: dict[int, Any]) -> Any:
-        found = {}
-        for name, item in writers:
-            one = getattr(value, name)
-            found[name] = one if item is None else item(one, shared)
-        if identified:
-            episode = value.episode_id
-            found |= {"family": episode.family, "split": episode.split, "index": episode.index}
-        return found
-
-    return write
-
-
-def _listed(item: _Writer | None) -> _Writer:
-    if item is None:
-        return lambda value, shared: list(value)
-    return lambda value, shared: [item(one, shared) for one in value]
-
-
-def _mapped(item: _Writer | None) -> _Writer:
-    return lambda value, shared: {key: item and item(one, shared) for key, one in value.items()}
-
-
-def _names(record: Any) -> tuple[str, ...]:
-    return tuple(_hints(record))
-
-
-def _arrow_fields(record: type, keys: tuple[str, ...]) -> list[pa.Field]:
-    found = []
-    for name, hint in _hints(record).items():
-        plain, optional = _split(hint)
-        found.append(pa.field(name, _arrow_type(plain, keys), nullable=optional))
-        if name == "episode_id":
-            found += [
-                pa.field("family", pa.string(), nullable=False),
-                pa.field("split", pa.string(), nullable=False),
-                pa.field("index", pa.int64(), nullable=False),
-            ]
-    return found
-
-
-def _arrow_type(hint: Any, keys: tuple[str, ...]) -> pa.DataType:
-    if hint in _SCALARS:
-        return _SCALARS[hint][0]
-    if is_dataclass(hint):
-        return pa.struct(_arrow_fields(hint, keys))  # type: ignore[arg-type]
-    if get_origin(hint) is tuple:
-        return pa.list_(pa.field("item", _arrow_type(get_args(hint)[0], keys), nullable=False))
-    value = _arrow_type(get_args(hint)[1], keys)
-    return pa.struct([pa.field(key, value, nullable=False) for key in keys])
-
-
-# --- from plain values -------------------------------------------------------------------------
-
-
-def _hints(record: Any) -> dict[str, Any]:
-    return _cached_hints(record)
-
-
-@cache
-def _cached_hints(record: Any) -> dict[str, Any]:
-    hints = get_type_hints(record)
-    return {field.name: hints[field.name] for field in fields(record)}
-
-
-def _split(hint: Any) -> tuple[Any, bool]:
-    """Return a type without None, and whether None was allowed."""
-    if get_origin(hint) in (UnionType, Union):
-        plain = [part for part in get_args(hint) if part is not NoneType]
-        return plain[0], True
-    return hint, False
-
-
-@cache
-def _reader(hint: Any) -> Callable[[Any], Any]:
-    """Return what checks and converts a plain value of a type."""
-    plain, optional = _split(hint)
-    nested = is_dataclass(plain) and plain is not EpisodeId
-    read = _record_reader(plain) if nested else _value_reader(plain)
-    if not optional:
-        return read
-    return lambda value: None if value is None else read(value)
-
-
-def _value_reader(hint: Any) -> Callable[[Any], Any]:
-    if hint is EpisodeId:
-        return EpisodeId.parse
-    if hint is Any:
-        return lambda value: value
-    if hint is float:
-        return lambda value: float(_of((float, int), value, "a number"))
-    if hint in _SCALARS:
-        expected = _SCALARS[hint][1]
-        return lambda value: _of((hint,), value, expected)
-    if get_origin(hint) is tuple:
-        item = _reader(get_args(hint)[0])
-        return lambda value: tuple(map(item, _of((list, tuple), value, "a list")))
-    item = _reader(get_args(hint)[1]) if get_args(hint) else lambda value: value
-    return lambda value: {
-        _of((str,), key, "text"): item(one) for key, one in _of((dict,), value, "a map").items()
-    }
-
-
 def _of(types: tuple[type, ...], value: Any, expected: str) -> Any:
     if type(value) not in types:
         shown = repr(value)
         raise ValueError(f"{shown if len(shown) < 80 else shown[:77] + '…'}; expected {expected}")
     return value
-
-
-def _record_reader(record: Any) -> Callable[[Any], Any]:
-    readers = {name: _reader(hint) for name, hint in _hints(record).items()}
-    optional = {name for name, hint in _hints(record).items() if _split(hint)[1]}
-
-    def read(value: Any) -> Any:
-        given = _of((dict,), value, "a map")
-        found = {}
-        for name, reader in readers.items():
-            if name not in given and name not in optional:
-                raise ValueError(f"{name} is missing")
-            try:
-                found[name] = reader(given.get(name))
-            except InterferenceError as error:
-                raise ValueError(f"{name}: {error.message}") from None
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from None
-        return record(**found)
-
-    return read

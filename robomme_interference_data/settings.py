@@ -22,7 +22,7 @@ from functools import wraps
 from types import NoneType, UnionType
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
-__all__ = ["option_names", "setting", "spread_values", "with_settings"]
+__all__ = ["setting", "spread_values", "with_settings"]
 
 _SETTING = "setting"
 
@@ -67,9 +67,8 @@ def with_settings[**P, R](function: Callable[P, R]) -> Callable[..., R]:
     for parameter in signature.parameters.values():
         kind = parameter.annotation
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-            options = _options(kind)
             configs[parameter.name] = kind, {one[0]: one[2]["whole"] for one in _declared(kind)}
-            parameters += options
+            parameters += _options(kind)
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     parameters.sort(key=lambda one: one.default is not inspect.Parameter.empty)
@@ -109,11 +108,6 @@ def spread_values(arguments: Sequence[str], several: Sequence[str]) -> list[str]
     return spread
 
 
-def option_names(config: type) -> dict[str, str]:
-    """Return the option of each field of a dataclass of settings, such as `--episode-split`."""
-    return {name: _option_name(name, told) for name, _, told, _ in _declared(config)}
-
-
 def _declared(config: Any) -> list[tuple[str, Any, dict[str, Any], Any]]:
     """Return name, type, what was told, and default of each setting."""
     hints = get_type_hints(config)
@@ -122,10 +116,6 @@ def _declared(config: Any) -> list[tuple[str, Any, dict[str, Any], Any]]:
         for field in dataclasses.fields(config)
         if _SETTING in field.metadata
     ]
-
-
-def _option_name(name: str, told: dict[str, Any]) -> str:
-    return told["name"] or "--" + name.replace("_", "-")
 
 
 def _options(config: type) -> list[inspect.Parameter]:
@@ -145,18 +135,15 @@ def _options(config: type) -> list[inspect.Parameter]:
             about["show_default"] = told["shown"]
         elif default in (None, ()):
             about["show_default"] = False
-        argument = told["name"] == "-"
-        option: Any = (
-            typer.Argument(**about) if argument else typer.Option(_option_name(name, told), **about)
+        option = told["name"] or "--" + name.replace("_", "-")
+        declared: Any = typer.Argument(**about) if option == "-" else typer.Option(option, **about)
+        parameter = inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, declared]
         )
-        annotation: Any = Annotated[kind, option]
-        missing = default is dataclasses.MISSING
-        value = inspect.Parameter.empty if missing else _default(default)
-        found.append(
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=value, annotation=annotation
-            )
-        )
+        if default is not dataclasses.MISSING:
+            value = list(default) if isinstance(default, tuple) else default
+            parameter = parameter.replace(default=value)
+        found.append(parameter)
     return found
 
 
@@ -164,10 +151,6 @@ def _without_none(hint: Any) -> Any:
     if get_origin(hint) is UnionType:
         return next(part for part in get_args(hint) if part is not NoneType)
     return hint
-
-
-def _default(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _value(given: Any, whole: bool) -> Any:

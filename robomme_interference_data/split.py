@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
@@ -148,7 +147,9 @@ class Split:
         if row is None:
             self._check_episode(episode)
             raise FormatError.damaged(self._rows.path, f"no row of {episode} under {wanted}")
-        return next(self._read(self._rows.part(row, row + 1)))
+        return next(
+            from_table(BufferManifest, self._rows.part(row, row + 1).table(), self._rows.path)
+        )
 
     def manifests(
         self,
@@ -171,7 +172,7 @@ class Split:
                     known = {one for one in self._keys[column] if one is not None}
                     raise UnknownNameError.among(column, value, self.root, known)
                 keep &= np.array([one == value for one in self._keys[column]])
-        return self._selected(keep)
+        return self._read(keep)
 
     def load(
         self,
@@ -201,24 +202,17 @@ class Split:
         )
 
     def _check_episode(self, episode: EpisodeId) -> None:
-        if episode in self.episode_ids:
-            return
         if episode.family not in self.families:
             raise UnknownNameError.among("family", episode.family, self.root, self.families)
-        raise UnknownNameError.among("episode", str(episode), self.root, self.episode_ids)
+        if episode not in self.episode_ids:
+            raise UnknownNameError.among("episode", str(episode), self.root, self.episode_ids)
 
-    def _selected(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
+    def _read(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
         for first in range(0, len(keep), _BATCH):
-            last = min(first + _BATCH, len(keep))
-            if keep[first:last].any():
-                yield from self._read(self._rows.part(first, last), keep[first:last])
-
-    def _read(
-        self, rows: RowSpan, keep: NDArray[np.bool_] | None = None
-    ) -> Iterator[BufferManifest]:
-        table = rows.table()
-        found = table if keep is None else table.filter(pa.array(keep))
-        return from_table(BufferManifest, found, rows.path)
+            wanted = keep[first : first + _BATCH]
+            if wanted.any():
+                table = self._rows.part(first, first + len(wanted)).table()
+                yield from from_table(BufferManifest, table.filter(wanted), self._rows.path)
 
     @cached_property
     def _rows(self) -> RowSpan:

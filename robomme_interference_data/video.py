@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, MissingFileError, TruncatedVideoError
 
-__all__ = ["decode_into", "iter_frames"]
+__all__ = ["iter_frames"]
 
 
 def iter_frames(
@@ -71,22 +71,6 @@ def iter_frames(
             f"{path}: the video ends before frame {expected}; expected {wanted}",
             "The file is damaged or incomplete: download or build it again.",
         )
-
-
-def decode_into(out: NDArray[np.uint8], path: Path, start: int, fps: float) -> NDArray[np.uint8]:
-    """Decode `len(out)` frames from number `start` on into `out`, `(T, H, W, 3) uint8`.
-
-    Returns:
-        `out`.
-
-    Raises:
-        FormatError: The frames are of another size than `out`, or as for `iter_frames`.
-        MissingFileError, TruncatedVideoError: As for `iter_frames`.
-    """
-    images = iter_frames(path, start, start + len(out), fps, out.shape[1:])
-    for position, image in enumerate(images):
-        out[position] = image
-    return out
 
 
 def _to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:

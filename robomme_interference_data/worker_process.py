@@ -23,7 +23,6 @@ __all__ = [
     "Worker",
     "WorkerProcess",
     "attempt",
-    "close",
     "end_if_starting",
     "end_workers",
     "wait_for",
@@ -110,12 +109,6 @@ def attempt(
     except Exception as error:
         # Foreign exceptions may not survive pickling; their text does.
         return None, RuntimeError(_text(error)), traceback.format_exc()
-
-
-def close(function: Task) -> None:
-    """Let a function close what it holds, if it can."""
-    if (call := getattr(function, "close", None)) is not None:
-        call()
 
 
 def end_if_starting() -> None:
@@ -301,7 +294,7 @@ def _serve(function: Task, pipe: Connection, words: Connection, number: int) -> 
         pipe.send(("ready",))
         while True:
             _send(pipe, *attempt(function, pipe.recv(), worker))
-    close(function)
+    getattr(function, "close", lambda: None)()
 
 
 def _send(pipe: Connection, value: Any, error: BaseException | None, trace: str | None) -> None:

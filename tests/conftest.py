@@ -60,11 +60,7 @@ def pytest_unconfigure() -> None:
 @pytest.fixture(autouse=True, scope="session")
 def _loopback_only() -> Iterator[None]:
     """Refuse connections that would leave this machine."""
-    lookup, connect, connect_ex = (
-        socket.getaddrinfo,
-        socket.socket.connect,
-        socket.socket.connect_ex,
-    )
+    lookup = socket.getaddrinfo
 
     def check(host: Any) -> None:
         name = host.decode() if isinstance(host, bytes) else host
@@ -75,20 +71,18 @@ def _loopback_only() -> Iterator[None]:
         check(host)
         return lookup(host, *rest, **options)
 
-    def guarded_connect(self: socket.socket, address: Any) -> None:
-        if isinstance(address, tuple):
-            check(address[0])
-        connect(self, address)
+    def guarded(connect: Callable[..., Any]) -> Callable[..., Any]:
+        def call(self: socket.socket, address: Any) -> Any:
+            if isinstance(address, tuple):
+                check(address[0])
+            return connect(self, address)
 
-    def guarded_connect_ex(self: socket.socket, address: Any) -> int:
-        if isinstance(address, tuple):
-            check(address[0])
-        return connect_ex(self, address)
+        return call
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(socket, "getaddrinfo", guarded_lookup)
-        patch.setattr(socket.socket, "connect", guarded_connect)
-        patch.setattr(socket.socket, "connect_ex", guarded_connect_ex)
+        for name in ("connect", "connect_ex"):
+            patch.setattr(socket.socket, name, guarded(getattr(socket.socket, name)))
         yield
 
 

@@ -112,7 +112,7 @@ class LeRobotSource:
             SourceError: The dataset cannot be used; says which episode, why and what to do.
         """
         columns = set(self._columns.values())
-        rows, known = self._lerobot.all_rows(), self._lerobot.tasks
+        rows, known = self._lerobot.table.to_pylist(), self._lerobot.tasks
         ids, simulator = self._ids(rows)
         found = []
         for index, name in ids.items():

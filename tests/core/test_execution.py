@@ -49,37 +49,32 @@ def test_a_value_need_not_be_picklable_here() -> None:
     assert outcome.value.acquire()
 
 
-def test_errors_of_this_package_are_themselves() -> None:
+def test_errors_of_this_package_are_themselves_others_are_told_in_words() -> None:
     (outcome,) = Serial().run(lambda task, worker: EpisodeId.parse(task), ["VideoRepick"])
     assert isinstance(outcome.error, InvalidIdError)
     assert outcome.error.hint is not None
     assert outcome.trace is not None and "EpisodeId.parse" in outcome.trace
-
-
-def test_foreign_errors_are_told_in_words() -> None:
     (outcome,) = Serial().run(lambda task, worker: int(task), ["x"])
     assert type(outcome.error) is RuntimeError
     assert str(outcome.error).startswith("ValueError: invalid literal")
-    assert outcome.attempts == 1
 
 
 @pytest.mark.parametrize(
-    ("times", "attempts", "found"),
-    [(1, 2, (2, False)), (2, 2, (2, True)), (2, 3, (3, False)), (1, 1, (1, True))],
+    ("error", "times", "attempts", "found"),
+    [
+        (SimulatorCrashError("died"), 1, 2, (2, False)),
+        (SimulatorCrashError("died"), 2, 2, (2, True)),
+        (SimulatorCrashError("died"), 2, 3, (3, False)),
+        (SimulatorCrashError("died"), 1, 1, (1, True)),
+        (InvalidOptionError("no"), 1, 2, (1, True)),  # which is final
+    ],
 )
 def test_a_task_is_started_again_after_some_errors(
-    times: int, attempts: int, found: tuple[int, bool]
+    error: Exception, times: int, attempts: int, found: tuple[int, bool]
 ) -> None:
-    function = Noted(SimulatorCrashError("died"), times)
-    run = Serial().run(function, [1], attempts=attempts, again=(SimulatorCrashError,))
+    run = Serial().run(Noted(error, times), [1], attempts=attempts, again=(SimulatorCrashError,))
     (outcome,) = run
     assert (outcome.attempts, outcome.error is not None) == found
-
-
-def test_other_errors_are_final() -> None:
-    function = Noted(InvalidOptionError("no"), 1)
-    (outcome,) = Serial().run(function, [1], again=(SimulatorCrashError,))
-    assert (outcome.attempts, type(outcome.error)) == (1, InvalidOptionError)
 
 
 def test_the_last_worker_may_not_retire() -> None:

@@ -1,6 +1,5 @@
 """Files reached through one place, written whole or not at all."""
 
-import hashlib
 import json
 import math
 from pathlib import Path
@@ -19,7 +18,6 @@ from robomme_interference_data.files import (
     hold,
     parse_sums,
     read_json,
-    sha256_file,
     write_json,
 )
 
@@ -60,20 +58,14 @@ def test_missing_file_or_folder_in_its_place(tmp_path: Path, name: str) -> None:
     assert "build it again" in str(caught.value.hint)
 
 
-def test_canonical_json() -> None:
-    assert canonical_json({"b": [1, 2.5, None, True], "a": "ä\n"}) == (
-        '{"a":"ä\\n","b":[1,2.5,null,true]}'
-    )
-    for number in (math.nan, math.inf, -math.inf):
-        with pytest.raises(ValueError, match="not JSON compliant"):
-            canonical_json({"x": number})
-
-
 @given(st.dictionaries(st.text(), values, max_size=5))
-def test_canonical_json_does_not_depend_on_order(value: dict[str, Any]) -> None:
+def test_canonical_json(value: dict[str, Any]) -> None:
     text = canonical_json(value)
     assert canonical_json(dict(reversed(value.items()))) == text
     assert json.loads(text) == value
+    assert canonical_json({"b": [1, 2.5, None], "a": "ä\n"}) == '{"a":"ä\\n","b":[1,2.5,null]}'
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        canonical_json({"x": math.inf})
 
 
 def test_written_json_is_read_back(tmp_path: Path) -> None:
@@ -84,22 +76,18 @@ def test_written_json_is_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"{", b"not json", b'{"a": 1', b"\xff\xfe\x00", b"{} {}", b"[" * 10**5]
+    "data",
+    [
+        *(b"", b"{", b"not json", b'{"a": 1', b"\xff\xfe\x00", b"{} {}", b"[" * 10**5),
+        *(b"[]", b"3", b"null", b'"text"'),
+    ],
 )
-def test_not_json(tmp_path: Path, data: bytes) -> None:
+def test_what_is_no_json_object(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "info.json"
     path.write_bytes(data)
-    with pytest.raises(FormatError, match=r"info\.json: not JSON") as caught:
+    with pytest.raises(FormatError, match=r"info\.json: (not JSON|no JSON object)") as caught:
         read_json(path)
     assert caught.value.hint
-
-
-@pytest.mark.parametrize("data", ["[]", "3", "null", '"text"'])
-def test_json_but_no_object(tmp_path: Path, data: str) -> None:
-    path = tmp_path / "info.json"
-    path.write_text(data)
-    with pytest.raises(FormatError, match=r"info\.json: no JSON object"):
-        read_json(path)
 
 
 @pytest.mark.parametrize(
@@ -180,30 +168,13 @@ def test_atomic_path_replaces(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_atomic_path_leaves_nothing_when_the_block_fails(tmp_path: Path) -> None:
-    path = tmp_path / "file.txt"
-    path.write_text("old")
+def test_nothing_is_left_and_the_old_file_stays_when_writing_fails(tmp_path: Path) -> None:
+    path = tmp_path / "info.json"
+    write_json(path, {"a": 1})
     with pytest.raises(KeyboardInterrupt), atomic_path(path) as partial:
         partial.write_text("half")
         raise KeyboardInterrupt
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
-
-
-def test_unserialisable_value_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "info.json"
-    write_json(path, {"a": 1})
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(path, {"a": math.nan})
     assert read_json(path) == {"a": 1}
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_sha256_file(tmp_path: Path) -> None:
-    path = tmp_path / "data"
-    path.write_bytes(b"abc")
-    # FIPS 180-4's example
-    assert sha256_file(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    data = bytes(range(256)) * 5000
-    path.write_bytes(data)
-    assert sha256_file(path) == hashlib.sha256(data).hexdigest()
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,5 +1,7 @@
 """Episode ids and lists of numbers: parse and format are inverses, and slips are told."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,23 +26,18 @@ def test_round_trip(episode: EpisodeId) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
+    "given",
     [
         *("", "MoveCube", "MoveCube/test", "MoveCube/test/1/2", "MoveCube/test/01", "/test/1"),
         *("MoveCube/test/-1", "MoveCube/test/1.0", "MoveCube/test/", "MoveCube/tset/1"),
         *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣"),
         *("MoveCube/test/1234567890123456789", "../test/1"),
+        *(None, 7, True, b"MoveCube/test/1", ("MoveCube", "test", 1)),
     ],
 )
-def test_what_is_no_id(text: str) -> None:
+def test_what_is_no_id(given: Any) -> None:
     with pytest.raises(InvalidIdError):
-        EpisodeId.parse(text)
-
-
-@pytest.mark.parametrize("given", [None, 7, True, b"MoveCube/test/1", ("MoveCube", "test", 1)])
-def test_other_types_are_refused(given: object) -> None:
-    with pytest.raises(InvalidIdError, match="is not an episode id"):
-        EpisodeId.parse(given)  # type: ignore[arg-type]
+        EpisodeId.parse(given)
 
 
 @pytest.mark.parametrize("index", [-1, 10**18, True, "3", 1.0, None])
@@ -64,11 +61,9 @@ def test_canonical_order() -> None:
     assert sorted(reversed(ids)) == ids
 
 
-@given(st.sets(st.integers(0, 300)))
+@given(st.sets(st.integers(0, 300), min_size=1))
 def test_numbers_round_trip(numbers: set[int]) -> None:
-    ordered = tuple(sorted(numbers))
-    if ordered:
-        assert parse_numbers(format_numbers(ordered)) == ordered
+    assert parse_numbers(format_numbers(sorted(numbers))) == tuple(sorted(numbers))
 
 
 @pytest.mark.parametrize(

@@ -81,27 +81,19 @@ def test_plain_values() -> None:
 
 
 def test_schema() -> None:
-    part = pa.struct(
-        [
-            pa.field("name", pa.string(), nullable=False),
-            pa.field("source", pa.string(), nullable=False),
-            pa.field("size", pa.int64(), nullable=False),
-        ]
-    )
-    digests = pa.struct([pa.field(key, pa.string(), nullable=False) for key in ("x", "y")])
+    def required(**types: pa.DataType) -> list[pa.Field]:
+        return [pa.field(name, kind, nullable=False) for name, kind in types.items()]
+
+    text, number = pa.string(), pa.int64()
+    part = pa.struct(required(name=text, source=text, size=number))
+    digests = pa.struct(required(x=text, y=text))
+    goals, parts = (pa.list_(pa.field("item", kind, nullable=False)) for kind in (text, part))
     assert arrow_schema(Row, ["x", "y"]) == pa.schema(
         [
-            pa.field("episode_id", pa.string(), nullable=False),
-            pa.field("family", pa.string(), nullable=False),
-            pa.field("split", pa.string(), nullable=False),
-            pa.field("index", pa.int64(), nullable=False),
-            pa.field("count", pa.int64(), nullable=False),
-            pa.field("share", pa.float64(), nullable=False),
-            pa.field("fine", pa.bool_(), nullable=False),
-            pa.field("note", pa.string()),
-            pa.field("digests", digests, nullable=False),
-            pa.field("goals", pa.list_(pa.field("item", pa.string(), False)), nullable=False),
-            pa.field("parts", pa.list_(pa.field("item", part, False)), nullable=False),
+            *required(episode_id=text, family=text, split=text, index=number),
+            *required(count=number, share=pa.float64(), fine=pa.bool_()),
+            pa.field("note", text),
+            *required(digests=digests, goals=goals, parts=parts),
             pa.field("best", part),
         ]
     )

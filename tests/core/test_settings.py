@@ -9,12 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 from robomme_interference_data.console import AsJson
-from robomme_interference_data.settings import (
-    option_names,
-    setting,
-    spread_values,
-    with_settings,
-)
+from robomme_interference_data.settings import setting, spread_values, with_settings
 
 SEVERAL = ("--families", "--source")
 
@@ -89,8 +84,8 @@ def test_slips_are_told(arguments: list[str], told: str) -> None:
 
 def test_help_shows_every_option() -> None:
     text = CliRunner().invoke(app, ["--help"]).output
-    for name, option in option_names(Config).items():
-        assert name == "split" or option in text
+    for option in ("--out", "--families", "--source", "--episode-split", "--k", "--videos"):
+        assert option in text
     assert "OF_THE_TEST_K" in text
 
 

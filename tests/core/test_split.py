@@ -4,6 +4,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -136,16 +137,17 @@ def test_episodes_that_cannot_be_loaded(
         assert told in str(caught.value)
 
 
-@pytest.mark.parametrize("cache", [3, ["x"], b"x"])
-def test_no_such_cache(cache: Any) -> None:
-    with pytest.raises(InvalidOptionError, match="expected True, False, a folder"):
-        load_split(GOLDEN, cache=cache)
-
-
-@pytest.mark.parametrize("threads", [0, -3, True, "2"])
-def test_no_such_threads(threads: Any) -> None:
-    with pytest.raises(InvalidOptionError, match="threads .*; expected a number from 1"):
-        load_split(GOLDEN, threads=threads)
+@pytest.mark.parametrize(
+    ("option", "values", "told"),
+    [
+        ("cache", (3, ["x"], b"x"), "expected True, False, a folder"),
+        ("threads", (0, -3, True, "2"), "expected a number from 1"),
+    ],
+)
+def test_no_such_option(option: str, values: tuple[Any, ...], told: str) -> None:
+    for value in values:
+        with pytest.raises(InvalidOptionError, match=told):
+            load_split(GOLDEN, **{option: value})
 
 
 def test_caches_by_folder_or_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,25 +234,25 @@ def rewritten(path: Path, change: Any) -> None:
     pq.write_table(change(pq.read_table(path)), path)
 
 
+def truncated(keep: int) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(path.read_bytes()[:keep])
+
+
 @pytest.mark.parametrize(
-    "change",
+    "damage",
     [
-        lambda t: t.drop_columns(["sessions"]),
-        lambda t: t.drop_columns(["condition"]),
-        lambda t: t.set_column(5, "k", t["condition"]),
-        lambda t: t.set_column(t.column_names.index("sessions"), "sessions", [[None] * len(t)]),
+        lambda path: rewritten(path, lambda t: t.drop_columns(["sessions"])),
+        lambda path: rewritten(path, lambda t: t.drop_columns(["condition"])),
+        lambda path: rewritten(path, lambda t: t.set_column(5, "k", t["condition"])),
+        lambda path: rewritten(
+            path,
+            lambda t: t.set_column(t.column_names.index("sessions"), "sessions", [[None] * len(t)]),
+        ),
+        *map(truncated, (0, 3, 100, 2000)),
     ],
 )
-def test_damaged_rows(own_split: Path, change: Any) -> None:
-    rewritten(own_split / ROWS, change)
-    with pytest.raises(FormatError, match=r"buffers\.parquet"):
-        load_split(own_split).load("MoveCube/test/0", "k3")
-
-
-@pytest.mark.parametrize("keep", [0, 3, 100, 2000])
-def test_truncated_rows(own_split: Path, keep: int) -> None:
-    path = own_split / ROWS
-    path.write_bytes(path.read_bytes()[:keep])
+def test_damaged_rows(own_split: Path, damage: Callable[[Path], object]) -> None:
+    damage(own_split / ROWS)
     with pytest.raises(FormatError, match=r"buffers\.parquet"):
         load_split(own_split).load("MoveCube/test/0", "k3")
 

@@ -17,7 +17,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     TruncatedVideoError,
 )
-from robomme_interference_data.video import decode_into, iter_frames
+from robomme_interference_data.video import iter_frames
 
 COUNT, SIZE, FPS = 60, (64, 80), 10
 pytestmark = pytest.mark.timeout(120)
@@ -101,11 +101,6 @@ def test_every_start_and_the_whole(videos: dict[str, Video], name: str) -> None:
     for start in (0, 37):
         found = np.stack(list(iter_frames(video.path, start, None, FPS)))
         np.testing.assert_array_equal(found, video.frames[start:])
-    room = np.zeros((50, *SIZE, 3), np.uint8)
-    assert decode_into(room[10:40], video.path, 21, FPS) is not None
-    np.testing.assert_array_equal(room[10:40], video.frames[21:51])
-    assert not room[:10].any()
-    assert not room[40:].any()
     assert list(iter_frames(video.path, 5, 5, FPS)) == []
 
 
@@ -123,11 +118,9 @@ def test_frames_are_the_callers(videos: dict[str, Video]) -> None:
 
 @pytest.mark.parametrize("start", [0, COUNT - 1, COUNT, 5000])
 def test_frames_after_the_end(videos: dict[str, Video], start: int) -> None:
-    stop = max(start, COUNT) + 1
     for video in videos.values():
-        with pytest.raises(TruncatedVideoError, match=f"expected frames {start} to") as caught:
-            list(iter_frames(video.path, start, stop, FPS))
-        assert str(video.path) in caught.value.message
+        with pytest.raises(TruncatedVideoError, match=f"expected frames {start} to"):
+            list(iter_frames(video.path, start, max(start, COUNT) + 1, FPS))
 
 
 @pytest.mark.parametrize(
@@ -208,4 +201,4 @@ def test_a_header_that_is_not_text_and_frames_of_another_size(
     with pytest.raises(FormatError, match="is not a readable video"):
         next(iter_frames(path, 0, 1, FPS))
     with pytest.raises(FormatError, match="80×64 pixels; .*says 32×64"):
-        decode_into(np.empty((4, 64, 32, 3), np.uint8), videos["ffv1.mkv"].path, 0, FPS)
+        next(iter_frames(videos["ffv1.mkv"].path, 0, 1, FPS, (64, 32, 3)))
