@@ -35,6 +35,7 @@ from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
     InvalidOptionError,
+    MissingExtraError,
     SourceError,
     first_line,
 )
@@ -169,14 +170,21 @@ def work_folder(out: Path) -> Path:
 
 @contextmanager
 def _working(out: Path) -> Iterator[Path]:
-    """Make the work folder of `out` and hold it; put back what a killed build had moved there."""
+    """Make the work folder of `out` and hold it; put back what a killed build had moved there.
+
+    It goes unless episodes are staged in it.
+    """
     work = work_folder(out)
     work.mkdir(parents=True, exist_ok=True)
     busy = BuildError(f"another build of {out} is running", "Wait for it to end, or stop it.")
     with hold(work / "lock", busy):
         if (work / "before").exists() and not out.exists():
             (work / "before").rename(out)
-        yield work
+        try:
+            yield work
+        finally:
+            if not any(work.glob("*/*")):
+                shutil.rmtree(work, ignore_errors=True)
 
 
 # --- stage and write ---------------------------------------------------------------------------
@@ -214,8 +222,8 @@ def _stage(
     for outcome in executor.run(task, missing, time_limit=limit):
         if outcome.error is not None:
             failures.append(outcome)
-            if isinstance(outcome.error, InvalidOptionError):  # the others will say the same
-                break
+            if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
+                break  # the others will say the same
             continue
         staged.append(outcome.value)
         progress.advance(1)

@@ -1,5 +1,6 @@
 """The official simulator the whole way: recorded, built, evaluated; a stand-in plays RoboMME."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,6 +57,13 @@ def test_demonstrations_are_built_from_it(tmp_path: Path, robomme_python: Path) 
     with pytest.raises(InvalidOptionError, match="demonstrations only"):
         build(DISTRACTORS, replace(config, out=tmp_path / "units"))
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+
+
+def test_an_interpreter_that_will_not_do_leaves_nothing(tmp_path: Path) -> None:
+    for python, error in (("/nowhere/python", InvalidOptionError), (sys.executable, ImportError)):
+        with pytest.raises(error):
+            build(DEMONSTRATIONS, config_of(tmp_path / "new", Path(python), "0-1"))
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
