@@ -13,7 +13,7 @@ from robomme_interference_data.simulators.base import (
     Begun,
     EpisodeInfo,
     Observation,
-    OneAtATime,
+    Simulator,
     camera_names,
 )
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
@@ -24,7 +24,7 @@ __all__ = ["TabletopSimulator"]
 POLICIES = ("oracle", "guess")
 
 
-class TabletopSimulator(OneAtATime):
+class TabletopSimulator(Simulator):
     """See `Simulator`. Keep to one in a process: an executor's workers are for more.
 
     Args:
