@@ -33,30 +33,27 @@ def seed_of(episode: EpisodeId) -> int:
     return family + _SPLIT_START[episode.split] + episode.index
 
 
-def turn_of(seed: int, count: int) -> int:
+def turn_of(seed: int, count: int, stream: int = 0) -> int:
     """Return which of `count` answers the episode of a seed has, from 0: they take turns.
 
     In each group of episodes of a family, split and difficulty each answer occurs equally often,
-    to within one. It does so once in every `count` episodes of the group, in a new order.
+    to within one. It does so once in every `count` episodes of the group, in a new order; another
+    `stream` has orders of its own.
     """
-    return _turn(seed, count, 0)
-
-
-def guess_of(seed: int, count: int) -> int:
-    """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
-
-    Guesses take turns as answers do, in orders of their own.
-    """
-    return _turn(seed, count, 1)
-
-
-def _turn(seed: int, count: int, stream: int) -> int:
     family, number = divmod(seed, _FAMILY_SPAN)
     split, number = divmod(number, _SPLIT_SPAN)
     number, difficulty = divmod(number, len(DIFFICULTIES))
     block, place = divmod(number, count)
     order = RandomState([family, split, difficulty, block, stream]).permutation(count)
     return int(order[place])
+
+
+def guess_of(seed: int, count: int) -> int:
+    """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
+
+    Guesses take turns as answers do.
+    """
+    return turn_of(seed, count, stream=1)
 
 
 def difficulty_of(seed: int) -> str:
