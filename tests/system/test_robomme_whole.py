@@ -14,7 +14,7 @@ from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.execution import Serial
+from robomme_interference_data.execution import Executor, Processes, Serial
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.simulators.robomme import EPISODES
 
@@ -59,10 +59,13 @@ def test_demonstrations_are_built_from_it(tmp_path: Path, robomme_python: Path) 
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
 
 
-def test_an_interpreter_that_will_not_do_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("executor", [Serial(), Processes(2)])
+def test_an_interpreter_that_will_not_do_leaves_nothing(tmp_path: Path, executor: Executor) -> None:
     for python, error in (("/nowhere/python", InvalidOptionError), (sys.executable, ImportError)):
+        config = config_of(tmp_path / "new", Path(python), "0-9")
+        plan = plan_build(DEMONSTRATIONS, config)
         with pytest.raises(error):
-            build(DEMONSTRATIONS, config_of(tmp_path / "new", Path(python), "0-1"))
+            build_dataset(plan, config.out, executor, WorkProgress(quiet=True))
         assert list(tmp_path.iterdir()) == []
 
 
