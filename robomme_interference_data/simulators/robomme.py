@@ -107,7 +107,6 @@ class RoboMMESimulator(Simulator):
     ):
         self._cameras = camera_names(self.name, cameras)
         self._python, self._answer_s = find_python(python), answer_s
-        self._played = 0
         self._process = _Process(self._python, answer_s)
 
     @property
@@ -116,11 +115,7 @@ class RoboMMESimulator(Simulator):
         return self._process.versions
 
     def act(self, policy: str) -> NDArray[np.float32]:
-        """Refuse: RoboMME has no built-in policy.
-
-        Raises:
-            UnknownNameError: Always.
-        """
+        """Refuse with `UnknownNameError`: RoboMME has no built-in policy."""
         raise UnknownNameError(
             f"the robomme simulator has no built-in policy {policy!r}",
             "oracle and guess play on the embedded suite only: --simulator tabletop.",
@@ -140,11 +135,10 @@ class RoboMMESimulator(Simulator):
         known = self._process.families
         if episode.family not in known:
             raise UnknownNameError.among("family", episode.family, self.name, known)
-        if self._process.pid is None or self._played >= EPISODES:
+        if self._process.pid is None or self._process.played >= EPISODES:
             self._process.end()
             self._process = _Process(self._python, self._answer_s)
-            self._played = 0
-        self._played += 1
+        self._process.played += 1
         about, arrays = self._process.call(
             "reset",
             **vars(episode),
@@ -207,6 +201,7 @@ class _Process:
                 f"{python} cannot be run as RoboMME's Python: {error}", _INSTALL
             ) from error
         self.pid: int | None = self._process.pid
+        self.played = 0
         self._logger = threading.Thread(target=self._keep_log, daemon=True)
         self._logger.start()
         hello, _ = self._answer("start")
