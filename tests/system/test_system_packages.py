@@ -121,12 +121,6 @@ LIST_BACKPORTS = "deb [arch=amd64 signed-by=/keys/archive.gpg] file:///m/ bookwo
         ("debian.sources", 2, DEB822, DEB822_BACKPORTS),
         ("inline.sources", 1, INLINE_KEY, INLINE_BACKPORTS),
         ("sources.list", 2, LIST, LIST_BACKPORTS),
-        (
-            "plain.list",
-            1,
-            "deb file:///d bookworm main\n",
-            "deb file:///d bookworm-backports main\n",
-        ),
     ],
 )
 @pytest.mark.parametrize("works", [True, False])
