@@ -212,11 +212,8 @@ def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:
     """Return the cameras that are asked of a simulator, in the order of `CAMERAS`.
 
     Raises:
-        InvalidOptionError: `cameras` is no list or tuple.
         UnknownNameError: There is no such camera.
     """
-    if not isinstance(cameras, list | tuple):
-        raise InvalidOptionError.expected("cameras", cameras, "a list of names")
     for camera in cameras:
         if camera not in CAMERAS:
             raise UnknownNameError.among("camera", camera, f"the {simulator} simulator", CAMERAS)

@@ -55,7 +55,7 @@ def simulate(
     from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId
     from robomme_interference_data.records import Status
-    from robomme_interference_data.simulators.registry import make_simulator
+    from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
 
     policies = POLICIES if simulator != "robomme" else POLICIES[2:]
     policy = policy or policies[0]
@@ -65,10 +65,10 @@ def simulate(
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     name = EpisodeId(family, split, episode)
     options: dict[str, Any] = {}
-    if simulator == "tabletop":
-        options = {"render": video is not None}
-    elif simulator == "robomme":
-        options = {"python": robomme_python}
+    if simulator in SIMULATORS and video is None:
+        options["cameras"] = ()
+    if simulator == "robomme":
+        options["python"] = robomme_python
     clip: VideoEncoder | None = None
     with ExitStack() as stack:
         # First: minutes are spent on what is to be in it.

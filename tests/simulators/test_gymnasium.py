@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from robomme_interference_data.errors import InvalidOptionError, NoRendererError
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
-import av
 import gymnasium
 import torch
 
@@ -72,21 +70,6 @@ def test_an_episode_is_the_simulators(tabletop: TabletopSimulator) -> None:
     assert not info["success"]
     assert np.array_equal(env.render()[0], seen["sensor_data"]["front"]["rgb"][0])
     env.close()
-
-
-def test_maniskills_recorder_writes_what_is_rendered(tmp_path: Path) -> None:
-    from mani_skill.utils.wrappers import RecordEpisode
-
-    env = RecordEpisode(make(render_mode="rgb_array"), str(tmp_path), save_trajectory=False)
-    env.unwrapped.demonstrating = False  # it is not recorded
-    env.reset(seed=SEED)
-    for _ in range(2):
-        env.step(env.unwrapped.act("oracle"))
-    env.close()
-    (video,) = tmp_path.glob("*.mp4")
-    with av.open(str(video)) as container:
-        sizes = [(frame.width, frame.height) for frame in container.decode(video=0)]
-    assert sizes == [(256, 256)] * 3
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,9 @@ def test_simulate_plays_the_demonstration(
     robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("python").symlink_to(robomme_python)  # there is another one on the path
+    local = Path("python")  # there is another one on the path
+    local.write_text(f'#!/bin/sh\nexec "{robomme_python}" "$@"\n')
+    local.chmod(0o755)
     app = typer.Typer()
     app.command()(simulate)
     words = ["--family", "MoveCube", "--episode", "3", "--json", "--simulator", "robomme"]

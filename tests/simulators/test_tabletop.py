@@ -19,7 +19,7 @@ from robomme_interference_data.simulators import Demonstration, Observation, Sta
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
-from robomme_interference_data.simulators.tabletop.episodes import episode_ids, seed_of
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 SHORT = "VideoUnmask/test/0"
@@ -112,7 +112,7 @@ def test_the_same_actions_have_the_same_outcome_whatever_is_drawn(
         return lesson, [first, *(simulator.step(*one)[0] for one in acted)]
 
     lesson, steps = play_ten(tabletop, True, every=1)
-    with TabletopSimulator(cameras=("front",)) as front, TabletopSimulator(render=False) as none:
+    with TabletopSimulator(cameras=("front",)) as front, TabletopSimulator(cameras=()) as none:
         for other, demonstration, drawn in (
             (tabletop, False, {"front", "wrist"}),
             (front, True, {"front"}),
@@ -190,8 +190,9 @@ def test_a_guess_does_not_depend_on_the_answer(scene: TabletopEnv) -> None:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_oracle_solves_test_episodes(blind: TabletopSimulator, family: str) -> None:
     """The last six of each family, two of each difficulty."""
-    for episode in episode_ids(family, "test")[-6:]:
-        blind.reset(str(episode))
+    for index in range(44, 50):
+        episode = f"{family}/test/{index}"
+        blind.reset(episode)
         assert play(blind.env, "oracle")[0] is Status.SUCCESS, episode
 
 

@@ -61,20 +61,11 @@ def difficulty_of(seed: int) -> str:
     return DIFFICULTIES[seed % len(DIFFICULTIES)]
 
 
-def episode_ids(
-    family: str | None = None, split: str | None = None, difficulty: str | None = None
-) -> list[EpisodeId]:
-    """List the suite's episodes in canonical order, all or those of one kind.
-
-    Raises:
-        UnknownNameError: There is no such family.
-        InvalidIdError: There is no such split.
-    """
-    families = FAMILIES if family is None else (family,)
-    splits = SPLITS if split is None else (split,)
-    found = []
-    for each in families:
-        for part in splits:
-            seed_of(EpisodeId(each, part, 0))
-            found += [EpisodeId(each, part, index) for index in range(EPISODES[part])]
-    return [e for e in found if difficulty is None or difficulty_of(seed_of(e)) == difficulty]
+def episode_ids() -> list[EpisodeId]:
+    """List the suite's episodes in canonical order."""
+    return [
+        EpisodeId(family, split, index)
+        for family in FAMILIES
+        for split in SPLITS
+        for index in range(EPISODES[split])
+    ]
