@@ -1,6 +1,6 @@
 """The embedded suite's judges, against what a script without knowledge of them would try."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,8 @@ from robomme_interference_data.simulators.tabletop.simulator import TabletopSimu
 
 
 @pytest.fixture
-def env(tabletop: TabletopSimulator) -> Iterator[TabletopEnv]:
-    tabletop.env.drawing = False
-    yield tabletop.env
-    tabletop.env.drawing = True
+def env(blind: TabletopSimulator) -> TabletopEnv:
+    return blind.env
 
 
 def start(env: TabletopEnv, episode: str, answer: int) -> Any:

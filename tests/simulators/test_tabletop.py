@@ -26,14 +26,6 @@ SHORT = "VideoUnmask/test/0"
 
 
 @pytest.fixture
-def blind(tabletop: TabletopSimulator) -> Iterator[TabletopSimulator]:
-    """The simulator without drawing, which is several times as fast."""
-    tabletop.env.drawing = False
-    yield tabletop
-    tabletop.env.drawing = True
-
-
-@pytest.fixture
 def scene(tabletop: TabletopSimulator) -> Iterator[TabletopEnv]:
     """Its environment, which sets the live scene without playing the demonstration."""
     tabletop.env.demonstrating = False
