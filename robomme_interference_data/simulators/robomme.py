@@ -157,7 +157,7 @@ class RoboMMESimulator(Simulator):
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
-        answer, arrays = self._process.call("step", {"action": [action]}, observe=observe)
+        answer, arrays = self._process.call("step", action=action.tolist(), observe=observe)
         status = Status(answer["status"])
         if status is Status.ERROR:
             what = f"reports an error at step {self._steps}: {answer['message']}"
@@ -211,9 +211,7 @@ class _Process:
         self.families: tuple[str, ...] = tuple(hello["families"])
         self.versions: dict[str, str] = hello["versions"]
 
-    def call(
-        self, call: str, arrays: dict[str, list[NDArray[Any]]] | None = None, **arguments: Any
-    ) -> tuple[dict[str, Any], Arrays]:
+    def call(self, call: str, **arguments: Any) -> tuple[dict[str, Any], Arrays]:
         """Call one of the worker's functions, `reset` or `step`.
 
         Raises:
@@ -221,7 +219,7 @@ class _Process:
             SimulatorCrashError: The call failed, the process died, or it took too long.
         """
         with suppress(OSError):  # it died: the answer will say so
-            robomme_worker.send(self._channel, {"call": call, **arguments}, arrays)
+            robomme_worker.send(self._channel, {"call": call, **arguments})
         answer, found = self._answer(call)
         if "unknown" in answer:
             raise UnknownNameError(f"no such episode: in robomme {answer['unknown']}")

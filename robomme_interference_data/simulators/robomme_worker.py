@@ -139,9 +139,11 @@ class Episodes:
         }
         return about, self._arrays(observations, slice(None) if demonstration else slice(-1, None))
 
-    def step(self, *, action: Any, observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    def step(self, action: list[float], observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
         """Execute an action; return the status, and one state and, if wanted, one frame each."""
-        observations, _, _, _, info = self._env.step(action[0])
+        import numpy as np
+
+        observations, _, _, _, info = self._env.step(np.array(action, np.float32))
         if info["status"] == "error":
             self.close()
             return {"status": "error", "message": str(info.get("error_message"))}, {}
@@ -181,10 +183,10 @@ def serve(channel: Connection) -> None:
         return
     episodes = Episodes()
     while True:
-        head, arrays = requests.get()
+        head, _ = requests.get()
         call = episodes.step if head.pop("call") == "step" else episodes.reset
         try:
-            answer, found = call(**head, **arrays)
+            answer, found = call(**head)
         except UnknownEpisode as error:
             answer, found = {"unknown": str(error)}, {}
         except Exception as error:

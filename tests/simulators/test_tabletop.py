@@ -79,18 +79,17 @@ def test_reset_serves_what_it_says_the_same_each_time(tabletop: TabletopSimulato
 
 
 @pytest.mark.slow
-def test_another_process_gives_the_same_bits(tabletop: TabletopSimulator) -> None:
+@pytest.mark.usefixtures("tabletop")  # skips where nothing can be drawn
+def test_another_process_gives_the_same_bits() -> None:
     code = (
         "import hashlib; from robomme_interference_data.simulators import make_simulator\n"
         f"lesson, first, _ = make_simulator('tabletop').reset({SHORT!r})\n"
         "for one in (lesson.images['wrist'], lesson.states, first.images['front'], first.state):\n"
         "    print(hashlib.sha256(one.tobytes()).hexdigest())\n"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    here: dict[str, Any] = {"__name__": "here"}
-    printed: list[str] = []
-    exec(code, here | {"print": printed.append})
-    assert told.stdout.split() == printed
+    command = [sys.executable, "-c", code]
+    one, other = (subprocess.run(command, capture_output=True, check=True) for _ in range(2))
+    assert one.stdout == other.stdout != b""
 
 
 def test_the_same_actions_have_the_same_outcome_whatever_is_drawn(
@@ -168,14 +167,6 @@ def test_where_the_arm_rests_the_frames_show_the_answer(scene: TabletopEnv, fami
         next(scene.episode.demonstrate(scene.arm, scene.answer))
         seen.append(scene.observe(("front",)).images["front"])
     assert not np.array_equal(*seen)
-
-
-def test_a_guess_does_not_depend_on_the_answer(scene: TabletopEnv) -> None:
-    guesses = set()
-    for answer in range(3):
-        reset(scene, "MoveCube", 3, answer=answer)
-        guesses.add(scene.guess)
-    assert len(guesses) == 1
 
 
 @pytest.mark.slow

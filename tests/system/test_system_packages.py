@@ -148,11 +148,6 @@ def test_backports_that_are_there_are_used(machine: Machine) -> None:
     assert list((machine.state / "parts").iterdir()) == []
 
 
-def test_a_release_that_is_new_enough_needs_no_backports(machine: Machine) -> None:
-    machine.set_up("vulkan", CANDIDATE="25.2.1-1")
-    assert machine.calls() == ["mesa-vulkan-drivers"]
-
-
 def test_nothing_is_said_where_nothing_is_missing(machine: Machine) -> None:
     said = machine.set_up(CANDIDATE="25.2.1-1")
     assert said == "setup: installing vulkan ...\nsetup: installing chromium ...\n"
