@@ -185,8 +185,9 @@ def verify(
     """
     from robomme_interference_data.build_dataset.verify import frames_of, verify_split
 
+    frames = frames_of(split)
     with WorkProgress() as progress:
-        progress.start("Verifying", frames_of(split) if decode else 0)
+        progress.start("Verifying", frames if decode else 0)
         violations = list(verify_split(split, decode=decode, advance=progress.advance))
     if as_json:
         print_json([vars(violation) for violation in violations])

@@ -48,9 +48,14 @@ class Violation:
 
 
 def frames_of(root: Path) -> int:
-    """Return how many frames a split stores; 0 if it cannot be told."""
+    """Return how many frames a split stores; 0 if it cannot be told.
+
+    Raises:
+        MissingFileError, FormatError: The folder is not a split, or its header cannot be read.
+    """
+    names = load_split(root).header.datasets
     try:
-        opened = [Dataset(LocalFiles(root / name)) for name in load_split(root).header.datasets]
+        opened = [Dataset(LocalFiles(root / name)) for name in names]
     except InterferenceError:
         return 0
     return sum(dataset.identity.counts.frames for dataset in opened)

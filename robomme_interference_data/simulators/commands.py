@@ -2,14 +2,16 @@
 
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from robomme_interference_data.console import AsJson, print_json
 from robomme_interference_data.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["simulate"]
 
@@ -112,8 +114,10 @@ def simulate(
 
 
 def _picture(
-    images: dict[str, NDArray[np.uint8]], colour: tuple[int, int, int]
-) -> NDArray[np.uint8]:
+    images: "dict[str, NDArray[np.uint8]]", colour: tuple[int, int, int]
+) -> "NDArray[np.uint8]":
     """Return the cameras side by side, under a bar of a colour."""
+    import numpy as np
+
     views = np.concatenate(list(images.values()), axis=1)
     return np.concatenate([np.full((16, views.shape[1], 3), colour, np.uint8), views])
