@@ -154,10 +154,7 @@ def leaks(episodes: int = 100) -> None:
 
 
 PARTS: dict[str, Callable[..., None]] = {
-    "speed": speed,
-    "resets": resets,
-    "workers": workers,
-    "leaks": leaks,
+    part.__name__: part for part in (speed, resets, workers, leaks)
 }
 
 

@@ -9,7 +9,7 @@ encoded again.
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
     InvalidOptionError,
+    MissingExtraError,
     SourceError,
     first_line,
 )
@@ -169,14 +170,21 @@ def work_folder(out: Path) -> Path:
 
 @contextmanager
 def _working(out: Path) -> Iterator[Path]:
-    """Make the work folder of `out` and hold it; put back what a killed build had moved there."""
+    """Make the work folder of `out` and hold it; put back what a killed build had moved there.
+
+    It goes unless episodes are staged in it.
+    """
     work = work_folder(out)
     work.mkdir(parents=True, exist_ok=True)
     busy = BuildError(f"another build of {out} is running", "Wait for it to end, or stop it.")
     with hold(work / "lock", busy):
         if (work / "before").exists() and not out.exists():
             (work / "before").rename(out)
-        yield work
+        try:
+            yield work
+        finally:
+            if not any(work.glob("*/[!.]*")):
+                shutil.rmtree(work, ignore_errors=True)
 
 
 # --- stage and write ---------------------------------------------------------------------------
@@ -211,17 +219,19 @@ def _stage(
             progress.advance(1, before=True)
     failures: list[Outcome] = []
     first = next((one for one in staged if one.staged.skipped is None), None)
-    for outcome in executor.run(task, missing, time_limit=limit):
-        if outcome.error is not None:
-            failures.append(outcome)
-            if isinstance(outcome.error, InvalidOptionError):  # the others will say the same
-                break
-            continue
-        staged.append(outcome.value)
-        progress.advance(1)
-        if outcome.value.staged.skipped is None:
-            first = first or outcome.value
-            _check_alike(first, outcome.value)
+    # Closed before anybody looks at what is staged: an error would keep the workers running.
+    with closing(executor.run(task, missing, time_limit=limit)) as outcomes:
+        for outcome in outcomes:
+            if outcome.error is not None:
+                failures.append(outcome)
+                if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
+                    break  # the others will say the same
+                continue
+            staged.append(outcome.value)
+            progress.advance(1)
+            if outcome.value.staged.skipped is None:
+                first = first or outcome.value
+                _check_alike(first, outcome.value)
     if failures:
         raise _failure(failures, len(todo))
     skipped = {str(one.staged.episode_id): one.staged.skipped for one in staged}

@@ -25,8 +25,6 @@ __all__ = ["Check", "any_failed", "checks", "report"]
 
 DISTRIBUTION = "robomme-interference-data"
 
-MIN_PYTHON = (3, 12)
-
 CODECS = (("libaom-av1", "w"), ("libsvtav1", "w"), ("libdav1d", "r"))
 """Codecs that datasets are written and read with: FFmpeg's name, `w` encoder or `r` decoder."""
 
@@ -61,7 +59,7 @@ class Check:
 def checks() -> list[Check]:
     """Look at everything; takes a few seconds."""
     return [
-        check_python(),
+        Check("Python", True, f"{platform.python_version()} ({sys.executable})"),
         check_packages("Core libraries"),
         check_video(CODECS),
         check_packages("Build datasets", "build"),
@@ -95,36 +93,23 @@ def report(rows: Sequence[Check]) -> Table:
     return Table("doctor", "", columns, tuple(lines))
 
 
-def check_python() -> Check:
-    """Look at this interpreter."""
-    ok = sys.version_info >= MIN_PYTHON
-    needed = ".".join(map(str, MIN_PYTHON))
-    return Check(
-        "Python",
-        ok,
-        f"{platform.python_version()} ({sys.executable})",
-        None if ok else f"install Python {needed} or later, then: pip install {DISTRIBUTION}",
-    )
-
-
 # --- packages ----------------------------------------------------------------------------------
 
 
 def check_packages(name: str, extra: str = "") -> Check:
     """Look at the packages of an extra; without one, at those that are always needed."""
+    name = f"{name} [{extra}]" if extra else name
     try:
         needed = _requirements(DISTRIBUTION, extra)
         problems = [problem for requirement in needed for problem in _problems(requirement)]
     except metadata.PackageNotFoundError:
         needed, problems = [], [f"{DISTRIBUTION} itself is not installed"]
     if not problems:
-        problems = [f"{item.name} {metadata.version(item.name)}" for item in needed]
-        ok, fix = True, None
-    elif extra:
-        ok, fix = None, f'pip install "{DISTRIBUTION}[{extra}]"'
-    else:
-        ok, fix = False, f"pip install --upgrade {DISTRIBUTION}"
-    return Check(f"{name} [{extra}]" if extra else name, ok, ", ".join(problems), fix)
+        found = [f"{item.name} {metadata.version(item.name)}" for item in needed]
+        return Check(name, True, ", ".join(found))
+    if extra:
+        return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
+    return Check(name, False, ", ".join(problems), f"pip install --upgrade {DISTRIBUTION}")
 
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:
@@ -134,11 +119,7 @@ def _requirements(distribution: str, extra: str) -> list[Requirement]:
         return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
     requirements = [Requirement(line) for line in metadata.requires(distribution) or ()]
-    return [
-        requirement
-        for requirement in requirements
-        if applies(requirement, extra) and (extra == "" or not applies(requirement, ""))
-    ]
+    return [one for one in requirements if applies(one, extra) and not (extra and applies(one, ""))]
 
 
 def _problems(requirement: Requirement) -> Iterator[str]:
@@ -183,15 +164,13 @@ def check_video(codecs: Sequence[tuple[str, str]]) -> Check:
         import av
     except ImportError as error:
         return Check(name, False, str(error), fix)
-    missing = []
+    versions = f"FFmpeg {av.ffmpeg_version_info} in PyAV {av.__version__}"
     for codec, mode in codecs:
         try:
             av.codec.Codec(codec, mode)
         except ValueError:
-            missing.append(f"{'encoder' if mode == 'w' else 'decoder'} {codec}")
-    versions = f"FFmpeg {av.ffmpeg_version_info} in PyAV {av.__version__}"
-    if missing:
-        return Check(name, False, f"{versions} has no {', '.join(missing)}", fix)
+            what = "encoder" if mode == "w" else "decoder"
+            return Check(name, False, f"{versions} has no {what} {codec}", fix)
     return Check(name, True, f"{versions} with {', '.join(codec for codec, _ in codecs)}")
 
 

@@ -7,6 +7,7 @@ embedded simulator plays all nine families, and the controls are evaluated on it
 Everything lands in demo/; what is there already is not made again.
 """
 
+import os
 import shlex
 import subprocess
 import sys
@@ -32,7 +33,8 @@ def main() -> None:
     """Build, load, verify, audit, draw, retrieve; the same simulated, then evaluate and score."""
     began = time.monotonic()
     DEMO.mkdir(exist_ok=True)
-    queries, units = recorded_here() if (ROOT / SHARED).is_dir() else self_recorded()
+    sample = ["--source sample"]
+    queries, units = recorded_here() if SHARED.is_dir() else (sample, sample)
     run("build demonstrations", *queries, "--split test", f"--out {SPLIT}/demonstrations")
     run("build distractors", *units, f"--out {SPLIT}/distractors")
     run(f"build manifests {SPLIT} --conditions no-history k0 k1 k3 k7 --seed 0")
@@ -84,7 +86,7 @@ def recorded_here() -> tuple[list[str], list[str]]:
     if not (recordings / "done").exists():
         say("Unpacking RoboMME's own recordings (HDF5, five families)")
         unpack = [sys.executable, str(SHARED / "unpack_h5.py"), str(recordings)]
-        subprocess.run(unpack, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(unpack, check=True, stdout=subprocess.DEVNULL)
         (recordings / "done").touch()
     if not (lessons / "frames.parquet").exists():
         say("Laying out the first test episode of each of the nine families (front camera)")
@@ -93,11 +95,6 @@ def recorded_here() -> tuple[list[str], list[str]]:
         [f"--source frames:{lessons}"],
         [f"--source robomme-h5:{recordings} sample:{','.join(FILLERS)}", "--cameras front"],
     )
-
-
-def self_recorded() -> tuple[list[str], list[str]]:
-    """Return the sources of demonstrations and of distractors where no recordings are."""
-    return ["--source sample"], ["--source sample"]
 
 
 def lay_out_lessons(lessons: Path, folder: Path) -> None:
@@ -143,7 +140,7 @@ def run(*parts: str) -> None:
     """Print and run one of the project's commands; end with its exit code if it fails."""
     words = " ".join(parts)
     say(f"\n$ robomme-interference {words}")
-    code = subprocess.run([str(COMMAND), *shlex.split(words)], cwd=ROOT, check=False).returncode
+    code = subprocess.run([str(COMMAND), *shlex.split(words)], check=False).returncode
     if code and THERE_BEFORE:
         say(
             "\nSome of demo/ was there before. If an earlier version of the project made it, "
@@ -160,7 +157,5 @@ def say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    import os
-
     os.chdir(ROOT)
     main()

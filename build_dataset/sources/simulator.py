@@ -11,8 +11,6 @@ from robomme_interference_data.build_dataset.sources.base import (
     SourceEpisode,
     choose_cameras,
 )
-from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.base import (
     CAMERAS,
@@ -59,8 +57,7 @@ class SimulatorSource:
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes: RoboMME's numbers are those of the tabletop suite."""
-        ids: list[EpisodeId] = [one for family in FAMILIES for one in episode_ids(family, None)]
-        return [SourceEpisode(one, self.provenance) for one in sorted(ids)]
+        return [SourceEpisode(one, self.provenance) for one in sorted(episode_ids())]
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Begin to play an episode; see `Source.read`."""

@@ -52,10 +52,12 @@ def simulate(
     robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
     ```
     """
+    from robomme_interference_data.constants import FPS
+    from robomme_interference_data.encode import CLIP, VideoEncoder
     from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId
     from robomme_interference_data.records import Status
-    from robomme_interference_data.simulators.registry import make_simulator
+    from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
 
     policies = POLICIES if simulator != "robomme" else POLICIES[2:]
     policy = policy or policies[0]
@@ -65,25 +67,30 @@ def simulate(
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     name = EpisodeId(family, split, episode)
     options: dict[str, Any] = {}
-    if simulator == "tabletop":
-        options = {"render": video is not None}
-    elif simulator == "robomme":
-        options = {"python": robomme_python}
+    if simulator in SIMULATORS and video is None:
+        options["cameras"] = ()
+    if simulator == "robomme":
+        options["python"] = robomme_python
+    clip: VideoEncoder | None = None
     with ExitStack() as stack:
         # First: minutes are spent on what is to be in it.
-        clip = None if video is None else _Clip(stack.enter_context(atomic_path(video)))
+        path = None if video is None else stack.enter_context(atomic_path(video))
         running = stack.enter_context(closing(make_simulator(simulator, **options)))
         lesson, seen, info = running.reset(str(name))
-        if clip is not None:
+        if path is not None:
+            first = _picture(seen.images, LIVE)
+            height, width, _ = first.shape
+            clip = VideoEncoder(path, CLIP, FPS, height, width, container="mp4")
             for index in range(len(lesson)):
-                clip.add({camera: f[index] for camera, f in lesson.images.items()}, LESSON)
-            clip.add(seen.images, LIVE)
+                images = {camera: frames[index] for camera, frames in lesson.images.items()}
+                clip.add(_picture(images, LESSON))
+            clip.add(first)
         steps, status = 0, Status.ONGOING
         while status is Status.ONGOING and policy != "none":
             seen, status = running.step(running.act(policy))
             steps += 1
             if clip is not None:
-                clip.add(seen.images, LIVE)
+                clip.add(_picture(seen.images, LIVE))
         if clip is not None:
             clip.close()
     result: dict[str, Any] = {
@@ -106,26 +113,11 @@ def simulate(
         typer.echo(f"{key.replace('_', ' ')}: {value}")
 
 
-class _Clip:
-    """Both cameras side by side, under a bar of a colour, frame by frame into a file."""
+def _picture(
+    images: "dict[str, NDArray[np.uint8]]", colour: tuple[int, int, int]
+) -> "NDArray[np.uint8]":
+    """Return the cameras side by side, under a bar of a colour."""
+    import numpy as np
 
-    def __init__(self, path: Path):
-        self._path = path
-        self._encoder: Any = None
-
-    def add(self, images: "dict[str, NDArray[np.uint8]]", colour: tuple[int, int, int]) -> None:
-        import numpy as np
-
-        from robomme_interference_data.constants import FPS
-        from robomme_interference_data.encode import CLIP, VideoEncoder
-
-        picture = np.concatenate(list(images.values()), axis=1)
-        bar = np.full((16, picture.shape[1], 3), colour, np.uint8)
-        picture = np.concatenate([bar, picture])
-        if self._encoder is None:
-            height, width, _ = picture.shape
-            self._encoder = VideoEncoder(self._path, CLIP, FPS, height, width, container="mp4")
-        self._encoder.add(picture)
-
-    def close(self) -> None:
-        self._encoder.close()
+    views = np.concatenate(list(images.values()), axis=1)
+    return np.concatenate([np.full((16, views.shape[1], 3), colour, np.uint8), views])

@@ -69,14 +69,8 @@ def find_simulator(name: str) -> Callable[..., Simulator]:
 def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
     """Return what is known of a simulator's versions.
 
-    Args:
-        name: As for `make_simulator`.
-        python: RoboMME's interpreter, for `robomme`.
-
-    Returns:
-        Under the simulator's own name the version of its episodes: `SUITE_VERSION` of `tabletop`,
-        that of the installed package of `robomme`; not there if it is not known. With `robomme`
-        also its Python's, `robomme_python`, and its numpy's, `robomme_numpy`.
+    Under its own name that of its episodes, if known: `SUITE_VERSION` of `tabletop`, that of the
+    installed package of `robomme`, whose interpreter is `python`; see `RoboMMESimulator.versions`.
 
     Raises:
         InvalidOptionError, MissingExtraError, SimulatorCrashError: As `RoboMMESimulator`.

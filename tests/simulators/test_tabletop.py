@@ -19,18 +19,10 @@ from robomme_interference_data.simulators import Demonstration, Observation, Sta
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
-from robomme_interference_data.simulators.tabletop.episodes import episode_ids, seed_of
+from robomme_interference_data.simulators.tabletop.episodes import seed_of
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 SHORT = "VideoUnmask/test/0"
-
-
-@pytest.fixture
-def blind(tabletop: TabletopSimulator) -> Iterator[TabletopSimulator]:
-    """The simulator without drawing, which is several times as fast."""
-    tabletop.env.drawing = False
-    yield tabletop
-    tabletop.env.drawing = True
 
 
 @pytest.fixture
@@ -87,55 +79,46 @@ def test_reset_serves_what_it_says_the_same_each_time(tabletop: TabletopSimulato
 
 
 @pytest.mark.slow
-def test_another_process_gives_the_same_bits(tabletop: TabletopSimulator) -> None:
+@pytest.mark.usefixtures("tabletop")  # skips where nothing can be drawn
+def test_another_process_gives_the_same_bits() -> None:
     code = (
         "import hashlib; from robomme_interference_data.simulators import make_simulator\n"
         f"lesson, first, _ = make_simulator('tabletop').reset({SHORT!r})\n"
         "for one in (lesson.images['wrist'], lesson.states, first.images['front'], first.state):\n"
         "    print(hashlib.sha256(one.tobytes()).hexdigest())\n"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    here: dict[str, Any] = {"__name__": "here"}
-    printed: list[str] = []
-    exec(code, here | {"print": printed.append})
-    assert told.stdout.split() == printed
+    command = [sys.executable, "-c", code]
+    one, other = (subprocess.run(command, capture_output=True, check=True) for _ in range(2))
+    assert one.stdout == other.stdout != b""
 
 
-def test_the_same_actions_have_the_same_outcome(blind: TabletopSimulator) -> None:
-    ways = []
-    for _ in range(2):
-        blind.reset("MoveCube/test/0")
-        ways.append(play(blind.env, "oracle"))
-    assert ways[0][0] is ways[1][0] is Status.SUCCESS
-    assert np.array_equal(ways[0][1], ways[1][1])
+def test_the_same_actions_have_the_same_outcome_whatever_is_drawn(
+    tabletop: TabletopSimulator,
+) -> None:
+    def play_ten(
+        simulator: TabletopSimulator, demonstration: bool, every: int
+    ) -> tuple[Demonstration, list[Observation]]:
+        lesson, first, _ = simulator.reset("MoveCube/test/0", demonstration)
+        acted = ((simulator.act("oracle"), n % every == 0) for n in range(10))
+        return lesson, [first, *(simulator.step(*one)[0] for one in acted)]
 
-
-def test_what_is_drawn_changes_nothing_else(tabletop: TabletopSimulator) -> None:
-    episode, cameras = "MoveCube/test/0", ("front", "wrist")
-    lesson, first, _ = tabletop.reset(episode)
-    steps = [tabletop.step(tabletop.act("oracle")) for _ in range(10)]
-    with TabletopSimulator(cameras=("front",)) as front, TabletopSimulator(render=False) as none:
+    lesson, steps = play_ten(tabletop, True, every=1)
+    with TabletopSimulator(cameras=("front",)) as front, TabletopSimulator(cameras=()) as none:
         for other, demonstration, drawn in (
-            (tabletop, False, cameras),
-            (front, True, ("front",)),
-            (none, True, ()),
+            (tabletop, False, {"front", "wrist"}),
+            (front, True, {"front"}),
+            (none, True, set()),
         ):
-            shown, start, _ = other.reset(episode, demonstration=demonstration)
-            made = [other.step(other.act("oracle"), observe=n % 5 == 4) for n in range(10)]
+            shown, seen = play_ten(other, demonstration, every=5)
             assert np.array_equal(shown.states, lesson.states)
             assert np.array_equal(shown.actions, lesson.actions)
-            assert tuple(shown.images) == (drawn if demonstration else ())
+            assert set(shown.images) == (drawn if demonstration else set())
             assert all(np.array_equal(shown.images[n], lesson.images[n]) for n in shown.images)
-            assert tuple(start.images) == drawn
-            assert [bool(seen.images) for seen, _ in made] == [
-                bool(drawn) and n % 5 == 4 for n in range(10)
-            ]
-            for (seen, status), (full, expected) in zip(
-                [(start, None), *made], [(first, None), *steps], strict=True
-            ):
-                assert status is expected
-                assert np.array_equal(seen.state, full.state)
-                assert all(np.array_equal(seen.images[n], full.images[n]) for n in seen.images)
+            assert [n for n, one in enumerate(seen) if one.images] == ([0, 1, 6] if drawn else [])
+            for one, full in zip(seen, steps, strict=True):
+                assert set(one.images) in ({*()}, drawn)
+                assert np.array_equal(one.state, full.state)
+                assert all(np.array_equal(one.images[n], full.images[n]) for n in one.images)
 
 
 def test_pictures_are_lit_by_the_scenes_own_lights(scene: TabletopEnv) -> None:
@@ -186,20 +169,13 @@ def test_where_the_arm_rests_the_frames_show_the_answer(scene: TabletopEnv, fami
     assert not np.array_equal(*seen)
 
 
-def test_a_guess_does_not_depend_on_the_answer(scene: TabletopEnv) -> None:
-    guesses = set()
-    for answer in range(3):
-        reset(scene, "MoveCube", 3, answer=answer)
-        guesses.add(scene.guess)
-    assert len(guesses) == 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_oracle_solves_test_episodes(blind: TabletopSimulator, family: str) -> None:
     """The last six of each family, two of each difficulty."""
-    for episode in episode_ids(family, "test")[-6:]:
-        blind.reset(str(episode))
+    for index in range(44, 50):
+        episode = f"{family}/test/{index}"
+        blind.reset(episode)
         assert play(blind.env, "oracle")[0] is Status.SUCCESS, episode
 
 

@@ -10,7 +10,7 @@ from robomme_interference_data.simulators.base import (
     Demonstration,
     EpisodeInfo,
     Observation,
-    OneAtATime,
+    Simulator,
 )
 
 STEPS = 3
@@ -19,7 +19,7 @@ UNKNOWN, ENDLESS = 3, 4
 """Index of an episode that does not exist, and of one that never ends; others do after `STEPS`."""
 
 
-class Double(OneAtATime):
+class Double(Simulator):
     """A simulator of 4×4 pictures, with a lesson of five frames in every episode.
 
     Args:

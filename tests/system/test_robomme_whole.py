@@ -1,5 +1,6 @@
 """The official simulator the whole way: recorded, built, evaluated; a stand-in plays RoboMME."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.execution import Serial
+from robomme_interference_data.execution import Executor, Processes, Serial
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.simulators.robomme import EPISODES
 
@@ -56,6 +57,16 @@ def test_demonstrations_are_built_from_it(tmp_path: Path, robomme_python: Path) 
     with pytest.raises(InvalidOptionError, match="demonstrations only"):
         build(DISTRACTORS, replace(config, out=tmp_path / "units"))
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+
+
+@pytest.mark.parametrize("executor", [Serial(), Processes(2)])
+def test_an_interpreter_that_will_not_do_leaves_nothing(tmp_path: Path, executor: Executor) -> None:
+    for python, error in (("/nowhere/python", InvalidOptionError), (sys.executable, ImportError)):
+        config = config_of(tmp_path / "new", Path(python), "0-9")
+        plan = plan_build(DEMONSTRATIONS, config)
+        with pytest.raises(error):
+            build_dataset(plan, config.out, executor, WorkProgress(quiet=True))
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:

@@ -180,12 +180,6 @@ def test_every_target_is_declared_phony() -> None:
     assert set(phony[1].split()) == set(re.findall(r"^([a-z]+):", MAKEFILE, re.MULTILINE))
 
 
-def test_every_file_that_make_runs_exists() -> None:
-    files = re.findall(r"\bscripts/[\w.]+", MAKEFILE)
-    assert files
-    assert [name for name in files if not (ROOT / name).is_file()] == []
-
-
 @pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh", "scripts/system_packages.sh"])
 def test_shell_scripts_are_executable_and_parse(name: str) -> None:
     assert (ROOT / name).stat().st_mode & stat.S_IXUSR

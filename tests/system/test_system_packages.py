@@ -121,12 +121,6 @@ LIST_BACKPORTS = "deb [arch=amd64 signed-by=/keys/archive.gpg] file:///m/ bookwo
         ("debian.sources", 2, DEB822, DEB822_BACKPORTS),
         ("inline.sources", 1, INLINE_KEY, INLINE_BACKPORTS),
         ("sources.list", 2, LIST, LIST_BACKPORTS),
-        (
-            "plain.list",
-            1,
-            "deb file:///d bookworm main\n",
-            "deb file:///d bookworm-backports main\n",
-        ),
     ],
 )
 @pytest.mark.parametrize("works", [True, False])
@@ -152,11 +146,6 @@ def test_backports_that_are_there_are_used(machine: Machine) -> None:
     machine.set_up("vulkan")
     assert machine.calls() == ["--target-release bookworm-backports mesa-vulkan-drivers"]
     assert list((machine.state / "parts").iterdir()) == []
-
-
-def test_a_release_that_is_new_enough_needs_no_backports(machine: Machine) -> None:
-    machine.set_up("vulkan", CANDIDATE="25.2.1-1")
-    assert machine.calls() == ["mesa-vulkan-drivers"]
 
 
 def test_nothing_is_said_where_nothing_is_missing(machine: Machine) -> None:

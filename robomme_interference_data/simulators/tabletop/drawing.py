@@ -23,7 +23,12 @@ from mani_skill.sensors.camera import CameraConfig
 from robomme_interference_data.simulators.tabletop.motion import ROD
 from robomme_interference_data.simulators.tabletop.renderer import SHADERS
 
-__all__ = ["PANDA", "SHADER", "draw_low_polygon"]
+__all__ = ["PANDA", "SHADER", "UPRIGHT", "Colour", "draw_low_polygon", "material"]
+
+Colour = tuple[float, float, float]
+
+UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)
+"""The turn, as a quaternion, that stands up sapien's cylinders, which lie along x."""
 
 SHADER = ShaderConfig(
     shader_pack=str(SHADERS),
@@ -37,18 +42,10 @@ sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
 PANDA = "panda_low_polygon"
 """Name under which ManiSkill knows the arm."""
 
-_WHITE = (0.93, 0.94, 0.95)
-_JOINT = (0.72, 0.75, 0.78)
-_DARK = (0.16, 0.17, 0.19)
 _PAINT = {
-    **{f"link{number}": _WHITE for number in range(8)},
-    "link2": _JOINT,
-    "link4": _JOINT,
-    "link6": _JOINT,
-    "hand": _WHITE,
-    "leftfinger": _DARK,
-    "rightfinger": _DARK,
-    "camera_link": _DARK,
+    **dict.fromkeys(("link0", "link1", "link3", "link5", "link7", "hand"), (0.93, 0.94, 0.95)),
+    **dict.fromkeys(("link2", "link4", "link6"), (0.72, 0.75, 0.78)),
+    **dict.fromkeys(("leftfinger", "rightfinger", "camera_link"), (0.16, 0.17, 0.19)),
 }
 _CAMERA = (0.010, 0.045, 0.0115)  # half size in m
 
@@ -84,34 +81,29 @@ def draw_low_polygon(articulation: Any, stick: float) -> None:
         stick: Length in m of the stick to draw in the gripper, beyond the fingertips; 0 for none.
     """
     for link in articulation.links:
-        part = _part(link.name)
+        part = link.name.removeprefix(f"scene-0-{PANDA}_").removeprefix("panda_")
         old = link.entity.find_component_by_type(sapien.render.RenderBodyComponent)
         if old is None or part not in _PAINT:
             continue
         link.entity.remove_component(old)
         body = sapien.render.RenderBodyComponent()
+        painted = material(_PAINT[part], 0.7, 0.2)
         if part == "camera_link":
-            shape = sapien.render.RenderShapeBox(_CAMERA, _material(_PAINT[part]))
+            shape = sapien.render.RenderShapeBox(_CAMERA, painted)
             shape.set_local_pose(sapien.Pose([-0.0125, -0.02, 0]))
         else:
             mesh = "finger" if part.endswith("finger") else part
-            shape = sapien.render.RenderShapeTriangleMesh(*_mesh(mesh), _material(_PAINT[part]))
+            shape = sapien.render.RenderShapeTriangleMesh(*_mesh(mesh), painted)
         if part == "rightfinger":  # the same mesh, turned half round
             shape.set_local_pose(sapien.Pose([0, 0, 0], [0, 0, 0, 1]))
         body.attach(shape)
         if stick and part == "hand":
-            rod = sapien.render.RenderShapeCylinder(
-                ROD, (stick + 0.04) / 2, _material((0.30, 0.18, 0.08))
-            )
-            middle = 0.1034 + stick - (stick + 0.04) / 2
-            rod.set_local_pose(sapien.Pose([0, 0, middle], [math.sqrt(0.5), 0, math.sqrt(0.5), 0]))
+            wood = material((0.30, 0.18, 0.08), 0.7, 0.2)
+            half = (stick + 0.04) / 2
+            rod = sapien.render.RenderShapeCylinder(ROD, half, wood)
+            rod.set_local_pose(sapien.Pose([0, 0, 0.1034 + stick - half], UPRIGHT))
             body.attach(rod)
         link.entity.add_component(body)
-
-
-def _part(name: str) -> str:
-    """`link3`, `hand`, `camera_link` …: a link's name without what ManiSkill puts before it."""
-    return name.removeprefix(f"scene-0-{PANDA}_").removeprefix("panda_")
 
 
 @lru_cache
@@ -143,5 +135,8 @@ def _smooth(vertices: Any, normals: Any) -> Any:
     return smooth.astype(np.float32)
 
 
-def _material(colour: tuple[float, float, float]) -> Any:
-    return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.7, specular=0.2)
+def material(colour: Colour, roughness: float = 0.9, specular: float = 0.1) -> Any:
+    """A plain material of a colour, matt unless said otherwise."""
+    return sapien.render.RenderMaterial(
+        base_color=[*colour, 1.0], roughness=roughness, specular=specular
+    )

@@ -33,24 +33,13 @@ def seed_of(episode: EpisodeId) -> int:
     return family + _SPLIT_START[episode.split] + episode.index
 
 
-def turn_of(seed: int, count: int) -> int:
+def turn_of(seed: int, count: int, stream: int = 0) -> int:
     """Return which of `count` answers the episode of a seed has, from 0: they take turns.
 
     In each group of episodes of a family, split and difficulty each answer occurs equally often,
-    to within one. It does so once in every `count` episodes of the group, in a new order.
+    to within one. It does so once in every `count` episodes of the group, in a new order; another
+    `stream` has orders of its own.
     """
-    return _turn(seed, count, 0)
-
-
-def guess_of(seed: int, count: int) -> int:
-    """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
-
-    Guesses take turns as answers do, in orders of their own.
-    """
-    return _turn(seed, count, 1)
-
-
-def _turn(seed: int, count: int, stream: int) -> int:
     family, number = divmod(seed, _FAMILY_SPAN)
     split, number = divmod(number, _SPLIT_SPAN)
     number, difficulty = divmod(number, len(DIFFICULTIES))
@@ -59,25 +48,24 @@ def _turn(seed: int, count: int, stream: int) -> int:
     return int(order[place])
 
 
+def guess_of(seed: int, count: int) -> int:
+    """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
+
+    Guesses take turns as answers do.
+    """
+    return turn_of(seed, count, stream=1)
+
+
 def difficulty_of(seed: int) -> str:
     """Return the difficulty of a seed's scene: easy, medium, hard, in turn."""
     return DIFFICULTIES[seed % len(DIFFICULTIES)]
 
 
-def episode_ids(
-    family: str | None = None, split: str | None = None, difficulty: str | None = None
-) -> list[EpisodeId]:
-    """List the suite's episodes in canonical order, all or those of one kind.
-
-    Raises:
-        UnknownNameError: There is no such family.
-        InvalidIdError: There is no such split.
-    """
-    families = FAMILIES if family is None else (family,)
-    splits = SPLITS if split is None else (split,)
-    found = []
-    for each in families:
-        for part in splits:
-            seed_of(EpisodeId(each, part, 0))
-            found += [EpisodeId(each, part, index) for index in range(EPISODES[part])]
-    return [e for e in found if difficulty is None or difficulty_of(seed_of(e)) == difficulty]
+def episode_ids() -> list[EpisodeId]:
+    """List the suite's episodes in canonical order."""
+    return [
+        EpisodeId(family, split, index)
+        for family in FAMILIES
+        for split in SPLITS
+        for index in range(EPISODES[split])
+    ]

@@ -8,7 +8,8 @@ from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.records import Status
-from robomme_interference_data.simulators.tabletop.kit import Colour, Kit
+from robomme_interference_data.simulators.tabletop.drawing import Colour
+from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 
 __all__ = ["Family"]

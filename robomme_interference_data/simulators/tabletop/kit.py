@@ -13,11 +13,10 @@ import numpy as np
 import sapien
 from numpy.typing import NDArray
 
+from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, Colour, material
 from robomme_interference_data.simulators.tabletop.motion import Point
 
-__all__ = ["COLOURS", "CUBE", "SIDE", "Body", "Colour", "Kit", "Place"]
-
-Colour = tuple[float, float, float]
+__all__ = ["COLOURS", "CUBE", "SIDE", "Body", "Kit", "Place"]
 
 COLOURS: dict[str, Colour] = {
     "red": (0.85, 0.08, 0.08),
@@ -79,18 +78,17 @@ class Body:
     def touched(self) -> bool:
         """Whether a part of the arm presses on the body."""
         arm = sapien.physx.PhysxArticulationLinkComponent
-        for contact in self._entity.scene.physx_system.get_contacts():
-            bodies = contact.bodies
-            if self._rigid in bodies and any(isinstance(body, arm) for body in bodies):
-                pressed = any(np.any(point.impulse) for point in contact.points)
-                if pressed:
-                    return True
-        return False
+        return any(
+            self._rigid in contact.bodies
+            and any(isinstance(body, arm) for body in contact.bodies)
+            and any(np.any(point.impulse) for point in contact.points)
+            for contact in self._entity.scene.physx_system.get_contacts()
+        )
 
     def put(self, place: Place) -> None:
         """Set the body somewhere, at rest."""
         self._entity.set_pose(place.pose)
-        if self._rigid is not None and not self._rigid.kinematic:
+        if self._movable and not self._rigid.kinematic:
             self._rigid.set_linear_velocity([0, 0, 0])
             self._rigid.set_angular_velocity([0, 0, 0])
 
@@ -136,7 +134,7 @@ class Kit:
             [
                 ((-4.8, 0, -0.05), (4, 8, 0.05), floor),
                 ((4.3, 0, -0.05), (4, 8, 0.05), floor),
-                ((-5, 0, 3), (0.05, 8, 3), (floor[0] * 0.8, floor[1] * 0.8, floor[2] * 0.8)),
+                ((-5, 0, 3), (0.05, 8, 3), _dark(floor, 0.8)),
             ],
             Place((0, 0, -0.9)),
             "floor",
@@ -169,7 +167,6 @@ class Kit:
     def container(self, xy: Point, colour: Colour) -> Body:
         """An opaque box without bottom, 7 cm wide and high, with a knob to grasp it by."""
         outer, wall, height = SIDE, 0.003, 0.065
-        dark = (colour[0] * 0.45, colour[1] * 0.45, colour[2] * 0.45)
         side, mid = outer - wall, height / 2
         boxes = [
             ((0, side, mid), (outer, wall, mid), colour),
@@ -177,7 +174,7 @@ class Kit:
             ((side, 0, mid), (wall, outer, mid), colour),
             ((-side, 0, mid), (wall, outer, mid), colour),
             ((0, 0, height - wall), (outer, outer, wall), colour),
-            ((0, 0, height + 0.014), (0.011, 0.011, 0.014), dark),
+            ((0, 0, height + 0.014), (0.011, 0.011, 0.014), _dark(colour, 0.45)),
         ]
         return self._body(boxes, Place((xy[0], xy[1], 0)), "container", size=height + 0.014)
 
@@ -203,16 +200,13 @@ class Kit:
 
     def target(self, xy: Point, colour: Colour, radius: float) -> Body:
         """A flat disc on the table: a ring of the colour around a white middle."""
-        builder = self._builder()
-        for size, height, tint in ((radius, 0.002, colour), (0.55 * radius, 0.003, (0.95,) * 3)):
-            self._disc(builder, size, height, tint)
-        return self._finish(builder, Place((xy[0], xy[1], 0)), "target", radius, "by hand")
+        discs = [(0.0, radius, 0.002, colour), (0.0, 0.55 * radius, 0.003, (0.95,) * 3)]
+        return self._body([], Place((xy[0], xy[1], 0)), "target", radius, "by hand", discs=discs)
 
     def lamp(self, colour: Colour, radius: float, height: float) -> Body:
         """A disc that covers the target or grid button that is lit; see `light`."""
-        builder = self._builder()
-        self._disc(builder, radius, height, colour)
-        return self._finish(builder, Place((0, 0, _LOW)), "lamp", height, "by hand")
+        discs = [(0.0, radius, height, colour)]
+        return self._body([], Place((0, 0, _LOW)), "lamp", height, "by hand", discs=discs)
 
     def button(self, xy: Point) -> Body:
         """A red push button of 4 cm height on a dark base; `home.p` is the middle of its top."""
@@ -222,21 +216,18 @@ class Kit:
             "button base",
             moves="by hand",
         )
-        builder = self._builder()
-        self._disc(builder, 0.022, 0.024, (0.9, 0.1, 0.1), top=0.0)
-        return self._finish(builder, Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand")
+        discs = [(-0.024, 0.022, 0.024, (0.9, 0.1, 0.1))]
+        return self._body([], Place((xy[0], xy[1], 0.04)), "button", 0.022, "by hand", discs=discs)
 
     def post(self, xy: Point, colour: Colour, radius: float, height: float) -> Body:
         """An upright post to look at: it stops nothing, so its family judges who runs into it."""
-        builder = self._builder()
-        self._disc(builder, radius, height, colour)
-        return self._finish(builder, Place((xy[0], xy[1], 0)), "post", radius, "by hand")
+        discs = [(0.0, radius, height, colour)]
+        return self._body([], Place((xy[0], xy[1], 0)), "post", radius, "by hand", discs=discs)
 
     def socket(self, xy: Point, colour: Colour, hole: float, depth: float) -> Body:
         """A box with a square hole along y, open at both sides; z 0 of the body is the table."""
         half, wall, middle = hole / 2, 0.02, 0.05
-        dark = (colour[0] * 0.6, colour[1] * 0.6, colour[2] * 0.6)
-        low = middle - half
+        dark, low = _dark(colour, 0.6), middle - half
         boxes = [
             ((0, 0, low / 2), (half + wall, depth / 2, low / 2), colour),
             ((0, 0, middle + half + wall / 2), (half + wall, depth / 2, wall / 2), colour),
@@ -250,20 +241,6 @@ class Kit:
         """Show a lamp at a place on the table, or hide it."""
         lamp.put(lamp.home if at is None else Place((at[0], at[1], 0.0)))
 
-    # --- how bodies are built --------------------------------------------------------------------
-
-    def _builder(self) -> Any:
-        return self._scene.create_actor_builder()
-
-    @staticmethod
-    def _disc(
-        builder: Any, radius: float, height: float, colour: Colour, top: float | None = None
-    ) -> None:
-        # sapien's cylinders lie along x; this quaternion stands them up.
-        z = height / 2 if top is None else top - height / 2
-        upright = sapien.Pose([0, 0, z], [math.sqrt(0.5), 0, math.sqrt(0.5), 0])
-        builder.add_cylinder_visual(upright, radius, height / 2, _material(colour))
-
     def _body(
         self,
         boxes: Iterable[tuple[Sequence[float], Sequence[float], Colour]],
@@ -273,17 +250,22 @@ class Kit:
         moves: str = "freely",
         density: float = 500.0,
         solid: bool = True,
+        discs: Iterable[tuple[float, float, float, Colour]] = (),
     ) -> Body:
-        """Build a body of boxes, each `(middle, half size, colour)`."""
-        builder = self._builder()
+        """Build a body of boxes, each `(middle, half size, colour)`, and of discs to look at.
+
+        A disc is `(z of its bottom, radius, height, colour)`.
+        """
+        builder = self._scene.create_actor_builder()
         for middle, half, colour in boxes:
             pose = sapien.Pose(middle)
             if solid:
                 builder.add_box_collision(pose, half, density=density)
-            builder.add_box_visual(pose, half, _material(colour))
-        return self._finish(builder, home, name, size, moves)
-
-    def _finish(self, builder: Any, home: Place, name: str, size: float, moves: str) -> Body:
+            builder.add_box_visual(pose, half, material(colour))
+        for bottom, radius, height, colour in discs:
+            # sapien's cylinders lie along x; this quaternion stands them up.
+            pose = sapien.Pose([0, 0, bottom + height / 2], UPRIGHT)
+            builder.add_cylinder_visual(pose, radius, height / 2, material(colour))
         builder.set_initial_pose(home.pose)
         build = {
             "freely": builder.build,
@@ -296,5 +278,6 @@ class Kit:
         return body
 
 
-def _material(colour: Colour) -> Any:
-    return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.9, specular=0.1)
+def _dark(colour: Colour, part: float) -> Colour:
+    red, green, blue = colour
+    return red * part, green * part, blue * part

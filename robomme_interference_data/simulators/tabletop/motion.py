@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FPS
 from robomme_interference_data.errors import MotionError
 
-__all__ = ["BASE", "HOME", "REST_QPOS", "ROD", "Arm", "Point", "Script"]
+__all__ = ["BASE", "HOME", "REST_QPOS", "ROD", "Arm", "Point", "Script", "eased"]
 
 Script = Iterator[None]
 
@@ -114,8 +114,7 @@ class Arm:
         seconds = 1.5 * max(float(np.linalg.norm(way)) / speed, abs(turn) / TURN) / self._pace
         steps = max(1, math.ceil(FPS * seconds))
         for step in range(1, steps + 1):
-            part = step / steps
-            part = part * part * (3 - 2 * part)
+            part = eased(step / steps)
             self._goal = start + part * way
             self._yaw = first_yaw + part * turn
             self._qpos = self._solve(self._goal, self._yaw, self._qpos)
@@ -199,3 +198,8 @@ class Arm:
                 "Keep targets within 0.3 to 0.72 m of the arm's base and clear of its limits.",
             )
         return np.asarray(qpos, dtype=np.float64)
+
+
+def eased(part: float) -> float:
+    """A part of the time, 0 to 1, as a part of the way: slower at both ends."""
+    return part * part * (3 - 2 * part)

@@ -13,7 +13,7 @@ from robomme_interference_data.simulators.base import (
     Begun,
     EpisodeInfo,
     Observation,
-    OneAtATime,
+    Simulator,
     camera_names,
 )
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
@@ -24,13 +24,12 @@ __all__ = ["TabletopSimulator"]
 POLICIES = ("oracle", "guess")
 
 
-class TabletopSimulator(OneAtATime):
+class TabletopSimulator(Simulator):
     """See `Simulator`. Keep to one in a process: an executor's workers are for more.
 
     Args:
-        render: Whether to draw. Without, observations hold no images, and episodes run several
+        cameras: Names of the cameras to draw; fewer are faster. Without any, episodes run several
             times as fast: for policies that do not look.
-        cameras: Names of the cameras to draw; fewer are faster.
 
     Raises:
         UnknownNameError: There is no such camera.
@@ -39,10 +38,10 @@ class TabletopSimulator(OneAtATime):
 
     name = "tabletop"
 
-    def __init__(self, render: bool = True, cameras: Sequence[str] = CAMERAS):
+    def __init__(self, cameras: Sequence[str] = CAMERAS):
         self._cameras = camera_names(self.name, cameras)
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
-        self.env = TabletopEnv(render=render, obs_mode="none")
+        self.env = TabletopEnv(render=bool(cameras), obs_mode="none")
         self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
 
     def act(self, policy: str) -> NDArray[np.float32]:

@@ -9,10 +9,11 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.tabletop.kit import Body, Place
-from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script, eased
 
 __all__ = [
     "ABOVE",
+    "Spot",
     "along",
     "exchanges",
     "is_near",
@@ -22,7 +23,6 @@ __all__ = [
     "row",
     "shuffled",
     "swap",
-    "touched",
 ]
 
 Spot = tuple[float, float]
@@ -31,8 +31,6 @@ Vector = NDArray[np.float64]
 STEPS = 30  # time steps of an exchange
 ABOVE = 0.001
 """How far above a thing the stick's tip stops that is to touch it, in m."""
-
-TOUCH = 0.004  # m above a thing, below which the stick's tip touches it
 
 
 def row(
@@ -75,11 +73,6 @@ def along(body: Body, to: Place, steps: int) -> list[Place]:
     return places
 
 
-def eased(part: float) -> float:
-    """A part of the time, 0 to 1, as a part of the way: slower at both ends."""
-    return part * part * (3 - 2 * part)
-
-
 def lanes(spots: Sequence[Spot], pair: tuple[int, int], gap: float) -> list[list[Spot]]:
     """The ways of two of the things at `spots` that change places, a spot per time step.
 
@@ -119,15 +112,6 @@ def swap(groups: Sequence[Sequence[Body]], pair: tuple[int, int], gap: float) ->
 def is_near(body: Body, other: Body, distance: float) -> bool:
     """Whether two bodies are within a distance of each other, seen from above."""
     return math.dist(body.p[:2], other.p[:2]) < distance
-
-
-def touched(arm: Arm, spots: Sequence[Spot], radius: float, height: float) -> int | None:
-    """Return which of the flat things at `spots`, `height` m high, the stick's tip is on."""
-    x, y, z = arm.tip
-    for number, spot in enumerate(spots):
-        if z < height + TOUCH and math.dist((x, y), spot) < radius:
-            return number
-    return None
 
 
 def off_line(point: Vector, one: Vector, other: Vector) -> float:

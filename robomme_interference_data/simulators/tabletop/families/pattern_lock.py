@@ -2,23 +2,54 @@
 
 import math
 from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.random import RandomState
 
 from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.family import Family
-from robomme_interference_data.simulators.tabletop.kit import Kit
+from robomme_interference_data.simulators.tabletop.kit import Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import ABOVE, touched
+from robomme_interference_data.simulators.tabletop.stage import ABOVE, Spot
 
-__all__ = ["PatternLock"]
+__all__ = ["PatternLock", "StickFamily"]
 
 SIDE, SPACING, RADIUS = 4, 0.075, 0.02  # buttons in a row; m; m
 TALL, HIGH = 0.010, 0.10  # m, a button, and the stick's tip above the buttons
 
+TOUCH = 0.004  # m above a thing, below which the stick's tip touches it
 
-class PatternLock(Family):
+
+class StickFamily(Family):
+    """Flat things, of which one is lit while the tip of a stick on the arm is on it.
+
+    Attributes:
+        spots: Where they are.
+        flat: Their radius and height, in m.
+        lamp: What lights one.
+        now: Which one is lit, or None.
+    """
+
+    spots: list[Spot]
+    flat: ClassVar[Spot]
+    lamp: Body
+    now: int | None
+
+    def demonstrate(self, arm: Arm, answer: Any) -> Script:
+        yield from arm.wait(10)
+        yield from self.solve(arm, answer)
+        yield from arm.go_home()
+
+    def react(self, arm: Arm) -> None:
+        radius, height = self.flat
+        x, y, z = arm.tip
+        near = (n for n, spot in enumerate(self.spots) if math.dist((x, y), spot) < radius)
+        self.now = next(near, None) if z < height + TOUCH else None
+        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
+
+
+class PatternLock(StickFamily):
     """A stick on the arm traces a path over a grid of buttons; retrace it.
 
     An answer is the path: numbers of buttons, each beside the one before it, straight or diagonal.
@@ -26,6 +57,7 @@ class PatternLock(Family):
 
     table = (0.16, 0.34, 0.34)
     stick = 0.10
+    flat = (RADIUS, TALL)
     length = (4, 5, 6)
 
     def draw(self, rng: RandomState) -> None:
@@ -48,21 +80,12 @@ class PatternLock(Family):
     def goals(self) -> tuple[str, ...]:
         return ("retrace the pattern with the stick, button by button in the same order",)
 
-    def demonstrate(self, arm: Arm, answer: tuple[int, ...]) -> Script:
-        yield from arm.wait(10)
-        yield from self.solve(arm, answer)
-        yield from arm.go_home()
-
     def solve(self, arm: Arm, answer: tuple[int, ...]) -> Script:
         yield from arm.move((*self.spots[answer[0]], HIGH))
         for number in answer:
             yield from arm.move((*self.spots[number], TALL + ABOVE), speed=0.15)
             yield from arm.wait(8)
         yield from arm.move((*self.spots[answer[-1]], HIGH))
-
-    def react(self, arm: Arm) -> None:
-        self.now = touched(arm, self.spots, RADIUS, TALL)
-        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
 
     def judge(self, arm: Arm, answer: tuple[int, ...]) -> Status:
         if self.now is not None and self.now != self.last:

@@ -8,10 +8,10 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.records import Status
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.families.pattern_lock import StickFamily
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line, touched
+from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line
 
 __all__ = ["RouteStick"]
 
@@ -24,7 +24,7 @@ FLAT = 0.003  # m, the height of a target
 LOW, HIGH = FLAT + ABOVE, 0.13  # m, the stick's tip on the targets and above the posts
 
 
-class RouteStick(Family):
+class RouteStick(StickFamily):
     """The stick goes from target to target, round the post between them on one side or the other.
 
     An answer is the targets' numbers, and for each post that is passed the side: 1 away from the
@@ -33,6 +33,7 @@ class RouteStick(Family):
 
     table = (0.48, 0.30, 0.30)
     stick = 0.12
+    flat = (RADIUS, FLAT)
     turns = (2, 3, 4)
 
     def draw(self, rng: RandomState) -> None:
@@ -54,11 +55,6 @@ class RouteStick(Family):
     def goals(self) -> tuple[str, ...]:
         return ("follow the same path round the posts with the stick as in the video",)
 
-    def demonstrate(self, arm: Arm, answer: Route) -> Script:
-        yield from arm.wait(10)
-        yield from self.solve(arm, answer)
-        yield from arm.go_home()
-
     def solve(self, arm: Arm, answer: Route) -> Script:
         targets, sides = answer
         yield from arm.move((*self.spots[targets[0]], HIGH))
@@ -70,10 +66,6 @@ class RouteStick(Family):
             yield from arm.move((*self.spots[other], LOW), speed=0.15)
             yield from arm.wait(3)
         yield from arm.move((*self.spots[targets[-1]], HIGH))
-
-    def react(self, arm: Arm) -> None:
-        self.now = touched(arm, self.spots, RADIUS, FLAT)
-        Kit.light(self.lamp, None if self.now is None else self.spots[self.now])
 
     def judge(self, arm: Arm, answer: Route) -> Status:
         targets, sides = answer
