@@ -22,7 +22,8 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
-    from robomme_interference_data.build_dataset.build import BuildPlan, BuildResult
+    from robomme_interference_data.build_dataset.build import BuildResult
+    from robomme_interference_data.build_dataset.config import BuildPlan
 
 __all__ = ["app", "audit", "verify"]
 
@@ -183,11 +184,10 @@ def verify(
     robomme-interference verify my-split
     ```
     """
-    from robomme_interference_data.build_dataset.verify import frames_of, verify_split
+    from robomme_interference_data.build_dataset.verify import verify_split
 
     with WorkProgress() as progress:
-        progress.start("Verifying", frames_of(split) if decode else 0)
-        violations = list(verify_split(split, decode=decode, advance=progress.advance))
+        violations = list(verify_split(split, decode=decode, progress=progress))
     if as_json:
         print_json([vars(violation) for violation in violations])
     else:

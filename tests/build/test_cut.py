@@ -1,4 +1,4 @@
-"""Which frames of an episode a dataset stores, and which episodes, in which order."""
+"""Which frames of an episode a dataset stores."""
 
 from collections.abc import Generator
 from typing import Any
@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.build_dataset.config import list_episodes
 from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
-from robomme_interference_data.build_dataset.sources import Frame, SourceEpisode
+from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.errors import SourceError
-from robomme_interference_data.ids import EpisodeId
 
 DEMONSTRATIONS, DISTRACTORS = "demonstrations", "distractors"
 
@@ -66,48 +64,3 @@ def test_nothing_to_store(kind: str, lesson: int | None, length: int, reason: st
         list(CUTS[kind](marks(lesson, length)))
     with pytest.raises(SourceError, match=r"does not mark(.|\n)*build distractors"):
         list(CUTS[DEMONSTRATIONS](marks(None, 10)))
-
-
-# --- episodes ------------------------------------------------------------------------------------
-
-
-class Listed:
-    """A source that lists episodes and has nothing to read."""
-
-    def __init__(self, *names: str):
-        self.names = names
-
-    def episodes(self) -> list[SourceEpisode]:
-        return [SourceEpisode(EpisodeId.parse(name)) for name in self.names]
-
-
-def listed(*sources: Any) -> list[tuple[int, str]]:
-    return [(number, str(one.id)) for number, one in list_episodes(sources)]
-
-
-def test_canonical_order_and_source_numbers() -> None:
-    one = Listed("PatternLock/train/2", "MoveCube/train/10", "Aaa/train/0")
-    two = Listed("MoveCube/train/9", "MoveCube/test/0", "MoveCube/val/3")
-    assert listed(one, two) == [
-        (1, "MoveCube/train/9"),
-        (0, "MoveCube/train/10"),
-        (1, "MoveCube/val/3"),
-        (1, "MoveCube/test/0"),
-        (0, "PatternLock/train/2"),
-        (0, "Aaa/train/0"),
-    ]
-
-
-PARTS = st.sampled_from(["MoveCube", "InsertPeg", "Zzz"]), st.sampled_from(["train", "val", "test"])
-
-
-@given(st.sets(st.builds("{}/{}/{}".format, *PARTS, st.integers(0, 30)), min_size=1), st.data())
-def test_order_of_episodes_and_sources_does_not_matter(names: set[str], data: Any) -> None:
-    shuffled = data.draw(st.permutations(sorted(names)))
-    cut = data.draw(st.integers(0, len(shuffled)))
-    parts = (shuffled[:cut], shuffled[cut:])
-    plain = [name for _, name in listed(Listed(*sorted(names)))]
-    for chosen in (parts, parts[::-1]):
-        found = listed(*(Listed(*part) for part in chosen))
-        assert [name for _, name in found] == plain
-        assert all(name in chosen[number] for number, name in found)

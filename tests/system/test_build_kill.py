@@ -66,14 +66,17 @@ def staged(out: Path) -> dict[Path, int]:
     }
 
 
-def disturb(
+@pytest.mark.parametrize("times", [2, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_stopped_at_random_moments(
     server: BuildServer,
-    out: Path,
     undisturbed: tuple[dict[str, bytes], float],
+    tmp_path: Path,
     sent: signal.Signals,
     times: int,
 ) -> None:
     """Stop builds of one output at random moments, then let one complete."""
+    out = tmp_path / "out"
     expected, duration = undisturbed
     moments = random.Random(sent)
     for _ in range(times):
@@ -100,27 +103,6 @@ def disturb(
     assert finished.code == 0, finished.stderr
     assert contents(out) == expected
     assert [path.name for path in out.parent.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_stopped_at_random_moments(
-    server: BuildServer,
-    undisturbed: tuple[dict[str, bytes], float],
-    tmp_path: Path,
-    sent: signal.Signals,
-) -> None:
-    disturb(server, tmp_path / "out", undisturbed, sent, times=2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_stopped_at_many_random_moments(
-    server: BuildServer,
-    undisturbed: tuple[dict[str, bytes], float],
-    tmp_path: Path,
-    sent: signal.Signals,
-) -> None:
-    disturb(server, tmp_path / "out", undisturbed, sent, times=12)
 
 
 def test_a_worker_that_is_killed_is_replaced(
