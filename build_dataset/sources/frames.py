@@ -26,11 +26,10 @@ from robomme_interference_data.build_dataset.sources.frames_table import (
     read_frames_table,
 )
 from robomme_interference_data.build_dataset.sources.images import (
-    decode_image,
-    is_png,
+    decode_images,
     probe_video,
 )
-from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError
+from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.video import iter_frames
@@ -89,7 +88,8 @@ class FramesSource(Source):
             path, length = key.images[camera], key.rows.length
             if path.is_dir():
                 _check_names(path, length)
-                streams[camera] = _iter_images(path, length)
+                files = [path / _image_name(number) for number in range(length)]
+                streams[camera] = decode_images(((f, f.read_bytes()) for f in files), exact=True)
             else:
                 rate, lossless = probe_video(path)
                 streams[camera] = _iter_video(path, rate, length)
@@ -172,19 +172,6 @@ def _check_names(path: Path, length: int) -> None:
             f"{_image_name(length - 1)} and nothing else",
             "Number the images of an episode from 0, six digits, one for every row.",
         )
-
-
-def _iter_images(path: Path, length: int) -> Generator[NDArray[np.uint8]]:
-    for number in range(length):
-        file = path / _image_name(number)
-        data = file.read_bytes()
-        try:
-            if not is_png(data):
-                raise FormatError("not a PNG image", "Store images as PNG: it is exact.")
-            image = decode_image(data)
-        except FormatError as error:
-            raise error.about(file) from None
-        yield image
 
 
 def _iter_video(path: Path, rate: float, length: int) -> Generator[NDArray[np.uint8]]:

@@ -28,7 +28,7 @@ from robomme_interference_data.build_dataset.sources.families import (
     ids_by_file,
 )
 from robomme_interference_data.build_dataset.sources.images import (
-    decode_image,
+    decode_images,
     info_is_exact,
     is_png,
 )
@@ -170,21 +170,12 @@ class LeRobotSource(Source):
     def _images(
         self, index: int, rows: RowSpan, column: str, exact: bool
     ) -> Generator[NDArray[np.uint8]]:
-        """Decode the images of an episode in order, `(H, W, 3) uint8` RGB, one in memory."""
         if self._lerobot.features[column]["dtype"] == "video":
             yield from self._lerobot.iter_frames(index, column, 0, len(rows))
             return
-        shape = self._lerobot.shape(column)
-        for number, data in enumerate(rows.images(column)):
-            where = f"frame {number} of column {column!r}"
-            if exact and not is_png(data):
-                raise SourceError(f"{where} is a JPEG, although the episode counts as exact", _MEND)
-            image = decode_image(data)
-            if image.shape != shape:
-                raise SourceError(
-                    f"{where} has the shape {image.shape}; info.json says {shape}", _MEND
-                )
-            yield image
+        cells = enumerate(rows.images(column))
+        where = f"of column {column!r}"
+        yield from decode_images(((f"frame {n} {where}", data) for n, data in cells), exact)
 
     def _is_exact(self, rows: RowSpan, column: str) -> bool:
         """Tell whether images are exact, by their codec or by the first one stored in parquet."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.made_up import MadeUpSource
-from support.splits import GOLDEN
+from support.splits import GOLDEN, contents
 
 from robomme_interference_data.build_dataset.build import (
     BuildResult,
@@ -35,7 +35,7 @@ from robomme_interference_data.errors import (
     SourceError,
 )
 from robomme_interference_data.execution import Serial
-from robomme_interference_data.files import LocalFiles, hold, read_json
+from robomme_interference_data.files import LocalFiles, hold
 from robomme_interference_data.ids import EpisodeId
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
@@ -47,14 +47,6 @@ def build(
     tasks = list_episodes(sources, **(filters or {}))
     plan = BuildPlan(kind, sources, tasks, **options)
     return build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def ids(root: Path) -> list[str]:
@@ -196,23 +188,6 @@ def test_nothing_to_store(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no episode yields distractors: 2 unusable"):
         build(tmp_path / "out", MadeUpSource({"A/train/0": (9, None), "B/train/0": (8, None)}))
     assert not (tmp_path / "out").exists()
-
-
-def test_report_and_identity(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    build(out, MadeUpSource({**TRAIN, "A/train/7": (9, None)}), version="1.2.3")
-    assert read_json(out / "meta" / "build_report.json") == {
-        "format_version": 1,
-        "kind": "distractors",
-        "counts": {"episodes": 4, "frames": 128, "families": {"A": 2, "B": 2}, "skipped": 1},
-        "skipped": [{"episode_id": "A/train/7", "why": "9 raw frames; a unit needs 249"}],
-    }
-    identity = Dataset(LocalFiles(out)).identity
-    told = identity.kind, identity.version, identity.codec, identity.exact
-    assert told == ("distractors", "1.2.3", "av1-lossless", True)
-    told = identity.cameras, identity.simulators, identity.sources
-    assert told == (("front",), ("made-up",), ({"kind": "made-up"},))
-    assert identity.unit == {"frames": 32, "stride": 8}
 
 
 # --- what is asked -------------------------------------------------------------------------------

@@ -177,7 +177,7 @@ HARMS: list[tuple[Callable[[Path], Any], str]] = [
     (
         # which would not be exact
         lambda f: (f / image(1)).write_bytes(encode_image(FRONT[1], "jpg")),
-        "000001.png: not a PNG image",
+        "000001.png: a JPEG image",
     ),
     (
         lambda f: write_video(place(f, kind="videos"), FRONT),

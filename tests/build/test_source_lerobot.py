@@ -218,11 +218,10 @@ def test_images_that_are_wrong(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path, one())
     column = "observation.images.front"
     cells = pq.read_table(root / DATA)[column].to_pylist()
-    small, jpeg = FOUR.images["front"][2][:8], FOUR.images["front"][2]
+    jpeg = encode_image(FOUR.images["front"][2], "jpg")
     for data, message in (
-        (cells[2]["bytes"][:60], "image is damaged"),
-        (encode_image(small), r"frame 2 .* has the shape \(8, 24, 3\); info.json says \(16, 24"),
-        (encode_image(jpeg, "jpg"), "frame 2 .* is a JPEG, although"),
+        (cells[2]["bytes"][:60], "frame 2 of .* image is damaged"),
+        (jpeg, "frame 2 of .* a JPEG image, although"),
         (b"", "expected PNG or JPEG"),
     ):
         wrong = [*cells[:2], {"bytes": data, "path": None}, cells[3]]

@@ -1,7 +1,7 @@
 """One episode staged: cut while it is read, encoded, decoded again, hashed; and what is refused."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from support.made_up import MadeUpSource, picture
 
 from robomme_interference_data.build_dataset import stage
 from robomme_interference_data.build_dataset.config import BuildPlan
+from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.stage import StagedEpisode, StageTask, read_staged
@@ -56,11 +57,6 @@ def test_a_demonstration(tmp_path: Path) -> None:
     pixels = front[:, ::4, ::4]  # every fourth row and column
     mean = made.stats("observation.images.front")["mean"]
     np.testing.assert_allclose(mean, pixels.mean((0, 1, 2)))
-
-
-def test_a_unit_has_no_lesson(tmp_path: Path) -> None:
-    known = staged(tmp_path, MadeUpSource({NAME: (300, None)}), "distractors").record
-    assert (known.length, known.exec_start_idx, known.lesson_sha256) == (32, None, None)
 
 
 def test_an_episode_that_yields_nothing_is_remembered(tmp_path: Path) -> None:
@@ -187,3 +183,59 @@ def test_statistics_against_numpy_in_any_order(images: NDArray[np.uint8]) -> Non
         # The smallest value that at least so many of the pixels do not exceed.
         expected = np.quantile(pixels, quantile, axis=0, method="inverted_cdf")
         np.testing.assert_array_equal(result[name], expected)
+
+
+# --- cuts ----------------------------------------------------------------------------------------
+
+DEMONSTRATIONS, DISTRACTORS = "demonstrations", "distractors"
+
+
+def marks(lesson: int | None, length: int) -> Generator[Frame]:
+    """Yield frames that only say their number, as state, and whether they are the lesson."""
+    for step in range(length):
+        shown = None if lesson is None else step < lesson
+        yield Frame({}, np.array([step], np.float32), None, shown)
+
+
+def steps(frames: Any) -> list[int]:
+    return [int(frame.state[0]) for frame in frames]
+
+
+def test_units_and_demonstrations() -> None:
+    # fmt: off
+    assert steps(CUTS[DISTRACTORS](marks(None, 249))) == [
+        0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120,
+        128, 136, 144, 152, 160, 168, 176, 184, 192, 200, 208, 216, 224, 232, 240, 248,
+    ]
+    # fmt: on
+    assert steps(CUTS[DEMONSTRATIONS](marks(3, 100))) == [0, 1, 2, 3]  # 3: the query frame
+
+
+@given(lesson=st.none() | st.integers(0, 400), length=st.integers(0, 400))
+def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
+    lesson: int | None, length: int
+) -> None:
+    for kind, needed in ((DISTRACTORS, 249), (DEMONSTRATIONS, (lesson or 0) + 1)):
+        read = marks(lesson, length)
+        try:
+            found = steps(CUTS[kind](read))
+        except (NothingToStore, SourceError):
+            assert length < needed or not lesson
+            continue
+        assert found == list(range(0, needed, 8 if kind == DISTRACTORS else 1))
+        assert steps(read) == list(range(needed, length))  # what is left
+
+
+@pytest.mark.parametrize(
+    ("kind", "lesson", "length", "reason"),
+    [
+        (DISTRACTORS, None, 248, "248 raw frames; a unit needs 249"),
+        (DEMONSTRATIONS, 0, 100, "no demonstration frame"),
+        (DEMONSTRATIONS, 100, 100, "no live observation after the demonstration"),
+    ],
+)
+def test_nothing_to_store(kind: str, lesson: int | None, length: int, reason: str) -> None:
+    with pytest.raises(NothingToStore, match=reason):
+        list(CUTS[kind](marks(lesson, length)))
+    with pytest.raises(SourceError, match=r"does not mark(.|\n)*build distractors"):
+        list(CUTS[DEMONSTRATIONS](marks(None, 10)))

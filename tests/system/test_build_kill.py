@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from support.build_server import BuildServer
+from support.splits import contents
 
 from robomme_interference_data.build_dataset.build import work_folder
 from robomme_interference_data.build_dataset.stage import read_staged
@@ -31,14 +32,6 @@ def command(out: Path, workers: int = 2) -> list[str]:
     """Build six units and one that is too short, of small cameras."""
     options = ["--cameras", "front", "--workers", str(workers), "--out", str(out)]
     return ["build", "distractors", "--source", "sample:MoveCube,PatternLock", *options]
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture(scope="module")
