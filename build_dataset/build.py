@@ -8,8 +8,7 @@ encoded again.
 
 import os
 import shutil
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -35,10 +34,10 @@ from robomme_interference_data.errors import (
     first_line,
 )
 from robomme_interference_data.execution import Executor, Outcome
-from robomme_interference_data.files import canonical_json, hold
+from robomme_interference_data.files import canonical_json, working
 from robomme_interference_data.records import EpisodeRecord
 
-__all__ = ["BuildResult", "build_dataset", "work_folder", "working"]
+__all__ = ["BuildResult", "build_dataset"]
 
 _ADVICE = "Choose another --out, or remove the folder first."
 
@@ -135,27 +134,6 @@ def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
                 f"{out} exists and was built from {before}, not from {source.provenance}", _ADVICE
             )
     return earlier
-
-
-def work_folder(out: Path) -> Path:
-    """Return the hidden folder beside `out` in which `out` is made."""
-    return out.parent / f".{out.name}.building"
-
-
-@contextmanager
-def working(out: Path) -> Iterator[Path]:
-    """Make the work folder of `out` and hold it; put back what a killed build had moved there.
-
-    Raises:
-        BuildError: Another process holds it.
-    """
-    work = work_folder(out)
-    work.mkdir(parents=True, exist_ok=True)
-    busy = BuildError(f"another build of {out} is running", "Wait for it to end, or stop it.")
-    with hold(work / "lock", busy):
-        if (work / "before").exists() and not out.exists():
-            (work / "before").rename(out)
-        yield work
 
 
 # --- stage and write ---------------------------------------------------------------------------

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from robomme_interference_data.build_dataset.build import working
 from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.constants import (
     ACTION,
@@ -38,7 +37,13 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     SourceError,
 )
-from robomme_interference_data.files import LocalFiles, atomic_path, sha256_file, write_json
+from robomme_interference_data.files import (
+    LocalFiles,
+    atomic_path,
+    sha256_file,
+    working,
+    write_json,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
