@@ -178,8 +178,10 @@ def verify(
     """
     from robomme_interference_data.build_dataset.verify import verify_split
 
-    with WorkProgress() as progress:
-        violations = list(verify_split(split, decode=decode, progress=progress))
+    progress = WorkProgress()
+    checks = verify_split(split, decode=decode, progress=progress)
+    with progress:
+        violations = list(checks)
     if as_json:
         print_json([vars(violation) for violation in violations])
     else:

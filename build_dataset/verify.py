@@ -65,7 +65,12 @@ def verify_split(
     Raises:
         MissingFileError, FormatError: The folder is not a split, or its header cannot be read.
     """
-    header = load_split(root).header
+    return _split(root, load_split(root).header, decode, progress or WorkProgress(quiet=True))
+
+
+def _split(
+    root: Path, header: ManifestHeader, decode: bool, progress: WorkProgress
+) -> Iterator[Violation]:
     rows = root / MANIFESTS / MANIFEST_ROWS
     if not rows.is_file():
         yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", "is missing")
@@ -78,7 +83,6 @@ def verify_split(
             datasets[name] = Dataset(LocalFiles(root / name))
         except InterferenceError as error:
             yield Violation(name, error.message)
-    progress = progress or WorkProgress(quiet=True)
     frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
     progress.start("Verifying", frames if decode else 0)
     pool = datasets.get(DISTRACTORS)

@@ -24,7 +24,10 @@ __all__ = ["app", "main"]
 
 
 class _Root(TyperGroup):
-    """Lets options take several values, as in `--conditions k0 k7`."""
+    """Keeps the order of `_GROUPS`, and lets options take several values: `--conditions k0 k7`."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [name for group in _GROUPS.values() for name, _ in group]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         command: Any = self

@@ -4,6 +4,7 @@
 can wait forever on a damaged file.
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,7 +45,8 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         FormatError: It is not a parquet file.
     """
     with reading(path):
-        return pq.ParquetFile(path, buffer_size=1 << 20)
+        # Bytes, as pyarrow cannot encode names that are not UTF-8.
+        return pq.ParquetFile(pa.OSFile(os.fsencode(path)), buffer_size=1 << 20)
 
 
 def is_listed(kind: pa.DataType) -> bool:

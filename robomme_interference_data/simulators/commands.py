@@ -2,14 +2,16 @@
 
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from robomme_interference_data.console import AsJson, print_json
 from robomme_interference_data.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["simulate"]
 
@@ -111,7 +113,9 @@ class _Clip:
         self._path = path
         self._encoder: Any = None
 
-    def add(self, images: dict[str, NDArray[np.uint8]], colour: tuple[int, int, int]) -> None:
+    def add(self, images: "dict[str, NDArray[np.uint8]]", colour: tuple[int, int, int]) -> None:
+        import numpy as np
+
         from robomme_interference_data.constants import FPS
         from robomme_interference_data.encode import CLIP, VideoEncoder
 

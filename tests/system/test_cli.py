@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +109,7 @@ def test_help_imports_nothing_heavy() -> None:
         (["lits"], "No such command 'lits'"),
         (["list"], "Missing argument"),
         (["list", ".", "--bad"], "No such option: --bad"),
-        (["show", EPISODE], "Missing argument 'CONDITION'"),
+        (["show", EPISODE], "Missing argument"),
         (["list", ".", "--condition", "k1", "k3"], "unexpected extra argument"),
         (["build", "demonstrations", "--source", "frames:."], "Missing option '--out'"),
     ],
@@ -128,7 +130,7 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
         (["list", "{}/nowhere"], ("is not a split", "build all")),
         (["list", "{}", "--family", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
         (["list", "{}", "--condition", "k9"], ("'k9'", "k0", "k7")),
-        (["list", "{}", "--condition", "seven"], ("'seven'", "k3")),
+        (["list", "{}", "--condition", "seven"], ("'seven'", "k0")),
         (["show", "MoveCube/test/9", "k3", "--split", "{}"], ("MoveCube/test/9", EPISODE)),
         (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
         (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0 k1 k3 k7 k9")),
@@ -163,8 +165,9 @@ def test_a_bad_source_lists_every_kind(run: Run, tmp_path: Path) -> None:
 
 
 def table_rows(out: str) -> list[list[str]]:
-    lines = [line.split("│")[1:-1] for line in out.splitlines() if line.startswith("│")]
-    return [[cell.strip() for cell in line] for line in lines]
+    """The rows under the line of dashes."""
+    lines = out[out.index("\n-----") :].splitlines()[2:]
+    return [re.split(r"  +", line.strip()) for line in takewhile(str.strip, lines)]
 
 
 def test_list(run: Run, tiny_split: Path) -> None:
