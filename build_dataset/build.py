@@ -105,11 +105,7 @@ def build_dataset(
 
 
 def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
-    """Return the dataset that is there; None if nothing is.
-
-    Raises:
-        BuildError: Something else is there, or it was built otherwise.
-    """
+    """Return the dataset that is there, built in the same way; None if nothing is."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / IDENTITY_PATH).is_file():
@@ -147,11 +143,7 @@ def _stage(
     executor: Executor,
     progress: WorkProgress,
 ) -> list[StagedEpisode]:
-    """Stage episodes, which must fit those that are known.
-
-    Raises:
-        BuildError, SourceError: Episodes failed, or do not fit together; the others are kept.
-    """
+    """Stage episodes, which must fit those that are known; what succeeds is kept."""
     task = StageTask(plan, work / "episodes")
     limit = plan.time_limit or max(source.time_limit for source in plan.sources)
     staged: list[StagedEpisode] = []

@@ -6,7 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ImageStats", "before_scaling"]
+__all__ = ["STATISTICS", "ImageStats", "before_scaling"]
+
+STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
+"""Names of the statistics in LeRobot's order, which is that of its columns."""
 
 
 class ImageStats:

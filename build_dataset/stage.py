@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
-from robomme_interference_data.build_dataset.image_stats import ImageStats
+from robomme_interference_data.build_dataset.image_stats import STATISTICS, ImageStats
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, DEMONSTRATIONS, FPS, STATE
 from robomme_interference_data.digest import FeatureDigests
@@ -93,7 +93,8 @@ class StagedEpisode:
 
     def stats(self, feature: str) -> dict[str, NDArray[Any]]:
         """See `StoredEpisode`."""
-        found = {name: np.array(values) for name, values in self.staged.stats[feature].items()}
+        # In this order whether it was staged just now or read again: columns follow it.
+        found = {name: np.array(self.staged.stats[feature][name]) for name in STATISTICS}
         return {**found, "count": found["count"].astype(np.int64)}
 
 
@@ -220,11 +221,7 @@ class _Writer:
         self.length = 0
 
     def add(self, frame: Frame) -> None:
-        """Take the next frame.
-
-        Raises:
-            SourceError: It is not as the first one, or holds what is no finite number.
-        """
+        """Take the next frame, which must be as the first one and hold finite numbers."""
         images = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()}
         vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
         if not self.length:

@@ -95,7 +95,7 @@ class FramesSource(Source):
                 streams[camera] = _iter_video(path, rate, length)
                 exact = exact and lossless
         rows = RowSpan(self._folder / TABLE, key.rows.start, key.rows.start + key.rows.length)
-        actions = rows.vectors("action") if key.rows.actions else None
+        actions = rows.vectors("action") if "action" in rows.names else None
         return Recording(
             goals=(key.rows.goal,),
             seed=key.rows.seed,

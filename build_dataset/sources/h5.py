@@ -135,11 +135,7 @@ class H5Source(Source):
 
 @contextmanager
 def _complete(where: object) -> Iterator[None]:
-    """Turn what h5py raises about something missing or damaged into one clear error.
-
-    Raises:
-        SourceError: The recording is not complete.
-    """
+    """Turn what h5py raises about something missing or damaged into one clear error."""
     try:
         yield
     except InterferenceError:

@@ -225,16 +225,7 @@ class LeRobotSource(Source):
 
 
 def _lesson(rows: RowSpan, columns: dict[str, str], said: int | None) -> int | None:
-    """Return the number of demonstration frames of an episode; None if nothing marks them.
-
-    Args:
-        rows: Its rows.
-        columns: Which columns may mark it.
-        said: What the per-episode metadata says, or None.
-
-    Raises:
-        SourceError: A column is not as it should be, or two do not agree.
-    """
+    """Return the number of demonstration frames, as columns and `said` agree; None if untold."""
     found = {} if said is None else {"meta/": said}
     if "is_demo" in columns:
         name = columns["is_demo"]

@@ -95,6 +95,8 @@ def test_a_build_goes_on_from_what_was_staged(tmp_path: Path) -> None:
     source.wrong["B/train/0"] = {}
     assert build(out, source).added == 4
     assert not work_folder(out).exists()
+    build(tmp_path / "at once", MadeUpSource(TRAIN))
+    assert contents(out) == contents(tmp_path / "at once")
 
 
 def test_several_failures_are_listed(tmp_path: Path) -> None:
