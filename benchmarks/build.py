@@ -11,16 +11,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 from timing import Times, interleave, machine, positive, table
 
-from robomme_interference_data.build_dataset.build import BuildPlan, build_dataset
-from robomme_interference_data.build_dataset.config import list_episodes
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.cut import cut_demonstration
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot, require_lerobot
@@ -44,14 +43,12 @@ FAMILIES = ("VideoUnmask", "VideoUnmaskSwap", "PatternLock")
 AIM = "≥ 0.8"
 
 
-@dataclass
-class Held:
+class Held(Source):
     """A source whose frames are in memory, so that reading costs nothing."""
 
-    recordings: dict[str, tuple[Recording, list[Frame]]]
-    provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "held"})
-    time_limit = 300.0
-    whole = True
+    def __init__(self, recordings: dict[str, tuple[Recording, list[Frame]]]):
+        self.recordings = recordings
+        self.provenance = {"kind": "held"}
 
     def episodes(self) -> list[SourceEpisode]:
         """List nothing: the episodes are given."""
@@ -65,9 +62,6 @@ class Held:
     def frames(self, episode: SourceEpisode) -> list[Frame]:
         """Return the frames of an episode."""
         return self.recordings[str(episode.id)][1]
-
-    def close(self) -> None:
-        """Nothing is held from one episode to the next."""
 
 
 def _each(frames: list[Frame]) -> Generator[Frame]:
@@ -130,15 +124,17 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
         made.mkdir()
         return made
 
+    def plan(source: Source) -> BuildPlan:
+        tasks = tuple((0, episode) for episode in episodes)
+        return BuildPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
+
     def stage(source: Source) -> None:
-        task = StageTask(DEMONSTRATIONS, (source,), cameras, codec, place())
+        task = StageTask(plan(source), place())
         for episode in episodes:
             task((0, episode), Worker(0))
 
     def build(executor: Executor) -> None:
-        tasks = tuple((0, episode) for episode in episodes)
-        plan = BuildPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
-        build_dataset(plan, place() / "out", executor, WorkProgress(quiet=True))
+        build_dataset(plan(source), place() / "out", executor, WorkProgress(quiet=True))
 
     times = interleave(
         {

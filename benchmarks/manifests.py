@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from timing import in_fresh_process, machine, megabytes, peak_memory, positive, table
 
-from robomme_interference_data.build_dataset.identity import counts_of, revision_of
+from robomme_interference_data.build_dataset.identity import identity_of
 from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     planned_buffers,
@@ -30,7 +30,6 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     EPISODES_DIR,
     FAMILIES,
-    FORMAT_VERSION,
     FPS,
     FRONT,
     IDENTITY_PATH,
@@ -39,13 +38,12 @@ from robomme_interference_data.constants import (
     MANIFESTS,
     STATE,
     UNIT_FRAMES,
-    UNIT_STRIDE,
     WRIST,
 )
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import BufferManifest, DatasetIdentity, EpisodeRecord
+from robomme_interference_data.records import BufferManifest, EpisodeRecord
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 SHAPES = {FRONT: (256, 256, 3), WRIST: (256, 256, 3), STATE: (8,)}
@@ -136,21 +134,7 @@ def write_dataset(root: Path, kind: str, count: int) -> None:
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
     }
     write_json(root / INFO_PATH, info)
-    units = kind == DISTRACTORS
-    identity = DatasetIdentity(
-        format_version=FORMAT_VERSION,
-        kind=kind,
-        version="1.0.0",
-        revision=revision_of(records),
-        exact=True,
-        codec="av1-lossless",
-        cameras=("front", "wrist"),
-        unit={"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if units else None,
-        simulators=("made-up",),
-        sources=(),
-        counts=counts_of(records),
-        sums="0" * 64,
-    )
+    identity = identity_of(records, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
     path = root / EPISODES_DIR / "chunk-000" / "file-000.parquet"
     path.parent.mkdir(parents=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Column, Table
 
@@ -97,26 +97,21 @@ def audit_split(split: Split) -> Audit:
     audit = Audit({name: dict.fromkeys(pool, 0) for name in split.conditions})
     audit.leaks += _pool_leaks(units, queries)
     for manifest in split.manifests():
-        audit.leaks += _buffer_leaks(manifest)
-        distractors = [one for one in manifest.sessions if one.role == "distractor"]
         uses = audit.uses[manifest.condition]
         places = audit.places.setdefault(manifest.condition, {})
-        for place, session in enumerate(distractors, 1):
+        drawn: Counter[EpisodeId] = Counter()
+        for session in (one for one in manifest.sessions if one.role == "distractor"):
+            where = f"{manifest}: {session.source}"
+            if manifest.episode_id.family in (session.family, session.source.family):
+                audit.leaks.append(Leak("same family", where))
+            if session.source.split != "train":
+                audit.leaks.append(Leak("not a train episode", where))
+            if session.source in drawn:
+                audit.leaks.append(Leak("repeated unit", where))
             uses[session.source] = uses.get(session.source, 0) + 1
-            places.setdefault(place, Counter())[session.family] += 1
+            drawn[session.source] += 1
+            places.setdefault(drawn.total(), Counter())[session.family] += 1
     return audit
-
-
-def _buffer_leaks(manifest: BufferManifest) -> Iterator[Leak]:
-    distractors = [session for session in manifest.sessions if session.role == "distractor"]
-    for session in distractors:
-        if manifest.episode_id.family in (session.family, session.source.family):
-            yield Leak("same family", f"{manifest}: {session.source}")
-        if session.source.split != "train":
-            yield Leak("not a train episode", f"{manifest}: {session.source}")
-    for source, count in Counter(session.source for session in distractors).items():
-        if count > 1:
-            yield Leak("repeated unit", f"{manifest}: {source}, {count} times")
 
 
 def _pool_leaks(units: Sequence[EpisodeRecord], queries: Sequence[EpisodeRecord]) -> Iterator[Leak]:

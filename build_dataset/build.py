@@ -8,26 +8,22 @@ encoded again.
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from robomme_interference_data.build_dataset.identity import complete_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan
+from robomme_interference_data.build_dataset.earlier import Earlier, read_earlier
+from robomme_interference_data.build_dataset.identity import complete_dataset, identity_of
 from robomme_interference_data.build_dataset.lerobot_writer import (
+    StoredEpisode,
     load_lerobot,
     require_lerobot,
     write_lerobot,
 )
-from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
+from robomme_interference_data.build_dataset.sources import SourceEpisode
 from robomme_interference_data.build_dataset.stage import StagedEpisode, StageTask, read_staged
-from robomme_interference_data.build_dataset.stored import (
-    Earlier,
-    EarlierEpisode,
-    NewEpisode,
-    read_earlier,
-)
 from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH
 from robomme_interference_data.encode import get_codec
@@ -40,35 +36,12 @@ from robomme_interference_data.errors import (
     first_line,
 )
 from robomme_interference_data.execution import Executor, Outcome
-from robomme_interference_data.files import hold
+from robomme_interference_data.files import canonical_json, working
+from robomme_interference_data.records import EpisodeRecord
 
-__all__ = ["BuildPlan", "BuildResult", "build_dataset", "work_folder"]
+__all__ = ["BuildResult", "build_dataset"]
 
-Stored = NewEpisode | EarlierEpisode
 _ADVICE = "Choose another --out, or remove the folder first."
-
-
-@dataclass(frozen=True)
-class BuildPlan:
-    """What to build, and how.
-
-    Attributes:
-        kind: `demonstrations` or `distractors`.
-        sources: Where to read.
-        tasks: The episodes to store: number of the source, and episode.
-        cameras: Cameras to store; None for all.
-        codec: Name of the video settings.
-        version: Version of the dataset.
-        time_limit: Seconds that one episode may take; None for the sources' own.
-    """
-
-    kind: str
-    sources: tuple[Source, ...]
-    tasks: tuple[tuple[int, SourceEpisode], ...]
-    cameras: tuple[str, ...] | None = None
-    codec: str = "av1-lossless"
-    version: str = "1.0.0"
-    time_limit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -111,32 +84,30 @@ def build_dataset(
     require_lerobot()
     get_codec(plan.codec)
     out = out.resolve()  # a folder cannot be given the name of a link, or "."
-    with _working(out) as work:
+    with working(out) as work:
         earlier = _earlier(out, plan)
         known = earlier.ids() if earlier else set()
-        stored: list[Stored] = list(earlier.episodes) if earlier else []
+        stored: list[StoredEpisode] = list(earlier.episodes) if earlier else []
         skipped = dict(earlier.skipped) if earlier else {}
         todo = [task for task in plan.tasks if task[1].id not in known]
+        before = len(stored)
         if todo or not earlier:
-            staged, more = _stage(work, plan, todo, executor, progress)
-            stored += staged
-            skipped |= more
+            for one in _stage(work, plan, todo, stored[:1], executor, progress):
+                if one.staged.skipped is None:
+                    stored.append(one)
+                else:
+                    skipped[str(one.staged.episode_id)] = one.staged.skipped
             _write(work, out, plan, earlier, stored, skipped, progress)
         shutil.rmtree(work, ignore_errors=True)
-    frames = sum(episode.length for episode in stored)
-    added = sum(isinstance(episode, NewEpisode) for episode in stored)
-    return BuildResult(out, len(stored), frames, added, skipped)
+    frames = sum(one.record.length for one in stored)
+    return BuildResult(out, len(stored), frames, len(stored) - before, skipped)
 
 
 # --- what is there already ---------------------------------------------------------------------
 
 
 def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
-    """Return the dataset that is there; None if nothing is.
-
-    Raises:
-        BuildError: Something else is there, or it was built otherwise.
-    """
+    """Return the dataset that is there, built in the same way; None if nothing is."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / IDENTITY_PATH).is_file():
@@ -163,30 +134,6 @@ def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
     return earlier
 
 
-def work_folder(out: Path) -> Path:
-    """Return the hidden folder beside `out` in which `out` is made."""
-    return out.parent / f".{out.name}.building"
-
-
-@contextmanager
-def _working(out: Path) -> Iterator[Path]:
-    """Make the work folder of `out` and hold it; put back what a killed build had moved there.
-
-    It goes unless episodes are staged in it.
-    """
-    work = work_folder(out)
-    work.mkdir(parents=True, exist_ok=True)
-    busy = BuildError(f"another build of {out} is running", "Wait for it to end, or stop it.")
-    with hold(work / "lock", busy):
-        if (work / "before").exists() and not out.exists():
-            (work / "before").rename(out)
-        try:
-            yield work
-        finally:
-            if not any(work.glob("*/[!.]*")):
-                shutil.rmtree(work, ignore_errors=True)
-
-
 # --- stage and write ---------------------------------------------------------------------------
 
 
@@ -194,20 +141,23 @@ def _stage(
     work: Path,
     plan: BuildPlan,
     todo: Sequence[tuple[int, SourceEpisode]],
+    known: Sequence[StoredEpisode],
     executor: Executor,
     progress: WorkProgress,
-) -> tuple[list[NewEpisode], dict[str, str]]:
-    """Stage episodes; return those that yield something, and why the others do not.
-
-    Raises:
-        BuildError, SourceError: Episodes failed, or do not fit together; the others are kept.
-    """
-    task = StageTask(
-        plan.kind, plan.sources, plan.cameras, get_codec(plan.codec), work / "episodes"
-    )
-    limits = [source.time_limit for source in plan.sources]
-    limit = plan.time_limit or max(limits)
+) -> list[StagedEpisode]:
+    """Stage episodes, which must fit those that are known; what succeeds is kept."""
+    task = StageTask(plan, work / "episodes")
+    limit = plan.time_limit or max(source.time_limit for source in plan.sources)
     staged: list[StagedEpisode] = []
+    alike = list(known)
+
+    def take(one: StagedEpisode, *, before: bool) -> None:
+        staged.append(one)
+        progress.advance(1, before=before)
+        if one.staged.skipped is None:
+            alike.append(one)
+            _check_alike(alike[0], one)
+
     missing = []
     progress.start("Reading and encoding", len(todo))
     for one in todo:
@@ -215,44 +165,33 @@ def _stage(
         if done is None:
             missing.append(one)
         else:
-            staged.append(done)
-            progress.advance(1, before=True)
+            take(done, before=True)
     failures: list[Outcome] = []
-    first = next((one for one in staged if one.staged.skipped is None), None)
     # Closed before anybody looks at what is staged: an error would keep the workers running.
     with closing(executor.run(task, missing, time_limit=limit)) as outcomes:
         for outcome in outcomes:
-            if outcome.error is not None:
-                failures.append(outcome)
-                if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
-                    break  # the others will say the same
+            if outcome.error is None:
+                take(outcome.value, before=False)
                 continue
-            staged.append(outcome.value)
-            progress.advance(1)
-            if outcome.value.staged.skipped is None:
-                first = first or outcome.value
-                _check_alike(first, outcome.value)
+            failures.append(outcome)
+            if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
+                break  # the others will say the same
     if failures:
         raise _failure(failures, len(todo))
-    skipped = {str(one.staged.episode_id): one.staged.skipped for one in staged}
-    kept = [NewEpisode(one) for one in staged if one.staged.skipped is None]
-    return kept, {name: why for name, why in skipped.items() if why is not None}
+    return staged
 
 
-def _check_alike(first: StagedEpisode, other: StagedEpisode) -> None:
+def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:
     """Check that two episodes can be in one dataset; one may lack actions."""
-    shown = [
-        {name: shape for name, shape in one.staged.features.items() if name != ACTION}
-        for one in (first, other)
-    ]
-    actions = {
-        one.staged.features[ACTION] for one in (first, other) if ACTION in one.staged.features
-    }
-    if shown[0] != shown[1] or len(actions) > 1:
+    both = one.features.keys() & other.features.keys()
+    if (one.features.keys() ^ other.features.keys()) - {ACTION} or any(
+        one.features[name] != other.features[name] for name in both
+    ):
         raise SourceError(
-            f"{first.staged.episode_id} and {other.staged.episode_id} cannot be in one dataset: "
-            f"their features are {first.staged.features} and {other.staged.features}",
-            "Choose cameras that all have with --cameras, or build the sources apart.",
+            f"{one.record.episode_id} and {other.record.episode_id} cannot be in one dataset: "
+            f"their features are {one.features} and {other.features}",
+            "Choose cameras that all have with --cameras, build the sources apart, or choose "
+            "another --out.",
         )
 
 
@@ -278,7 +217,7 @@ def _write(
     out: Path,
     plan: BuildPlan,
     earlier: Earlier | None,
-    stored: Sequence[Stored],
+    stored: Sequence[StoredEpisode],
     skipped: dict[str, str],
     progress: WorkProgress,
 ) -> None:
@@ -289,14 +228,10 @@ def _write(
             f"no episode yields {plan.kind}: {len(skipped)} unusable ({reasons})",
             "Check --families, --split and --episodes against the sources.",
         )
-    ordered = sorted(stored, key=lambda one: one.episode_id.sort_key)
-    shapes = [one.features for one in ordered]
+    ordered = sorted(stored, key=lambda one: one.record.episode_id)
     # Actions are kept only where all episodes have them: buffers do not show them.
-    kept = all(ACTION in one for one in shapes)
-    alike = [{n: s for n, s in one.items() if kept or n != ACTION} for one in shapes]
-    features = alike[0]
-    if any(one != features for one in alike):
-        raise BuildError(f"{out} has episodes of other sizes than those to be added", _ADVICE)
+    acted = all(ACTION in one.features for one in ordered)
+    features = {n: s for n, s in ordered[0].features.items() if acted or n != ACTION}
     with progress.status("Loading lerobot"):
         load_lerobot()
     made = work / "dataset"
@@ -304,14 +239,30 @@ def _write(
     progress.start("Writing the LeRobot dataset", len(ordered))
     for _ in write_lerobot(made, plan.kind, ordered, features, get_codec(plan.codec)):
         progress.advance(1)
-    records = [one.record(index, tuple(features)) for index, one in enumerate(ordered)]
-    told: list[dict[str, Any]] = list(earlier.dataset.identity.sources) if earlier else []
-    for source in plan.sources:
-        if source.provenance not in told:
-            told.append(source.provenance)
+    records = [_placed(one.record, index, features) for index, one in enumerate(ordered)]
+    told = {canonical_json(source.provenance): source.provenance for source in plan.sources}
+    if earlier:
+        told |= {canonical_json(one): one for one in earlier.dataset.identity.sources}
+    sources = [one for _, one in sorted(told.items())]
+    identity = identity_of(records, plan.kind, plan.version, plan.codec, sources)
     with progress.status("Hashing"):
-        complete_dataset(made, plan.kind, plan.version, records, plan.codec, told, skipped)
+        complete_dataset(made, records, identity, skipped)
         os.sync()
     if out.exists():
         out.rename(work / "before")  # put back by the next build, should this one end here
     made.rename(out)
+
+
+def _placed(record: EpisodeRecord, index: int, features: Collection[str]) -> EpisodeRecord:
+    """Return a record at its place in a dataset with these features."""
+
+    def only(digests: dict[str, str]) -> dict[str, str]:
+        return {name: digest for name, digest in digests.items() if name in features}
+
+    lesson = record.lesson_sha256
+    return replace(
+        record,
+        episode_index=index,
+        feature_sha256=only(record.feature_sha256),
+        lesson_sha256=lesson and only(lesson),
+    )

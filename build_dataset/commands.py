@@ -1,11 +1,18 @@
 """Commands that make splits and check them: `build …`, `verify`, `audit`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from robomme_interference_data.build_dataset.config import BuildConfig, PlanConfig
+from robomme_interference_data.build_dataset.config import (
+    BuildConfig,
+    BuildPlan,
+    PlanConfig,
+    plan_all,
+    plan_build,
+    position_limit,
+)
 from robomme_interference_data.console import (
     MESSAGES,
     AsJson,
@@ -20,9 +27,6 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
 )
 from robomme_interference_data.settings import with_settings
-
-if TYPE_CHECKING:
-    from robomme_interference_data.build_dataset.build import BuildPlan, BuildResult
 
 __all__ = ["app", "audit", "verify"]
 
@@ -68,7 +72,7 @@ def demonstrations(config: BuildConfig, as_json: AsJson = False) -> None:
         --cameras front --out S/demonstrations
     ```
     """
-    _build_one(DEMONSTRATIONS, config, as_json=as_json)
+    _build(plan_build(DEMONSTRATIONS, config), config.out, config.workers, as_json=as_json)
 
 
 @app.command()
@@ -85,7 +89,7 @@ def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
         --cameras front --out S/distractors
     ```
     """
-    _build_one(DISTRACTORS, config, as_json=as_json)
+    _build(plan_build(DISTRACTORS, config), config.out, config.workers, as_json=as_json)
 
 
 @app.command()
@@ -117,23 +121,13 @@ def build_all(config: BuildConfig, plan: PlanConfig, as_json: AsJson = False) ->
     robomme-interference build all --source robomme-h5:recordings/ --out my-split
     ```
     """
-    from robomme_interference_data.build_dataset.config import plan_all
-
     for kind, step in plan_all(config, plan).items():
-        _build(step, config.out / kind, config.workers)
+        _build(step, config.out / kind, config.workers, as_json=False)
     _plan(config.out, plan, as_json=as_json)
     MESSAGES.print(f"Next: robomme-interference verify {config.out}")
 
 
-def _build_one(kind: str, config: BuildConfig, *, as_json: bool) -> None:
-    from robomme_interference_data.build_dataset.config import plan_build
-
-    result = _build(plan_build(kind, config), config.out, config.workers)
-    if as_json:
-        print_json({**vars(result), "out": str(result.out)})
-
-
-def _build(plan: "BuildPlan", out: Path, workers: int) -> "BuildResult":
+def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
     from robomme_interference_data.build_dataset.build import build_dataset
     from robomme_interference_data.execution import Processes
 
@@ -141,16 +135,15 @@ def _build(plan: "BuildPlan", out: Path, workers: int) -> "BuildResult":
         result = build_dataset(plan, out, Processes(workers), progress)
     done = f"{result.added} added" if result.added else "was built before"
     MESSAGES.print(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
-    for number, (name, why) in enumerate(sorted(result.skipped.items())):
-        if number == _TOLD:
-            MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
-            break
+    for name, why in sorted(result.skipped.items())[:_TOLD]:
         MESSAGES.print(f"  left out {name}: {why}")
-    return result
+    if len(result.skipped) > _TOLD:
+        MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
+    if as_json:
+        print_json({**vars(result), "out": str(result.out)})
 
 
 def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
-    from robomme_interference_data.build_dataset.config import position_limit
     from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
     from robomme_interference_data.split import load_split
 
@@ -183,12 +176,12 @@ def verify(
     robomme-interference verify my-split
     ```
     """
-    from robomme_interference_data.build_dataset.verify import frames_of, verify_split
+    from robomme_interference_data.build_dataset.verify import verify_split
 
-    frames = frames_of(split)
-    with WorkProgress() as progress:
-        progress.start("Verifying", frames if decode else 0)
-        violations = list(verify_split(split, decode=decode, advance=progress.advance))
+    progress = WorkProgress()
+    checks = verify_split(split, decode=decode, progress=progress)
+    with progress:
+        violations = list(checks)
     if as_json:
         print_json([vars(violation) for violation in violations])
     else:

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -20,11 +20,11 @@ from robomme_interference_data.ids import parse_numbers
 from robomme_interference_data.settings import setting
 
 if TYPE_CHECKING:
-    from robomme_interference_data.build_dataset.build import BuildPlan
     from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
 
 __all__ = [
     "BuildConfig",
+    "BuildPlan",
     "PlanConfig",
     "list_episodes",
     "plan_all",
@@ -84,44 +84,57 @@ class PlanConfig:
     )
 
 
-def plan_build(kind: str, config: BuildConfig) -> "BuildPlan":
-    """Open the sources and plan one dataset.
+@dataclass(frozen=True)
+class BuildPlan:
+    """A `BuildConfig` whose sources are open; or made without one.
 
-    Raises:
-        InvalidOptionError: A setting is not what it may be, or does not fit the sources.
-        SourceError, MissingExtraError, HubError: A source cannot be used.
+    Attributes:
+        kind: `demonstrations` or `distractors`.
+        sources: Where to read.
+        tasks: The episodes to store: number of the source, and episode.
+        cameras: Cameras to store; None for all.
+        codec: Name of the video settings.
+        version: Version of the dataset.
+        time_limit: Seconds that one episode may take; None for the sources' own.
     """
-    return _plan(kind, config, config.split or ("train" if kind == DISTRACTORS else None))
+
+    kind: str
+    sources: "tuple[Source, ...]"
+    tasks: "tuple[tuple[int, SourceEpisode], ...]"
+    cameras: tuple[str, ...] | None = None
+    codec: str = "av1-lossless"
+    version: str = "1.0.0"
+    time_limit: float | None = None
 
 
-def plan_all(config: BuildConfig, plan: PlanConfig) -> "dict[str, BuildPlan]":
+def plan_all(config: BuildConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
     """Plan both datasets of a split, and check all that can be known before anything is read.
 
     Raises:
         PoolTooSmallError: Even if every train episode yielded a unit, there were too few.
         InvalidIdError, InvalidOptionError, SourceError: As `plan_build` and `in_order`.
     """
-    conditions = in_order(plan.conditions)
-    position_limit(plan)
-    plans = {DEMONSTRATIONS: plan_build(DEMONSTRATIONS, config)}
-    units = dataclasses.replace(config, families=(), episodes=None)
-    plans[DISTRACTORS] = _plan(DISTRACTORS, units, "train")
-    _check_pool(plans, conditions)
-    return plans
-
-
-def _check_pool(plans: "dict[str, BuildPlan]", conditions: Sequence[Condition]) -> None:
     from robomme_interference_data.draw import UnitPool
 
-    pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
-    most = max(condition.k for condition in conditions)
-    for query in {e.id.family: e.id for _, e in plans[DEMONSTRATIONS].tasks}.values():
-        pool.draw(query, most)
+    conditions = in_order(plan.conditions)
+    position_limit(plan)
+    queries = plan_build(DEMONSTRATIONS, config)
+    every = dataclasses.replace(config, families=(), episodes=None, split="train")
+    units = plan_build(DISTRACTORS, every)
+    pool = UnitPool(episode.id for _, episode in units.tasks)
+    for query in {episode.id.family: episode.id for _, episode in queries.tasks}.values():
+        pool.draw(query, max(condition.k for condition in conditions))
+    return {DEMONSTRATIONS: queries, DISTRACTORS: units}
 
 
-def _plan(kind: str, config: BuildConfig, split: str | None) -> "BuildPlan":
-    from robomme_interference_data.build_dataset.build import BuildPlan
-    from robomme_interference_data.build_dataset.sources import OpenOptions, open_source
+def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
+    """Open the sources and plan one dataset.
+
+    Raises:
+        InvalidOptionError: A setting is not what it may be, or does not fit the sources.
+        SourceError, MissingExtraError, HubError: A source cannot be used.
+    """
+    from robomme_interference_data.build_dataset.sources import open_source
     from robomme_interference_data.encode import get_codec
     from robomme_interference_data.execution import Processes
 
@@ -133,12 +146,15 @@ def _plan(kind: str, config: BuildConfig, split: str | None) -> "BuildPlan":
         raise InvalidOptionError.expected(
             "--columns", config.columns, "NAME=COLUMN, such as front=image"
         )
-    options = OpenOptions(
-        columns={name: column for name, _, column in pairs} or None,
-        families_file=config.families_file,
-        robomme_python=config.robomme_python,
+    sources = tuple(
+        open_source(
+            text,
+            columns={name: column for name, _, column in pairs},
+            families_file=config.families_file,
+            robomme_python=config.robomme_python,
+        )
+        for text in config.source
     )
-    sources = tuple(open_source(text, options) for text in config.source)
     for text, source in zip(config.source, sources, strict=True):
         if kind == DISTRACTORS and not source.whole:
             raise InvalidOptionError(
@@ -146,6 +162,7 @@ def _plan(kind: str, config: BuildConfig, split: str | None) -> "BuildPlan":
                 "Build the two datasets apart, the distractors from RoboMME's own training "
                 "recordings: robomme-interference build distractors --source robomme-h5:FOLDER",
             )
+    split = config.split or ("train" if kind == DISTRACTORS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
     return BuildPlan(
         kind=kind,

@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,24 +42,10 @@ from robomme_interference_data.files import (
 from robomme_interference_data.records import Counts, DatasetIdentity, EpisodeRecord
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
-__all__ = ["complete_dataset", "counts_of", "listed_files", "revision_of"]
+__all__ = ["complete_dataset", "identity_of", "listed_files"]
 
 _LEROBOTS = ("episode_index", "length")
 """Fields of a record that LeRobot writes."""
-
-
-def revision_of(records: Iterable[EpisodeRecord]) -> str:
-    """Return the identity of a dataset's content: SHA-256 over all records, a line of JSON each."""
-    digest = hashlib.sha256()
-    for record in records:
-        digest.update(canonical_json(to_dict(record)).encode() + b"\n")
-    return digest.hexdigest()
-
-
-def counts_of(records: Sequence[EpisodeRecord]) -> Counts:
-    """Return how much records amount to."""
-    families = Counter(record.episode_id.family for record in records)
-    return Counts(len(records), sum(record.length for record in records), dict(families))
 
 
 def listed_files(files: Files) -> list[str]:
@@ -72,52 +59,62 @@ def listed_files(files: Files) -> list[str]:
     return [path for folder in folders for path in files.list(folder) if path not in known]
 
 
-def complete_dataset(
-    root: Path,
+def identity_of(
+    records: Sequence[EpisodeRecord],
     kind: str,
     version: str,
-    records: Sequence[EpisodeRecord],
     codec: str,
-    sources: Sequence[dict[str, Any]],
+    sources: Iterable[dict[str, Any]],
+    sums: str = "",
+) -> DatasetIdentity:
+    """Return the identity of a dataset with these episodes; see `DatasetIdentity`."""
+    revision = hashlib.sha256()
+    for record in records:
+        revision.update(canonical_json(to_dict(record)).encode() + b"\n")
+    families = Counter(record.episode_id.family for record in records)
+    features = {name for record in records for name in record.feature_sha256}
+    cameras = sorted(name for name in features if name.startswith(CAMERA_PREFIX))
+    return DatasetIdentity(
+        format_version=FORMAT_VERSION,
+        kind=kind,
+        version=version,
+        revision=revision.hexdigest(),
+        exact=all(record.exact for record in records),
+        codec=codec,
+        cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
+        unit={"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if kind == DISTRACTORS else None,
+        simulators=tuple(sorted({one.simulator for one in records if one.simulator})),
+        sources=tuple(sources),
+        counts=Counts(len(records), sum(one.length for one in records), dict(families)),
+        sums=sums,
+    )
+
+
+def complete_dataset(
+    root: Path,
+    records: Sequence[EpisodeRecord],
+    identity: DatasetIdentity,
     skipped: dict[str, str],
 ) -> None:
     """Complete a dataset that LeRobot's writer has finished.
 
     Args:
         root: The dataset.
-        kind: `demonstrations` or `distractors`.
-        version: Its version.
         records: Its episodes.
-        codec: Name of the video settings.
-        sources: What the sources say of themselves.
+        identity: Its identity; `sums` follows from the files.
         skipped: Ids of episodes that yielded nothing, and why.
     """
     _add_columns(root, records)
     _sort_statistics(root / STATS_PATH)
-    counts = counts_of(records)
     report = {
         "format_version": FORMAT_VERSION,
-        "kind": kind,
-        "counts": {**to_dict(counts), "skipped": len(skipped)},
+        "kind": identity.kind,
+        "counts": {**to_dict(identity.counts), "skipped": len(skipped)},
         "skipped": [{"episode_id": name, "why": why} for name, why in sorted(skipped.items())],
     }
     write_json(root / REPORT_PATH, report)
     write_text(root / SUMS_PATH, format_sums(root, listed_files(LocalFiles(root))))
-    names = sorted(n for n in records[0].feature_sha256 if n.startswith(CAMERA_PREFIX))
-    identity = DatasetIdentity(
-        format_version=FORMAT_VERSION,
-        kind=kind,
-        version=version,
-        revision=revision_of(records),
-        exact=all(record.exact for record in records),
-        codec=codec,
-        cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in names),
-        unit={"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if kind == DISTRACTORS else None,
-        simulators=tuple(sorted({one.simulator for one in records if one.simulator})),
-        sources=tuple(sorted(sources, key=canonical_json)),
-        counts=counts,
-        sums=sha256_file(root / SUMS_PATH),
-    )
+    identity = replace(identity, sums=sha256_file(root / SUMS_PATH))
     write_json(root / IDENTITY_PATH, to_dict(identity))
 
 

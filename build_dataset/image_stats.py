@@ -1,9 +1,15 @@
 """Statistics of images, as LeRobot stores them."""
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ImageStats"]
+__all__ = ["STATISTICS", "ImageStats", "before_scaling"]
+
+STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
+"""Names of the statistics in LeRobot's order, which is that of its columns."""
 
 
 class ImageStats:
@@ -43,3 +49,15 @@ class ImageStats:
             reached = cumulated >= quantile * total[:, None]
             stats[f"q{round(quantile * 100):02d}"] = np.argmax(reached, axis=1).astype(np.float64)
         return stats
+
+
+def before_scaling(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Return what LeRobot divided by 255 when it stored a statistic of images, bit for bit."""
+    if name.endswith("/count"):
+        return values
+    found = []
+    for value in values.astype(np.float64):
+        near = value * 255
+        steps = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
+        found.append(next((one for one in steps if one / 255 == value), near))
+    return np.array(found)

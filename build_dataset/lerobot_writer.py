@@ -19,9 +19,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, FPS, STATE
+from robomme_interference_data.constants import ACTION, FPS
 from robomme_interference_data.encode import Codec
 from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.records import EpisodeRecord
 
 __all__ = ["StoredEpisode", "load_lerobot", "require_lerobot", "write_lerobot"]
 
@@ -33,14 +34,19 @@ _PANDA = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6", "joi
 
 
 class StoredEpisode(Protocol):
-    """What the writer needs of an episode that is encoded and checked."""
+    """An episode that is encoded and checked, wherever it lies."""
 
     @property
-    def task(self) -> str:
-        """The task's text."""
+    def record(self) -> EpisodeRecord:
+        """What the dataset says of it; the writer gives it its number."""
         ...
 
-    def video(self, camera: str) -> Path:
+    @property
+    def features(self) -> dict[str, tuple[int, ...]]:
+        """Shape of one value by feature: cameras `(H, W, 3)`, vectors `(D,)`."""
+        ...
+
+    def video(self, feature: str) -> Path:
         """Return the video file of a camera."""
         ...
 
@@ -109,30 +115,24 @@ def write_lerobot(
         for episode in episodes:
             videos.next = episode
             vectors = {n: episode.vectors(n) for n, s in features.items() if len(s) == 1}
-            for position in range(len(vectors[STATE])):
+            for position in range(episode.record.length):
                 values = {name: array[position] for name, array in vectors.items()}
-                dataset.add_frame({**blank, **values, "task": episode.task})
+                dataset.add_frame({**blank, **values, "task": episode.record.goal})
             dataset.save_episode()
-            yield len(vectors[STATE])
+            yield episode.record.length
         dataset.finalize()
 
 
 def _declared(features: dict[str, tuple[int, ...]]) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table: cameras first, then state and action."""
-    cameras = sorted(name for name in features if name.startswith(CAMERA_PREFIX))
-    declared: dict[str, dict[str, Any]] = {
-        name: {
-            "dtype": "video",
-            "shape": features[name],
-            "names": ["height", "width", "channels"],
-        }
-        for name in cameras
-    }
-    for name in (STATE, ACTION):
-        if name in features:
-            (size,) = features[name]
-            names = list(_PANDA) if size == len(_PANDA) else [f"value_{i}" for i in range(size)]
-            declared[name] = {"dtype": "float32", "shape": (size,), "names": names}
+    declared: dict[str, dict[str, Any]] = {}
+    for name in sorted(features, key=lambda one: (len(features[one]) == 1, one == ACTION, one)):
+        shape = features[name]
+        kind, names = "video", ["height", "width", "channels"]
+        if len(shape) == 1:
+            kind, names = "float32", [f"value_{number}" for number in range(*shape)]
+            names = list(_PANDA) if len(names) == len(_PANDA) else names
+        declared[name] = {"dtype": kind, "shape": shape, "names": names}
     return declared
 
 
@@ -158,7 +158,7 @@ class _ReadyVideos:
         for feature in self._features:
             # LeRobot moves the file away and removes the folder that it was in.
             copy = Path(tempfile.mkdtemp(dir=self._folder)) / "episode.mp4"
-            shutil.copyfile(self.next.video(feature.removeprefix(CAMERA_PREFIX)), copy)
+            shutil.copyfile(self.next.video(feature), copy)
             videos[feature] = (copy, self.next.stats(feature))
         return videos
 

@@ -5,7 +5,7 @@ Rules 1 to 5 and 8 of the protocol; the draw itself is `draw.py`, what a conditi
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import batched
@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from robomme_interference_data.build_dataset.build import work_folder
 from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.constants import (
     ACTION,
@@ -41,10 +40,11 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import (
     LocalFiles,
     atomic_path,
-    hold,
     sha256_file,
+    working,
     write_json,
 )
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
     BufferManifest,
@@ -80,6 +80,21 @@ class ManifestPlan:
     conditions: tuple[Condition, ...]
     seed: int = 0
     position_limit: int | None = POSITION_LIMIT
+
+    @cached_property
+    def pool(self) -> UnitPool:
+        """The units, to be drawn."""
+        return UnitPool((one.episode_id for one in self.distractors.records()), self.seed)
+
+    @cached_property
+    def units(self) -> dict[EpisodeId, SessionEntry]:
+        """The units as sessions."""
+        return {
+            one.episode_id: _entry(
+                "distractor", self.distractors, one, one.length, combine(one.feature_sha256)
+            )
+            for one in self.distractors.records()
+        }
 
 
 def plan_manifests(
@@ -127,14 +142,14 @@ def plan_manifests(
 class _Material:
     """What the conditions' rules make the history of one query of; see `conditions.Material`."""
 
-    def __init__(self, split: "_Sessions", record: EpisodeRecord):
-        self._split = split
+    def __init__(self, plan: ManifestPlan, record: EpisodeRecord):
+        self._plan = plan
         self._record = record
         self._units: list[SessionEntry] = []
 
     @cached_property
     def _lesson(self) -> SessionEntry:
-        record, dataset = self._record, self._split.plan.demonstrations
+        record, dataset = self._record, self._plan.demonstrations
         if record.exec_start_idx is None or record.lesson_sha256 is None:
             raise FormatError.damaged(dataset.files.describe(), f"{record.episode_id}: no lesson")
         sha = combine(record.lesson_sha256)
@@ -145,30 +160,10 @@ class _Material:
 
     def units(self, k: int) -> Sequence[SessionEntry]:
         if k > len(self._units):  # drawn once for the largest k: smaller ones begin it
-            most = max(k, *(condition.k for condition in self._split.plan.conditions))
-            drawn = self._split.pool.draw(self._record.episode_id, most)
-            self._units = [self._split.units[unit] for unit in drawn]
+            most = max(k, *(condition.k for condition in self._plan.conditions))
+            drawn = self._plan.pool.draw(self._record.episode_id, most)
+            self._units = [self._plan.units[unit] for unit in drawn]
         return self._units[:k]
-
-
-class _Sessions:
-    """The units of a split as sessions, and the pool that they are drawn from."""
-
-    def __init__(self, plan: ManifestPlan):
-        self.plan = plan
-        records = list(plan.distractors.records())
-        self.pool = UnitPool((record.episode_id for record in records), plan.seed)
-        self.units = {
-            record.episode_id: _entry(
-                "distractor",
-                plan.distractors,
-                record,
-                record.length,
-                combine(record.feature_sha256),
-            )
-            for record in records
-        }
-        self.exact = {record.episode_id: record.exact for record in records}
 
 
 def _entry(
@@ -187,9 +182,9 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
         PoolTooSmallError: A query needs more units than the other families have.
         HistoryTooLongError: A buffer exceeds the position limit.
     """
-    sessions = _Sessions(plan)
+    exact = {one.episode_id: one.exact for one in plan.distractors.records()}
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
-        query, material = Query(plan.demonstrations, record), _Material(sessions, record)
+        query, material = Query(plan.demonstrations, record), _Material(plan, record)
         for condition in plan.conditions:
             entries = condition.sessions(material)
             placed = place_sessions(entries)
@@ -203,7 +198,7 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
                 seed=record.seed,
                 difficulty=record.difficulty,
                 simulator=record.simulator,
-                exact=record.exact and all(sessions.exact.get(e.source, True) for e in entries),
+                exact=record.exact and all(exact.get(entry.source, True) for entry in entries),
                 lesson_frames=lesson_frames(placed, 0, frames),
                 history_frames=frames,
                 lesson_share=lesson_share(placed, 0, frames),
@@ -239,32 +234,30 @@ def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
         BuildError: The folder holds something else, or is being written by another process.
     """
     out = root.resolve() / MANIFESTS
-    work = work_folder(out)
-    work.mkdir(parents=True, exist_ok=True)
-    busy = BuildError(f"another process is writing {out}", "Wait for it to end, or stop it.")
-    with hold(work / "lock", busy):
+    rows, header = out / MANIFEST_ROWS, out / MANIFEST_HEADER
+    with working(out) as work:
         try:
-            _check_folder(out)
-            yield from _write(plan, out)
+            out.mkdir(exist_ok=True)
+            strangers = {path.name for path in out.iterdir()} - {rows.name, header.name}
+            if strangers and not header.is_file():
+                raise BuildError(f"{out} exists and holds no manifests, but {min(strangers)}")
+            written = work / rows.name
+            counts = yield from _write_rows(plan, written)
+            write_json(work / header.name, to_dict(_header(plan, counts, sha256_file(written))))
+            # An old header must not vouch for new rows, should this end here.
+            header.unlink(missing_ok=True)
+            written.replace(rows)
+            (work / header.name).replace(header)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
 
-def _check_folder(out: Path) -> None:
-    """Make the folder, and remove what a killed run left half-written in it."""
-    out.mkdir(parents=True, exist_ok=True)
-    for left in out.glob(".*.partial"):
-        left.unlink()
-    strangers = {path.name for path in out.iterdir()} - {MANIFEST_ROWS, MANIFEST_HEADER}
-    if strangers and not (out / MANIFEST_HEADER).is_file():
-        raise BuildError(f"{out} exists and holds no manifests, but {min(strangers)}")
-
-
-def _write(plan: ManifestPlan, out: Path) -> Iterator[int]:
+def _write_rows(plan: ManifestPlan, path: Path) -> Generator[int, None, dict[str, int]]:
+    """Write all rows; yields the number of buffers after each batch, and returns the counts."""
     schema = arrow_schema(BufferManifest)
     buffers = sessions = 0
     with (
-        atomic_path(out / MANIFEST_ROWS) as partial,
+        atomic_path(path) as partial,
         pq.ParquetWriter(partial, schema, compression="zstd") as writer,
     ):
         for batch in batched(planned_buffers(plan), _BATCH):
@@ -272,9 +265,11 @@ def _write(plan: ManifestPlan, out: Path) -> Iterator[int]:
             buffers += len(batch)
             sessions += sum(len(manifest.sessions) for manifest in batch)
             yield len(batch)
-        # An old header must not vouch for new rows, should writing stop here.
-        (out / MANIFEST_HEADER).unlink(missing_ok=True)
-    header = ManifestHeader(
+    return {"queries": len(plan.demonstrations), "buffers": buffers, "sessions": sessions}
+
+
+def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHeader:
+    return ManifestHeader(
         format_version=FORMAT_VERSION,
         rule_version=RULE_VERSION,
         seed=plan.seed,
@@ -289,7 +284,6 @@ def _write(plan: ManifestPlan, out: Path) -> Iterator[int]:
             )
             for dataset in (plan.demonstrations, plan.distractors)
         },
-        counts={"queries": len(plan.demonstrations), "buffers": buffers, "sessions": sessions},
-        rows=sha256_file(out / MANIFEST_ROWS),
+        counts=counts,
+        rows=rows,
     )
-    write_json(out / MANIFEST_HEADER, to_dict(header))

@@ -8,31 +8,33 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
-from robomme_interference_data.build_dataset.image_stats import ImageStats
-from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
+from robomme_interference_data.build_dataset.image_stats import STATISTICS, ImageStats
+from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, DEMONSTRATIONS, FPS, STATE
 from robomme_interference_data.digest import FeatureDigests
-from robomme_interference_data.encode import Codec, VideoEncoder
+from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.files import canonical_json, write_json
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.video import iter_frames
 
 __all__ = ["StageTask", "Staged", "StagedEpisode", "read_staged"]
 
 _RECORD = "record.json"
-_LAYOUT = 2
+_LAYOUT = 3
 """Version of a staged episode's folder."""
 
 Task = tuple[int, SourceEpisode]
@@ -41,44 +43,59 @@ Task = tuple[int, SourceEpisode]
 
 @dataclass(frozen=True)
 class Staged:
-    """What is known of a staged episode; see `EpisodeRecord` for what is not said here.
+    """What is known of a staged episode.
 
     Attributes:
         skipped: Why the episode yields nothing; None if it yields something.
+        record: What a dataset says of it, at whatever place; None if it yields nothing.
         features: Shape of one value by feature.
-        stats: Image statistics by feature.
+        stats: Image statistics by feature, see `ImageStats`.
     """
 
     episode_id: EpisodeId
     skipped: str | None
-    length: int
-    goals: tuple[str, ...]
-    seed: int | None
-    difficulty: str | None
-    simulator: str | None
-    exec_start_idx: int | None
-    exact: bool
+    record: EpisodeRecord | None
     features: dict[str, tuple[int, ...]]
-    feature_sha256: dict[str, str]
-    lesson_sha256: dict[str, str] | None
     stats: dict[str, dict[str, tuple[float, ...]]]
 
 
 @dataclass(frozen=True)
 class StagedEpisode:
-    """A staged episode and the folder that holds its videos and vectors."""
+    """A staged episode, which yields something, and the folder that holds it; see `StoredEpisode`.
+
+    Raises:
+        ValueError: By `record`: the episode yields nothing.
+    """
 
     staged: Staged
     folder: Path
 
-    def video(self, camera: str) -> Path:
-        """Return the video file of a camera."""
-        return self.folder / f"{camera}.mp4"
+    @property
+    def record(self) -> EpisodeRecord:
+        """See `StoredEpisode`."""
+        if self.staged.record is None:
+            raise ValueError(f"{self.staged.episode_id}: {self.staged.skipped}")
+        return self.staged.record
+
+    @property
+    def features(self) -> dict[str, tuple[int, ...]]:
+        """See `StoredEpisode`."""
+        return self.staged.features
+
+    def video(self, feature: str) -> Path:
+        """See `StoredEpisode`."""
+        return self.folder / f"{feature}.mp4"
 
     def vectors(self, feature: str) -> NDArray[np.float32]:
-        """Read states or actions, `(T, D) float32`."""
-        values: NDArray[np.float32] = np.load(self.folder / f"{_file_name(feature)}.npy")
+        """See `StoredEpisode`."""
+        values: NDArray[np.float32] = np.load(self.folder / f"{feature}.npy")
         return values
+
+    def stats(self, feature: str) -> dict[str, NDArray[Any]]:
+        """See `StoredEpisode`."""
+        # In this order whether it was staged just now or read again: columns follow it.
+        found = {name: np.array(self.staged.stats[feature][name]) for name in STATISTICS}
+        return {**found, "count": found["count"].astype(np.int64)}
 
 
 @dataclass(frozen=True)
@@ -86,28 +103,23 @@ class StageTask:
     """Stages one episode after the other, as a task of an executor.
 
     Attributes:
-        kind: `demonstrations` or `distractors`.
-        sources: Where to read.
-        cameras: Cameras to store; None for all.
-        codec: Video settings.
+        plan: What to build.
         folder: Where staged episodes appear.
     """
 
-    kind: str
-    sources: tuple[Source, ...]
-    cameras: tuple[str, ...] | None
-    codec: Codec
+    plan: BuildPlan
     folder: Path
 
     def place(self, task: Task) -> Path:
         """Return the folder of a staged episode: named by a hash of all that decides it."""
         number, episode = task
+        codec = get_codec(self.plan.codec)
         content = {
-            "kind": self.kind,
-            "source": self.sources[number].provenance,
+            "kind": self.plan.kind,
+            "source": self.plan.sources[number].provenance,
             "episode": [str(episode.id), repr(episode.key)],
-            "cameras": self.cameras,
-            "codec": [self.codec.vcodec, self.codec.pix_fmt, dict(self.codec.options)],
+            "cameras": self.plan.cameras,
+            "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
             "layout": _LAYOUT,
         }
         return self.folder / hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
@@ -128,7 +140,7 @@ class StageTask:
         place.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(dir=place.parent, prefix=f".{place.name}."))
         try:
-            recording = self.sources[number].read(episode, self.cameras)
+            recording = self.plan.sources[number].read(episode, self.plan.cameras)
             with closing(recording.frames):
                 staged = self._write(episode.id, recording, partial)
             write_json(partial / _RECORD, to_dict(staged))
@@ -144,54 +156,49 @@ class StageTask:
 
     def close(self) -> None:
         """Release what sources hold."""
-        for source in self.sources:
+        for source in self.plan.sources:
             source.close()
 
     def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
-        writer = _Writer(self.codec, folder)
+        codec = get_codec(self.plan.codec)
+        writer = _Writer(codec, folder)
         lesson: dict[str, str] | None = None
-        skipped = None
         try:
-            for frame in CUTS[self.kind](recording.frames):
-                if self.kind == DEMONSTRATIONS and not frame.is_demonstration:
+            for frame in CUTS[self.plan.kind](recording.frames):
+                if self.plan.kind == DEMONSTRATIONS and not frame.is_demonstration:
                     lesson = writer.digests.current()
                 writer.add(frame)
         except NothingToStore as reason:
-            skipped = str(reason)
+            writer.close()
+            return Staged(episode, str(reason), None, {}, {})
         writer.close()
-        start = writer.length - 1 if lesson is not None else None
+        start = None if lesson is None else writer.length - 1
         digests = writer.digests.current()
-        if skipped is None:
-            decoded, decoded_lesson = _decode(writer, start)
-            if self.codec.exact and any(digests[name] != sha for name, sha in decoded.items()):
-                raise BuildError(
-                    f"a video does not decode to the frames that were encoded with "
-                    f"{self.codec.name}",
-                    "Please report this with the versions that robomme-interference doctor prints.",
-                )
-            # Of a lossy codec, what a reader gets is what is hashed.
-            digests |= decoded
-            lesson = None if lesson is None else lesson | decoded_lesson
-        return Staged(
+        decoded, decoded_lesson = writer.decode(start)
+        if codec.exact and any(digests[name] != sha for name, sha in decoded.items()):
+            raise BuildError(
+                f"a video does not decode to the frames that were encoded with {codec.name}",
+                "Please report this with the versions that robomme-interference doctor prints.",
+            )
+        # Of a lossy codec, what a reader gets is what is hashed.
+        record = EpisodeRecord(
+            episode_index=0,
             episode_id=episode,
-            skipped=skipped,
             length=writer.length,
             goals=recording.goals,
             seed=recording.seed,
             difficulty=recording.difficulty,
             simulator=recording.simulator,
             exec_start_idx=start,
-            exact=recording.exact and self.codec.exact,
-            features=writer.features,
-            feature_sha256=digests,
-            lesson_sha256=lesson,
-            stats={
-                CAMERA_PREFIX + camera: {
-                    name: tuple(map(float, values)) for name, values in stats.result().items()
-                }
-                for camera, stats in writer.stats.items()
-            },
+            exact=recording.exact and codec.exact,
+            feature_sha256=digests | decoded,
+            lesson_sha256=None if lesson is None else lesson | decoded_lesson,
         )
+        stats = {
+            feature: {name: tuple(map(float, values)) for name, values in one.result().items()}
+            for feature, one in writer.stats.items()
+        }
+        return Staged(episode, None, record, writer.features, stats)
 
 
 def read_staged(folder: Path) -> StagedEpisode | None:
@@ -201,7 +208,7 @@ def read_staged(folder: Path) -> StagedEpisode | None:
 
 
 class _Writer:
-    """The files of a staged episode while they are written."""
+    """The files of a staged episode while they are written; all maps are by feature."""
 
     def __init__(self, codec: Codec, folder: Path):
         self._codec = codec
@@ -214,25 +221,21 @@ class _Writer:
         self.length = 0
 
     def add(self, frame: Frame) -> None:
-        """Take the next frame.
-
-        Raises:
-            SourceError: It is not as the first one, or holds what is no finite number.
-        """
-        if not self.length:
-            self._begin(frame)
+        """Take the next frame, which must be as the first one and hold finite numbers."""
+        images = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()}
         vectors = {STATE: frame.state} | ({} if frame.action is None else {ACTION: frame.action})
-        found = {CAMERA_PREFIX + camera: image for camera, image in frame.images.items()} | vectors
-        shapes = {name: value.shape for name, value in found.items()}
+        if not self.length:
+            self._begin(images, vectors)
+        shapes = {name: value.shape for name, value in (images | vectors).items()}
         if shapes != self.features:
             raise SourceError(
                 f"stored frame {self.length} has {shapes}; the first one {self.features}",
                 "All frames of an episode must have the same cameras and sizes.",
             )
-        for camera, image in frame.images.items():
-            self._encoders[camera].add(image)
-            self.stats[camera].add(image)
-            self.digests.update(CAMERA_PREFIX + camera, image)
+        for name, image in images.items():
+            self._encoders[name].add(image)
+            self.stats[name].add(image)
+            self.digests.update(name, image)
         for name, value in vectors.items():
             if value.dtype != np.float32 or not np.isfinite(value).all():
                 raise SourceError(
@@ -248,47 +251,30 @@ class _Writer:
         for encoder in self._encoders.values():
             encoder.close()
         for name, values in self._vectors.items():
-            np.save(self._folder / f"{_file_name(name)}.npy", np.stack(values))
+            np.save(self._folder / f"{name}.npy", np.stack(values))
 
-    def decoded(self) -> Iterator[tuple[str, Iterator[NDArray[np.uint8]]]]:
-        """Yield each camera's feature name, and its frames as they were written."""
-        for camera in self._encoders:
-            yield CAMERA_PREFIX + camera, iter_frames(self._folder / f"{camera}.mp4", 0, None, FPS)
+    def decode(self, start: int | None) -> tuple[dict[str, str], dict[str, str]]:
+        """Decode the videos; return digests over all frames, and over those before `start`."""
+        digests = FeatureDigests()
+        lesson: dict[str, str] = {}
+        for name in self._encoders:
+            images = iter_frames(self._folder / f"{name}.mp4", 0, self.length, FPS)
+            for count, image in enumerate(images, 1):
+                digests.update(name, image)
+                if count == start:
+                    lesson[name] = digests.current()[name]
+        return digests.current(), lesson
 
-    def _begin(self, frame: Frame) -> None:
-        for camera, image in frame.images.items():
+    def _begin(
+        self, images: dict[str, NDArray[np.uint8]], vectors: dict[str, NDArray[np.float32]]
+    ) -> None:
+        for name, image in images.items():
             if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
                 raise SourceError(
-                    f"an image of camera {camera!r} is {image.shape} {image.dtype}; expected "
-                    "(H, W, 3) uint8"
+                    f"{name} holds images {image.shape} {image.dtype}; expected (H, W, 3) uint8"
                 )
-            path = self._folder / f"{camera}.mp4"
-            self._encoders[camera] = VideoEncoder(
-                path, self._codec, FPS, image.shape[0], image.shape[1]
-            )
-            self.stats[camera] = ImageStats()
-            self.features[CAMERA_PREFIX + camera] = image.shape
-        for name, value in ((STATE, frame.state), (ACTION, frame.action)):
-            if value is not None:
-                self._vectors[name] = []
-                self.features[name] = value.shape
-
-
-def _decode(writer: _Writer, start: int | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Decode what was written; return the digests over all frames and over the lesson."""
-    digests = FeatureDigests()
-    lesson: dict[str, str] = {}
-    for feature, frames in writer.decoded():
-        count = 0
-        for image in frames:
-            if count == start:
-                lesson[feature] = digests.current()[feature]
-            digests.update(feature, image)
-            count += 1
-        if count != writer.length:
-            raise BuildError(f"{feature} decodes to {count} frames; {writer.length} were encoded")
-    return digests.current(), lesson
-
-
-def _file_name(feature: str) -> str:
-    return feature.rpartition(".")[2]
+            path = self._folder / f"{name}.mp4"
+            self._encoders[name] = VideoEncoder(path, self._codec, FPS, len(image), image.shape[1])
+            self.stats[name] = ImageStats()
+        self._vectors = {name: [] for name in vectors}
+        self.features = {name: value.shape for name, value in (images | vectors).items()}

@@ -1,14 +1,14 @@
 """Recompute every hash and every rule of a split, and name each violation."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
-from robomme_interference_data.build_dataset.identity import counts_of, listed_files, revision_of
+from robomme_interference_data.build_dataset.identity import identity_of, listed_files
 from robomme_interference_data.build_dataset.lerobot_meaning import lerobot_violations
 from robomme_interference_data.build_dataset.manifests import plan_manifests, planned_buffers
+from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -20,7 +20,6 @@ from robomme_interference_data.constants import (
     MANIFESTS,
     RULE_VERSION,
     UNIT_FRAMES,
-    UNIT_STRIDE,
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.embeddings import IndexHeader, index_folder
@@ -31,7 +30,7 @@ from robomme_interference_data.records import EpisodeRecord, ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.split import load_split
 
-__all__ = ["Violation", "frames_of", "verify_split"]
+__all__ = ["Violation", "verify_split"]
 
 
 @dataclass(frozen=True)
@@ -47,22 +46,8 @@ class Violation:
     what: str
 
 
-def frames_of(root: Path) -> int:
-    """Return how many frames a split stores; 0 if it cannot be told.
-
-    Raises:
-        MissingFileError, FormatError: The folder is not a split, or its header cannot be read.
-    """
-    names = load_split(root).header.datasets
-    try:
-        opened = [Dataset(LocalFiles(root / name)) for name in names]
-    except InterferenceError:
-        return 0
-    return sum(dataset.identity.counts.frames for dataset in opened)
-
-
 def verify_split(
-    root: Path, *, decode: bool = True, advance: Callable[[int], None] = lambda frames: None
+    root: Path, *, decode: bool = True, progress: WorkProgress | None = None
 ) -> Iterator[Violation]:
     """Check a split, yielding violations as they are found.
 
@@ -75,66 +60,61 @@ def verify_split(
     Args:
         root: Folder of the split.
         decode: Whether to decode all data: by far the longest part.
-        advance: Called with a number of frames whenever so many have been checked.
+        progress: Where to show how many frames are decoded.
 
     Raises:
         MissingFileError, FormatError: The folder is not a split, or its header cannot be read.
     """
-    header = load_split(root).header
+    return _split(root, load_split(root).header, decode, progress or WorkProgress(quiet=True))
+
+
+def _split(
+    root: Path, header: ManifestHeader, decode: bool, progress: WorkProgress
+) -> Iterator[Violation]:
     rows = root / MANIFESTS / MANIFEST_ROWS
     if not rows.is_file():
         yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", "is missing")
     elif sha256_file(rows) != header.rows:
         what = f"does not have the SHA-256 of {MANIFEST_HEADER}"
         yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", what)
-    found: list[Violation] = []
     datasets: dict[str, Dataset] = {}
     for name in header.datasets:
-        with _told(name, found):
+        try:
             datasets[name] = Dataset(LocalFiles(root / name))
-    yield from found
+        except InterferenceError as error:
+            yield Violation(name, error.message)
+    frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
+    progress.start("Verifying", frames if decode else 0)
+    pool = datasets.get(DISTRACTORS)
     for name, dataset in datasets.items():
-        yield from _dataset(name, dataset, header, decode=decode, advance=advance)
-        pool = datasets.get(DISTRACTORS)
-        broken: list[Violation] = []
-        with _told(name, broken):
-            broken += [] if pool is None else _indexes(name, dataset, pool.revision)
-        yield from broken
-    if not found:
-        yield from _buffers(root, header)
+        yield from _told(name, _dataset(name, dataset, header, progress if decode else None))
+        if pool is not None:
+            yield from _told(name, _indexes(name, dataset, pool.revision))
+    if len(datasets) == len(header.datasets):
+        yield from _told(MANIFESTS, _buffers(root, header))
 
 
-@contextmanager
-def _told(where: str, found: list[Violation]) -> Iterator[None]:
-    """Turn an error of what is read inside into a violation."""
+def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
+    """Yield violations; an error of what is read on the way is one, too, and the last."""
     try:
-        yield
+        yield from violations
     except InterferenceError as error:
-        found.append(Violation(where, error.message))
+        yield Violation(where, error.message)
 
 
 def _dataset(
-    name: str,
-    dataset: Dataset,
-    header: ManifestHeader,
-    *,
-    decode: bool,
-    advance: Callable[[int], None],
+    name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
 ) -> Iterator[Violation]:
-    found: list[Violation] = []
-    with _told(name, found):
-        found += _files(name, dataset, header)
-        records = list(dataset.records())
-        found += _identity(name, dataset, records, header)
-        found += (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
-        yield from found
-        found.clear()
-        for record in records:
-            yield from _record(name, record)
-            if decode:
-                yield from _episode(name, dataset, record)
-                advance(record.length)
-    yield from found
+    yield from _files(name, dataset, header)
+    records = list(dataset.records())
+    yield from _identity(name, dataset, records, header)
+    yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
+    for record in records:
+        where = f"{name} {record.episode_id}"
+        yield from _record(where, name, record)
+        if progress is not None:
+            yield from _told(where, _episode(where, dataset, record))
+            progress.advance(record.length)
 
 
 def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
@@ -156,76 +136,59 @@ def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Viol
 def _identity(
     name: str, dataset: Dataset, records: list[EpisodeRecord], header: ManifestHeader
 ) -> Iterator[Violation]:
-    identity, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
-    unit = {"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if name == DISTRACTORS else None
-    expected: dict[str, Any] = {
-        "kind": name,
-        "revision": revision_of(records),
-        "exact": all(record.exact for record in records),
-        "cameras": dataset.cameras,
-        "unit": unit,
-        "simulators": tuple(sorted({r.simulator for r in records if r.simulator})),
-        "counts": counts_of(records),
-    }
-    for field, value in expected.items():
-        given = getattr(identity, field)
-        if given != value:
-            yield Violation(where, f"{field} is {given}; its episodes say {value}")
-    if identity.codec not in CODECS:
-        yield Violation(where, f"codec {identity.codec!r} is unknown")
+    given, where = dataset.identity, f"{name}/{IDENTITY_PATH}"
+    made = identity_of(records, name, given.version, given.codec, given.sources, given.sums)
+    for field, value in (vars(made) | {"cameras": dataset.cameras}).items():
+        if getattr(given, field) != value:
+            yield Violation(where, f"{field} is {getattr(given, field)}; its episodes say {value}")
+    if given.codec not in CODECS:
+        yield Violation(where, f"codec {given.codec!r} is unknown")
     recorded = header.datasets[name]
     for field in ("kind", "version", "revision"):
-        if getattr(recorded, field) != getattr(identity, field):
+        if getattr(recorded, field) != getattr(given, field):
             what = f"{field} of the {name} is {getattr(recorded, field)}; the dataset says "
-            yield Violation(f"{MANIFESTS}/{MANIFEST_HEADER}", f"{what}{getattr(identity, field)}")
+            yield Violation(f"{MANIFESTS}/{MANIFEST_HEADER}", f"{what}{getattr(given, field)}")
 
 
-def _record(name: str, record: EpisodeRecord) -> Iterator[Violation]:
+def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]:
     start = record.exec_start_idx
-    where = f"{name} {record.episode_id}"
-    if (start is None) != (name == DISTRACTORS) or (start is None) != (
-        record.lesson_sha256 is None
-    ):
+    lessons = {name != DISTRACTORS, start is not None, record.lesson_sha256 is not None}
+    if len(lessons) > 1:
         yield Violation(where, f"exec_start_idx is {start}")
     elif record.length != (expected := UNIT_FRAMES if start is None else start + 1):
         yield Violation(where, f"holds {record.length} frames, not {expected}")
 
 
-def _episode(name: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
-    where = f"{name} {record.episode_id}"
+def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
     spans = {"frames": (record.length, record.feature_sha256)}
     if record.exec_start_idx is not None and record.lesson_sha256 is not None:
         spans["lesson"] = (record.exec_start_idx, record.lesson_sha256)
-    found: list[Violation] = []
-    with _told(where, found):
-        stops = [stop for stop, _ in spans.values()]
-        decoded = dataset.digests(record.episode_index, 0, stops)
-        for (what, (_, recorded)), digests in zip(spans.items(), decoded, strict=True):
-            for feature in sorted(digests.keys() | recorded.keys()):
-                if digests.get(feature) != recorded.get(feature):
-                    told = f"{feature} ({what}) does not have the recorded SHA-256"
-                    found.append(Violation(where, told))
-    yield from found
+    decoded = dataset.digests(record.episode_index, 0, [stop for stop, _ in spans.values()])
+    for (what, (_, recorded)), digests in zip(spans.items(), decoded, strict=True):
+        for feature in sorted(digests.keys() | recorded.keys()):
+            if digests.get(feature) != recorded.get(feature):
+                told = f"{feature} ({what}) does not have the recorded SHA-256"
+                yield Violation(where, told)
 
 
 def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
     """Check the embeddings beside a dataset, whatever encoders and cameras they are of."""
-    lengths = {record.episode_index: record.length for record in dataset.records()}
     for path in dataset.files.list(INDEX_DIR, f"/{INDEX_HEADER}"):
         folder = str(PurePath(path).parent)
-        found: list[Violation] = []
-        with _told(f"{name}/{folder}", found):
-            header = read_header(dataset.files.path(path), IndexHeader)
-            made = header.encoder.name, header.camera
-            if index_folder(*made) != folder:
-                what = f"holds the embeddings of {made[0]}, camera {made[1]}"
-                found.append(Violation(f"{name}/{folder}", what))
-            else:
-                dataset.index(*made).check(lengths)
-            if header.pool != pool:
-                what = "its centre and typical cosine are of other distractors"
-                found.append(Violation(f"{name}/{folder}", what))
-        yield from found
+        yield from _told(f"{name}/{folder}", _index(name, dataset, folder, pool))
+
+
+def _index(name: str, dataset: Dataset, folder: str, pool: str) -> Iterator[Violation]:
+    where = f"{name}/{folder}"
+    header = read_header(dataset.files.path(f"{folder}/{INDEX_HEADER}"), IndexHeader)
+    made = header.encoder.name, header.camera
+    if index_folder(*made) != folder:
+        yield Violation(where, f"holds the embeddings of {made[0]}, camera {made[1]}")
+    else:
+        lengths = {record.episode_index: record.length for record in dataset.records()}
+        dataset.index(*made).check(lengths)
+    if header.pool != pool:
+        yield Violation(where, "its centre and typical cosine are of other distractors")
 
 
 def _buffers(root: Path, header: ManifestHeader) -> Iterator[Violation]:
@@ -235,32 +198,28 @@ def _buffers(root: Path, header: ManifestHeader) -> Iterator[Violation]:
         what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
         yield Violation(where, what)
         return
-    found: list[Violation] = []
-    with _told(MANIFESTS, found):
-        plan = plan_manifests(root, header.conditions, header.seed, header.position_limit)
-        given = {str(manifest): to_dict(manifest) for manifest in load_split(root).manifests()}
-        order = list(given)
-        counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
-        for number, manifest in enumerate(planned_buffers(plan)):
-            counts["buffers"] += 1
-            counts["sessions"] += len(manifest.sessions)
-            row = given.pop(str(manifest), None)
-            if row is None:
-                found.append(Violation(str(manifest), f"is missing in {MANIFEST_ROWS}"))
-                continue
-            if number >= len(order) or order[number] != str(manifest):
-                found.append(Violation(str(manifest), f"is not in its place in {MANIFEST_ROWS}"))
-            for field, value in to_dict(manifest).items():
-                if row[field] != value:
-                    told, rules = _difference(row[field], value)
-                    what = f"{field} is {told}; the rules give {rules}"
-                    found.append(Violation(str(manifest), what))
-        found += (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in given)
-        if header.counts != counts:
-            found.append(Violation(where, f"counts are {header.counts}; there are {counts}"))
-        if set(header.datasets) != {DEMONSTRATIONS, DISTRACTORS}:
-            found.append(Violation(where, f"datasets are {sorted(header.datasets)}"))
-    yield from found
+    plan = plan_manifests(root, header.conditions, header.seed, header.position_limit)
+    given = {str(manifest): to_dict(manifest) for manifest in load_split(root).manifests()}
+    order = list(given)
+    counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
+    for number, manifest in enumerate(planned_buffers(plan)):
+        counts["buffers"] += 1
+        counts["sessions"] += len(manifest.sessions)
+        row = given.pop(str(manifest), None)
+        if row is None:
+            yield Violation(str(manifest), f"is missing in {MANIFEST_ROWS}")
+            continue
+        if number >= len(order) or order[number] != str(manifest):
+            yield Violation(str(manifest), f"is not in its place in {MANIFEST_ROWS}")
+        for field, value in to_dict(manifest).items():
+            if row[field] != value:
+                told, rules = _difference(row[field], value)
+                yield Violation(str(manifest), f"{field} is {told}; the rules give {rules}")
+    yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in given)
+    if header.counts != counts:
+        yield Violation(where, f"counts are {header.counts}; there are {counts}")
+    if set(header.datasets) != {DEMONSTRATIONS, DISTRACTORS}:
+        yield Violation(where, f"datasets are {sorted(header.datasets)}")
 
 
 def _difference(found: Any, expected: Any) -> tuple[str, str]:
@@ -271,6 +230,5 @@ def _difference(found: Any, expected: Any) -> tuple[str, str]:
         return f"{given} at {place}", wanted
     if isinstance(found, dict) and isinstance(expected, dict):
         keys = [key for key in expected if found.get(key) != expected[key]]
-        both = ({key: one.get(key) for key in keys} for one in (found, expected))
-        return str(next(both)), str(next(both))
+        return str({key: found.get(key) for key in keys}), str({key: expected[key] for key in keys})
     return repr(found), repr(expected)

@@ -4,6 +4,7 @@ import fcntl
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -11,7 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
-from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
+from robomme_interference_data.errors import (
+    BuildError,
+    FormatError,
+    InterferenceError,
+    MissingFileError,
+)
 
 __all__ = [
     "Files",
@@ -23,6 +29,8 @@ __all__ = [
     "parse_sums",
     "read_json",
     "sha256_file",
+    "work_folder",
+    "working",
     "write_json",
     "write_text",
 ]
@@ -197,3 +205,32 @@ def hold(lock: Path, busy: InterferenceError) -> Iterator[None]:
         except OSError:
             raise busy from None
         yield
+
+
+def work_folder(out: Path) -> Path:
+    """Return the hidden folder beside `out` in which `out` is made."""
+    return out.parent / f".{out.name}.building"
+
+
+@contextmanager
+def working(out: Path) -> Iterator[Path]:
+    """Make the work folder of `out` and hold it; put back what was `before` in it if `out` is gone.
+
+    So a folder can be replaced whole: `out` becomes `before` in the work folder, and what was made
+    there `out`; then the caller removes the work folder. One in which nothing is finished goes by
+    itself.
+
+    Raises:
+        BuildError: Another process holds it.
+    """
+    work = work_folder(out)
+    work.mkdir(parents=True, exist_ok=True)
+    busy = BuildError(f"another process makes {out}", "Wait for it to end, or stop it.")
+    with hold(work / "lock", busy):
+        if (work / "before").exists() and not out.exists():
+            (work / "before").rename(out)
+        try:
+            yield work
+        finally:
+            if not any(work.glob("*/[!.]*")):
+                shutil.rmtree(work, ignore_errors=True)

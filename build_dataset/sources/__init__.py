@@ -1,7 +1,5 @@
 """Sources of recorded episodes, opened by a specification such as `robomme-h5:recordings/`."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from robomme_interference_data.build_dataset.sources.base import (
@@ -12,77 +10,33 @@ from robomme_interference_data.build_dataset.sources.base import (
 )
 from robomme_interference_data.errors import InvalidOptionError, nearest
 
-__all__ = ["KINDS", "Frame", "OpenOptions", "Recording", "Source", "SourceEpisode", "open_source"]
+__all__ = ["KINDS", "Frame", "Recording", "Source", "SourceEpisode", "open_source"]
 
-
-@dataclass(frozen=True)
-class OpenOptions:
-    """What some kinds of source are opened with.
-
-    Attributes:
-        columns: `lerobot`: logical name to the dataset's column, where they differ.
-        families_file: `lerobot`: file that names the family of every episode.
-        robomme_python: `robomme`: the interpreter that has RoboMME.
-    """
-
-    columns: dict[str, str] | None = None
-    families_file: Path | None = None
-    robomme_python: str | None = None
-
-
-def _robomme_h5(location: str, options: OpenOptions) -> Source:
-    from robomme_interference_data.build_dataset.sources.h5 import H5Source
-
-    return H5Source(_folder(location))
-
-
-def _lerobot(location: str, options: OpenOptions) -> Source:
-    from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
-
-    return LeRobotSource(location, columns=options.columns, families_file=options.families_file)
-
-
-def _frames(location: str, options: OpenOptions) -> Source:
-    from robomme_interference_data.build_dataset.sources.frames import FramesSource
-
-    return FramesSource(_folder(location))
-
-
-def _tabletop(location: str, options: OpenOptions) -> Source:
-    from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
-
-    return SimulatorSource("tabletop")
-
-
-def _robomme(location: str, options: OpenOptions) -> Source:
-    from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
-
-    return SimulatorSource("robomme", options.robomme_python)
-
-
-def _sample(location: str, options: OpenOptions) -> Source:
-    from robomme_interference_data.build_dataset.sources.sample import SampleSource
-
-    return SampleSource(tuple(location.split(","))) if location else SampleSource()
-
-
-KINDS: dict[str, tuple[str, Callable[[str, OpenOptions], Source]]] = {
-    "robomme-h5": ("robomme-h5:FOLDER", _robomme_h5),
-    "lerobot": ("lerobot:FOLDER or lerobot:NAMESPACE/NAME[@REVISION]", _lerobot),
-    "frames": ("frames:FOLDER", _frames),
-    "tabletop": ("tabletop", _tabletop),
-    "robomme": ("robomme", _robomme),
-    "sample": ("sample[:FAMILY,…]", _sample),
+KINDS = {
+    "robomme-h5": "robomme-h5:FOLDER",
+    "lerobot": "lerobot:FOLDER or lerobot:NAMESPACE/NAME[@REVISION]",
+    "frames": "frames:FOLDER",
+    "tabletop": "tabletop",
+    "robomme": "robomme",
+    "sample": "sample[:FAMILY,…]",
 }
-"""Kind of source to how it is written, and what opens one by what follows the colon."""
+"""Kind of source to how it is written."""
 
 
-def open_source(specification: str, options: OpenOptions | None = None) -> Source:
+def open_source(
+    specification: str,
+    *,
+    columns: dict[str, str] | None = None,
+    families_file: Path | None = None,
+    robomme_python: str | None = None,
+) -> Source:
     """Open a source.
 
     Args:
         specification: `KIND:LOCATION`, or `KIND` where nothing need stand behind it; see `KINDS`.
-        options: For kinds that take some.
+        columns: `lerobot`: logical name to the dataset's column, where they differ.
+        families_file: `lerobot`: file that names the family of every episode.
+        robomme_python: `robomme`: the interpreter that has RoboMME.
 
     Raises:
         InvalidOptionError: The specification or kind is unknown, or there is no such folder.
@@ -90,15 +44,33 @@ def open_source(specification: str, options: OpenOptions | None = None) -> Sourc
         MissingExtraError: The kind needs an extra that is not installed.
     """
     kind, colon, location = specification.partition(":")
-    usage, open_kind = KINDS.get(kind, ("", None))
+    usage = KINDS.get(kind, "")
     incomplete = usage.startswith(f"{kind}:") and not location
-    if open_kind is None or incomplete or (colon and ":" not in usage):
+    if not usage or incomplete or (colon and ":" not in usage):
         raise InvalidOptionError(
-            f"--source {specification!r} is not one of "
-            + ", ".join(usage for usage, _ in KINDS.values()),
+            f"--source {specification!r} is not one of {', '.join(KINDS.values())}",
             nearest(kind, KINDS, more=""),
         )
-    return open_kind(location, options or OpenOptions())
+    # Each in a module of its own, which brings libraries that the others do not need.
+    if kind == "robomme-h5":
+        from robomme_interference_data.build_dataset.sources.h5 import H5Source
+
+        return H5Source(_folder(location))
+    if kind == "lerobot":
+        from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
+
+        return LeRobotSource(location, columns=columns, families_file=families_file)
+    if kind == "frames":
+        from robomme_interference_data.build_dataset.sources.frames import FramesSource
+
+        return FramesSource(_folder(location))
+    if kind == "sample":
+        from robomme_interference_data.build_dataset.sources.sample import SampleSource
+
+        return SampleSource(tuple(location.split(","))) if location else SampleSource()
+    from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
+
+    return SimulatorSource(kind, robomme_python)
 
 
 def _folder(location: str) -> Path:

@@ -3,6 +3,7 @@
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ __all__ = [
     "choose_cameras",
     "compose",
     "demonstration_length",
+    "file_state",
 ]
 
 
@@ -95,7 +97,7 @@ class Recording:
 
 
 class Source(Protocol):
-    """A place with recorded episodes. Instances are picklable: workers get a copy each.
+    """A place with recorded episodes, to be inherited from. Picklable: workers get a copy each.
 
     Attributes:
         provenance: What a dataset built from it records about it, `kind` among it; the same on
@@ -104,13 +106,9 @@ class Source(Protocol):
         whole: Whether episodes go on after the first live observation, as units need.
     """
 
-    time_limit: float
-    whole: bool
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """See above."""
-        ...
+    provenance: dict[str, Any]
+    time_limit: float = 1800.0
+    whole: bool = True
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes, in the canonical order of their ids.
@@ -136,8 +134,21 @@ class Source(Protocol):
         ...
 
     def close(self) -> None:
-        """Release what is held from one episode to the next."""
-        ...
+        """Release what is held from one episode to the next: nothing, unless a source says so."""
+        return
+
+
+def file_state(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a file, or a folder of files, does; None if there is none.
+
+    Returns:
+        The latest time of change in ns, and the size in bytes.
+    """
+    if not path.exists():
+        return None
+    found = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
+    latest = max((one.st_mtime_ns for one in found), default=0)
+    return latest, sum(one.st_size for one in found)
 
 
 def choose_cameras(wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:

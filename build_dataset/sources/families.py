@@ -7,31 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["BLOCK_FAMILIES", "ids_by_block", "ids_by_columns", "ids_by_file"]
-
-BLOCK_FAMILIES = (
-    "PatternLock",
-    "ButtonUnmaskSwap",
-    "ButtonUnmask",
-    "VideoPlaceButton",
-    "VideoUnmaskSwap",
-    "PickXtimes",
-    "StopCube",
-    "SwingXtimes",
-    "PickHighlight",
-    "MoveCube",
-    "InsertPeg",
-    "RouteStick",
-    "BinFill",
-    "VideoPlaceOrder",
-    "VideoRepick",
-    "VideoUnmask",
-)
-"""Families of RoboMME's LeRobot datasets, which have no family column: 100 episodes of each, in
-this order (`lerobot/robomme`, `Yinpei/robomme_data_lerobot`)."""
+__all__ = ["ids_by_block", "ids_by_columns", "ids_by_file"]
 
 _BLOCK = 100
 _CSV = ("episode_index,family on the first line, and split and index if wanted", "0,MoveCube")
@@ -50,7 +30,7 @@ def ids_by_block() -> dict[int, EpisodeId]:
     """Name the episodes 0 to 1,599 by their block of 100."""
     return {
         _BLOCK * block + index: EpisodeId(family, "train", index)
-        for block, family in enumerate(BLOCK_FAMILIES)
+        for block, family in enumerate(BLOCKS)
         for index in range(_BLOCK)
     }
 

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.sources.base import (
     Recording,
+    Source,
     SourceEpisode,
     choose_cameras,
     compose,
+    file_state,
 )
 from robomme_interference_data.build_dataset.sources.frames_table import (
     TABLE,
@@ -24,11 +26,10 @@ from robomme_interference_data.build_dataset.sources.frames_table import (
     read_frames_table,
 )
 from robomme_interference_data.build_dataset.sources.images import (
-    decode_image,
-    is_png,
+    decode_images,
     probe_video,
 )
-from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError
+from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.video import iter_frames
@@ -48,7 +49,7 @@ class _Key:
     state: tuple[Any, ...]
 
 
-class FramesSource:
+class FramesSource(Source):
     """Episodes in a frames folder.
 
     Args:
@@ -58,12 +59,9 @@ class FramesSource:
         SourceError: There is no such table in it.
     """
 
-    time_limit = 1800.0
-    whole = True
-
     def __init__(self, folder: Path):
         self._folder = folder
-        self.provenance: dict[str, Any] = {"kind": "frames"}
+        self.provenance = {"kind": "frames"}
         if not (folder / TABLE).is_file():
             raise SourceError(
                 f"{folder} is no frames folder: {TABLE} is missing",
@@ -83,24 +81,21 @@ class FramesSource:
         """Open an episode; see `Source.read`."""
         key: _Key = episode.key
         chosen = choose_cameras(cameras, tuple(key.images))
-        try:
-            same = self._state(key.images) == key.state
-        except OSError:
-            same = False
-        if not same:
+        if self._state(key.images) != key.state:
             raise SourceError("its files have changed since they were listed", "Start again.")
         streams, exact = {}, True
         for camera in chosen:
             path, length = key.images[camera], key.rows.length
             if path.is_dir():
                 _check_names(path, length)
-                streams[camera] = _iter_images(path, length)
+                files = [path / _image_name(number) for number in range(length)]
+                streams[camera] = decode_images(((f, f.read_bytes()) for f in files), exact=True)
             else:
                 rate, lossless = probe_video(path)
                 streams[camera] = _iter_video(path, rate, length)
                 exact = exact and lossless
         rows = RowSpan(self._folder / TABLE, key.rows.start, key.rows.start + key.rows.length)
-        actions = rows.vectors("action") if key.rows.actions else None
+        actions = rows.vectors("action") if "action" in rows.names else None
         return Recording(
             goals=(key.rows.goal,),
             seed=key.rows.seed,
@@ -109,9 +104,6 @@ class FramesSource:
             exact=exact if key.rows.exact is None else key.rows.exact,
             frames=compose(streams, rows.vectors("state"), actions, key.rows.lesson),
         )
-
-    def close(self) -> None:
-        """Nothing is held."""
 
     def _find(self, episodes: Iterable[EpisodeId]) -> dict[EpisodeId, dict[str, Path]]:
         """Find the video or image folder of every camera of every episode."""
@@ -166,13 +158,7 @@ class FramesSource:
                 yield path, camera, f"{family}/{split}/{index}"
 
     def _state(self, images: dict[str, Path]) -> tuple[Any, ...]:
-        """Return what changes when the table or an episode's images do: times and sizes."""
-        found = []
-        for path in (self._folder / TABLE, *images.values()):
-            stats = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
-            latest = max((one.st_mtime_ns for one in stats), default=0)
-            found.append((latest, sum(one.st_size for one in stats)))
-        return tuple(found)
+        return tuple(file_state(path) for path in (self._folder / TABLE, *images.values()))
 
 
 def _check_names(path: Path, length: int) -> None:
@@ -186,19 +172,6 @@ def _check_names(path: Path, length: int) -> None:
             f"{_image_name(length - 1)} and nothing else",
             "Number the images of an episode from 0, six digits, one for every row.",
         )
-
-
-def _iter_images(path: Path, length: int) -> Generator[NDArray[np.uint8]]:
-    for number in range(length):
-        file = path / _image_name(number)
-        data = file.read_bytes()
-        try:
-            if not is_png(data):
-                raise FormatError("not a PNG image", "Store images as PNG: it is exact.")
-            image = decode_image(data)
-        except FormatError as error:
-            raise error.about(file) from None
-        yield image
 
 
 def _iter_video(path: Path, rate: float, length: int) -> Generator[NDArray[np.uint8]]:

@@ -31,7 +31,6 @@ class EpisodeRows:
         start: Its first row.
         length: Its rows, which are its frames.
         lesson: Frames with `is_demo`; None if the table has no such column.
-        actions: Whether the table has actions.
         goal: The goal in words.
         seed: Seed of the simulator, or None.
         difficulty: `easy`, `medium`, `hard`, or None.
@@ -42,7 +41,6 @@ class EpisodeRows:
     start: int
     length: int
     lesson: int | None
-    actions: bool
     goal: str
     seed: int | None
     difficulty: str | None
@@ -145,6 +143,6 @@ def _episode(where: str, rows: pa.Table, start: int) -> EpisodeRows:
                 "Give all rows of an episode the same one, or make two episodes of it.",
             )
         values[column] = found[0]
-    marked, actions = "is_demo" in rows.column_names, "action" in rows.column_names
+    marked = "is_demo" in rows.column_names
     lesson = demonstration_length(rows["is_demo"], f"{where}: is_demo") if marked else None
-    return EpisodeRows(start, len(rows), lesson, actions, **values)
+    return EpisodeRows(start, len(rows), lesson, **values)

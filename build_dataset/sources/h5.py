@@ -17,10 +17,13 @@ import numpy as np
 from robomme_interference_data.build_dataset.sources.base import (
     Frame,
     Recording,
+    Source,
     SourceEpisode,
     choose_cameras,
     demonstration_length,
+    file_state,
 )
+from robomme_interference_data.build_dataset.sources.robomme_families import ROBOMME
 from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
 from robomme_interference_data.ids import EpisodeId
 
@@ -33,26 +36,8 @@ _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
 _AGAIN = "Record or download the file again, or move it out of the folder."
 
-_TEST_SEEDS = 500_000
-_VAL_SEEDS = 1_000_000
-_FAMILY_CODES = {
-    "PickXtimes": 1,
-    "StopCube": 2,
-    "SwingXtimes": 3,
-    "BinFill": 4,
-    "VideoUnmaskSwap": 5,
-    "VideoUnmask": 6,
-    "ButtonUnmaskSwap": 7,
-    "ButtonUnmask": 8,
-    "VideoRepick": 9,
-    "VideoPlaceButton": 10,
-    "VideoPlaceOrder": 11,
-    "PickHighlight": 12,
-    "InsertPeg": 13,
-    "MoveCube": 14,
-    "PatternLock": 15,
-    "RouteStick": 16,
-}
+_SEEDS = (("val", 1_000_000, 10_000), ("test", 500_000, 10_000), ("train", 0, 1000))
+"""Of each split, its first seed, and what a family's code is multiplied by."""
 
 
 def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
@@ -69,27 +54,20 @@ def identify(family: str, seeds: dict[int, int | None]) -> dict[int, EpisodeId]:
     Returns:
         Number to id; split `train` where there is no seed.
     """
-    code = _FAMILY_CODES.get(family)
+    known = ROBOMME.get(family)
     splits, votes = {}, []
     for number, seed in seeds.items():
-        value, scale, splits[number] = seed or 0, 1000, "train"
-        if value >= _VAL_SEEDS:
-            value, scale, splits[number] = value - _VAL_SEEDS, 10_000, "val"
-        elif value >= _TEST_SEEDS:
-            value, scale, splits[number] = value - _TEST_SEEDS, 10_000, "test"
-        if seed is not None and code is not None:
-            votes.append(number - (value - scale * code) // 100)
-    by_seed = {first: votes.count(first) for first in (0, 1)}
-    if 0 in seeds:
-        first = 0
-    elif by_seed[0] != by_seed[1]:
-        first = max(by_seed, key=lambda candidate: by_seed[candidate])
-    else:
-        first = 1 if 1 in seeds else 0
+        value = seed or 0
+        splits[number], least, scale = next((s for s in _SEEDS if value >= s[1]), _SEEDS[-1])
+        if seed is not None and known is not None:
+            votes.append(number - (value - least - scale * known.code) // 100)
+    first = 0
+    if 0 not in seeds:  # else numbers are indices, whatever the seeds say
+        first = max((0, 1), key=lambda one: (votes.count(one), one in seeds))
     return {number: EpisodeId(family, splits[number], number - first) for number in seeds}
 
 
-class H5Source:
+class H5Source(Source):
     """A folder of `record_dataset_<Family>.h5` files.
 
     Args:
@@ -100,15 +78,12 @@ class H5Source:
         MissingExtraError: h5py is not installed.
     """
 
-    time_limit = 1800.0
-    whole = True
-
     def __init__(self, folder: Path):
         try:
             import h5py  # noqa: F401
         except ImportError:
             raise MissingExtraError.needs("reading RoboMME recordings", "h5py", "build") from None
-        self.provenance: dict[str, Any] = {"kind": "robomme-h5"}
+        self.provenance = {"kind": "robomme-h5"}
         candidates = [folder] if folder.is_file() else sorted(folder.glob("*.h5"))
         self._files = {
             match["family"]: path for path in candidates if (match := _FILE.fullmatch(path.name))
@@ -128,14 +103,13 @@ class H5Source:
                 if not numbers:
                     raise SourceError(f"{path} holds no episode_<N> group", _AGAIN)
                 ids = identify(family, {n: _seed(file[f"episode_{n}"]) for n in numbers})
-            stat = path.stat()
-            state = (stat.st_size, stat.st_mtime_ns)
-            found += [SourceEpisode(ids[n], (str(path.resolve()), n, state)) for n in numbers]
+            place = str(path.resolve()), file_state(path)
+            found += [SourceEpisode(ids[n], (n, *place)) for n in numbers]
         return sorted(found, key=lambda episode: episode.id)
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Open an episode; see `Source.read`."""
-        path, number, _ = episode.key
+        number, path, _ = episode.key
         where = f"{path}: episode_{number}"
         with _opened(path) as file, _complete(where):
             group = file[f"episode_{number}"]
@@ -158,17 +132,10 @@ class H5Source:
                 frames=_frames(path, number, steps, lesson, chosen),
             )
 
-    def close(self) -> None:
-        """Nothing is held."""
-
 
 @contextmanager
 def _complete(where: object) -> Iterator[None]:
-    """Turn what h5py raises about something missing or damaged into one clear error.
-
-    Raises:
-        SourceError: The recording is not complete.
-    """
+    """Turn what h5py raises about something missing or damaged into one clear error."""
     try:
         yield
     except InterferenceError:

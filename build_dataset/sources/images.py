@@ -4,6 +4,7 @@ A recording counts as exact only where that is certain: PNG images, or video of 
 codec, or options, that lose nothing. Converting to YUV alone already changes 8-bit RGB values.
 """
 
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
 
-__all__ = ["decode_image", "info_is_exact", "is_png", "probe_video"]
+__all__ = ["decode_image", "decode_images", "info_is_exact", "is_png", "probe_video"]
 
 _RGB_FORMATS = (
     *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
@@ -98,6 +99,31 @@ def is_png(data: bytes) -> bool:
         f"an image starts with the bytes {data[:8].hex(' ') or '(none)'}; expected PNG or JPEG",
         "Store images as PNG: it is exact.",
     )
+
+
+def decode_images(
+    encoded: Iterable[tuple[object, bytes]], exact: bool
+) -> Generator[NDArray[np.uint8]]:
+    """Decode the images of an episode in order, `(H, W, 3) uint8` RGB, one in memory.
+
+    Args:
+        encoded: Where each image lies, for messages, and its bytes.
+        exact: Whether the episode counts as exact: its images must be PNG then.
+
+    Raises:
+        FormatError: As `decode_image`, or one is not PNG; says where.
+    """
+    for where, data in encoded:
+        try:
+            if exact and not is_png(data):
+                raise FormatError(
+                    "a JPEG image, although the episode counts as exact",
+                    "Store images as PNG: it is exact.",
+                )
+            image = decode_image(data)
+        except FormatError as error:
+            raise error.about(where) from None
+        yield image
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:

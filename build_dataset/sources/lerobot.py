@@ -14,25 +14,30 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.sources.base import (
     Recording,
+    Source,
     SourceEpisode,
     choose_cameras,
     compose,
     demonstration_length,
+    file_state,
 )
 from robomme_interference_data.build_dataset.sources.columns import CAMERAS, resolve_columns
 from robomme_interference_data.build_dataset.sources.families import (
-    BLOCK_FAMILIES,
     ids_by_block,
     ids_by_columns,
     ids_by_file,
 )
-from robomme_interference_data.build_dataset.sources.goals import families_for_goal, goal_fits
 from robomme_interference_data.build_dataset.sources.images import (
-    decode_image,
+    decode_images,
     info_is_exact,
     is_png,
 )
-from robomme_interference_data.errors import FormatError, MissingFileError, SourceError
+from robomme_interference_data.build_dataset.sources.robomme_families import (
+    BLOCKS,
+    ROBOMME,
+    families_for_goal,
+)
+from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.hub import HubFiles, locate
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
@@ -67,7 +72,7 @@ class _Told:
         return self.goals or self.tasks or ()
 
 
-class LeRobotSource:
+class LeRobotSource(Source):
     """Episodes of a LeRobot dataset.
 
     Args:
@@ -81,9 +86,6 @@ class LeRobotSource:
         HubError: The repository or its revision is unknown, or cannot be reached.
     """
 
-    time_limit = 1800.0
-    whole = True
-
     def __init__(
         self,
         location: str,
@@ -94,7 +96,7 @@ class LeRobotSource:
         self._files = locate(location)
         self._given_columns = columns
         self._families_file = families_file
-        self.provenance: dict[str, Any] = {"kind": "lerobot"}
+        self.provenance = {"kind": "lerobot"}
         if isinstance(self._files, HubFiles):
             self.provenance |= {"repo": self._files.repo_id, "revision": self._files.commit}
 
@@ -150,9 +152,6 @@ class LeRobotSource:
             frames=compose(streams, states, actions, lesson),
         )
 
-    def close(self) -> None:
-        """Nothing is held."""
-
     @cached_property
     def _lerobot(self) -> LeRobotFiles:
         return LeRobotFiles(self._files)
@@ -171,21 +170,12 @@ class LeRobotSource:
     def _images(
         self, index: int, rows: RowSpan, column: str, exact: bool
     ) -> Generator[NDArray[np.uint8]]:
-        """Decode the images of an episode in order, `(H, W, 3) uint8` RGB, one in memory."""
         if self._lerobot.features[column]["dtype"] == "video":
             yield from self._lerobot.iter_frames(index, column, 0, len(rows))
             return
-        shape = self._lerobot.shape(column)
-        for number, data in enumerate(rows.images(column)):
-            where = f"frame {number} of column {column!r}"
-            if exact and not is_png(data):
-                raise SourceError(f"{where} is a JPEG, although the episode counts as exact", _MEND)
-            image = decode_image(data)
-            if image.shape != shape:
-                raise SourceError(
-                    f"{where} has the shape {image.shape}; info.json says {shape}", _MEND
-                )
-            yield image
+        cells = enumerate(rows.images(column))
+        where = f"of column {column!r}"
+        yield from decode_images(((f"frame {n} {where}", data) for n, data in cells), exact)
 
     def _is_exact(self, rows: RowSpan, column: str) -> bool:
         """Tell whether images are exact, by their codec or by the first one stored in parquet."""
@@ -209,14 +199,15 @@ class LeRobotSource:
         raise SourceError(
             f"{self._where} does not say of what family its {len(rows)} episodes are: it has no "
             "per-episode column episode_id or family, and is not one of RoboMME's with "
-            f"{len(blocks)} of {len(BLOCK_FAMILIES)} families",
+            f"{len(blocks)} of {len(BLOCKS)} families",
             _MEND_FAMILIES,
         )
 
     def _check_goals(self, index: int, name: EpisodeId, goals: tuple[str, ...]) -> None:
         for goal in goals:
-            if not goal_fits(name.family, goal):
-                others = " and ".join(families_for_goal(goal)) or "no family of RoboMME"
+            fits = families_for_goal(goal)
+            if name.family in ROBOMME and name.family not in fits:
+                others = " and ".join(fits) or "no family of RoboMME"
                 raise SourceError(
                     f"{self._where}: episode {index} would be {name}, but its goal {goal!r} "
                     f"cannot be one of {name.family}; it fits {others}",
@@ -224,32 +215,17 @@ class LeRobotSource:
                 )
 
     def _state(self, index: int, columns: set[str]) -> tuple[Any, ...]:
-        """Return what changes when the episode's files do: times and sizes; the commit is known."""
+        """Return what changes when the episode's files do; of the Hub's, the commit is known."""
         if isinstance(self._files, HubFiles):
             return ()
         place = self._lerobot.place(index)
-        states: list[Any] = []
         videos = [path for name, (path, _) in place.videos.items() if name in columns]
-        for relative in (place.data, *videos):
-            try:
-                status = self._files.path(relative).stat()
-                states.append((status.st_mtime_ns, status.st_size))
-            except MissingFileError:  # a part of a dataset may be here only; missed when read
-                states.append(None)
-        return tuple(states)
+        # A part of a dataset may be here only: what is not is missed when it is read.
+        return tuple(file_state(self._files.root / path) for path in (place.data, *videos))
 
 
 def _lesson(rows: RowSpan, columns: dict[str, str], said: int | None) -> int | None:
-    """Return the number of demonstration frames of an episode; None if nothing marks them.
-
-    Args:
-        rows: Its rows.
-        columns: Which columns may mark it.
-        said: What the per-episode metadata says, or None.
-
-    Raises:
-        SourceError: A column is not as it should be, or two do not agree.
-    """
+    """Return the number of demonstration frames, as columns and `said` agree; None if untold."""
     found = {} if said is None else {"meta/": said}
     if "is_demo" in columns:
         name = columns["is_demo"]

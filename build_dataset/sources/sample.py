@@ -7,7 +7,6 @@ every machine makes the same pixels.
 
 import hashlib
 from collections.abc import Generator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.build_dataset.sources.base import (
     Frame,
     Recording,
+    Source,
     SourceEpisode,
     choose_cameras,
 )
@@ -30,7 +30,7 @@ _SHORT = 200
 """Frames of the first family's train episode 1: too few for a unit, as some real ones have."""
 
 
-class SampleSource:
+class SampleSource(Source):
     """Three train episodes and a test episode of each family.
 
     Args:
@@ -39,12 +39,11 @@ class SampleSource:
     """
 
     time_limit = 300.0
-    whole = True
 
     def __init__(self, families: tuple[str, ...] = FAMILIES, size: int = 256):
         self._families = families
         self._size = size
-        self.provenance: dict[str, Any] = {"kind": "sample", "size": size}
+        self.provenance = {"kind": "sample", "size": size}
 
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes; see `Source.episodes`."""
@@ -68,9 +67,6 @@ class SampleSource:
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]
         return Recording((goal,), scene.seed, difficulty, "sample", True, frames)
-
-    def close(self) -> None:
-        """Nothing is held."""
 
 
 class _Scene:

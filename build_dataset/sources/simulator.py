@@ -8,6 +8,7 @@ import numpy as np
 from robomme_interference_data.build_dataset.sources.base import (
     Frame,
     Recording,
+    Source,
     SourceEpisode,
     choose_cameras,
 )
@@ -25,7 +26,7 @@ from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 __all__ = ["SimulatorSource"]
 
 
-class SimulatorSource:
+class SimulatorSource(Source):
     """The episodes of the nine families that have demonstrations.
 
     An episode is the demonstration, the first live observation and, on the tabletop, what the
@@ -35,9 +36,6 @@ class SimulatorSource:
     Args:
         name: `tabletop` or `robomme`.
         python: RoboMME's interpreter, for `robomme`.
-
-    Attributes:
-        whole: Whether episodes go on after the first live observation.
     """
 
     def __init__(self, name: str, python: str | None = None):
@@ -47,7 +45,7 @@ class SimulatorSource:
         self.time_limit = 300.0 if name == "tabletop" else 1800.0
         # The same episode of another version of the suite is another one.
         version = {"suite_version": SUITE_VERSION} if name == "tabletop" else {}
-        self.provenance: dict[str, Any] = {"kind": name, **version}
+        self.provenance = {"kind": name, **version}
         self._options = {"python": python} if name == "robomme" else {}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()

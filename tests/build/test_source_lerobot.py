@@ -20,8 +20,8 @@ from support.recordings import (
     make_episode,
 )
 
-from robomme_interference_data.build_dataset.sources import OpenOptions, Recording, open_source
-from robomme_interference_data.build_dataset.sources.families import BLOCK_FAMILIES
+from robomme_interference_data.build_dataset.sources import Recording, open_source
+from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
@@ -37,7 +37,7 @@ FOUR = make_episode(1, 4, MOVE, 2)
 
 
 def read(root: Path, index: int = 0, **options: Any) -> Recording:
-    source = open_source(f"lerobot:{root}", OpenOptions(**options))
+    source = open_source(f"lerobot:{root}", **options)
     return source.read(source.episodes()[index], None)
 
 
@@ -93,7 +93,7 @@ def test_a_part_of_a_dataset_can_be_used(v21: Path) -> None:
 
 def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
     by_family = {family: goal for goal, fits in GOALS.items() for family in fits}
-    goals = [by_family[family] for family in BLOCK_FAMILIES for _ in range(100)]
+    goals = [by_family[family] for family in BLOCKS for _ in range(100)]
     episodes = {str(number): replace(FOUR, goal=goal) for number, goal in enumerate(goals)}
     root = write_lerobot(tmp_path / "d", episodes, stored=None, episode_id=None)
     start = time.perf_counter()
@@ -111,7 +111,7 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
     families = [name.split("/")[0] for _, (name, _) in sorted(found.items())]
     names = tmp_path / "families.json"
     names.write_text(json.dumps(dict(enumerate([*families[:950], "InsertPeg", *families[951:]]))))
-    listed = open_source(f"lerobot:{root}", OpenOptions(families_file=names)).episodes()
+    listed = open_source(f"lerobot:{root}", families_file=names).episodes()
     ids = {episode.key[0]: str(episode.id) for episode in listed}
     assert (ids[950], ids[1000]) == ("InsertPeg/train/0", "InsertPeg/train/1")
 
@@ -218,11 +218,10 @@ def test_images_that_are_wrong(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path, one())
     column = "observation.images.front"
     cells = pq.read_table(root / DATA)[column].to_pylist()
-    small, jpeg = FOUR.images["front"][2][:8], FOUR.images["front"][2]
+    jpeg = encode_image(FOUR.images["front"][2], "jpg")
     for data, message in (
-        (cells[2]["bytes"][:60], "image is damaged"),
-        (encode_image(small), r"frame 2 .* has the shape \(8, 24, 3\); info.json says \(16, 24"),
-        (encode_image(jpeg, "jpg"), "frame 2 .* is a JPEG, although"),
+        (cells[2]["bytes"][:60], "frame 2 of .* image is damaged"),
+        (jpeg, "frame 2 of .* a JPEG image, although"),
         (b"", "expected PNG or JPEG"),
     ):
         wrong = [*cells[:2], {"bytes": data, "path": None}, cells[3]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robomme_interference_data.build_dataset.cut import cut_demonstration
-from robomme_interference_data.build_dataset.sources import OpenOptions, Recording, open_source
+from robomme_interference_data.build_dataset.sources import Recording, open_source
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
@@ -94,7 +94,7 @@ def test_an_episode_of_the_tabletop(made: list[Played]) -> None:
 
 
 def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Played]) -> None:
-    source = open_source("robomme", OpenOptions(robomme_python="/opt/python"))
+    source = open_source("robomme", robomme_python="/opt/python")
     assert source.provenance == {"kind": "robomme"}
     assert (source.time_limit, source.whole) == (1800, False)
     frames = list(read(source).frames)

@@ -1,6 +1,9 @@
-"""Opening sources by name, what all of them share, and the made-up sample."""
+"""What every source of recordings does, whatever the layout; opening them; the made-up sample."""
 
-import hashlib
+import os
+import pickle
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,12 +12,92 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.lerobot_layouts import write_lerobot
+from support.recordings import EPISODES, SEEDS, check_recording, write_frames, write_h5
 
-from robomme_interference_data.build_dataset.sources import KINDS, Recording, open_source
+from robomme_interference_data.build_dataset.sources import KINDS, Recording, Source, open_source
 from robomme_interference_data.build_dataset.sources.base import compose, demonstration_length
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import (
+    InvalidIdError,
+    InvalidOptionError,
+    MissingFileError,
+    SourceError,
+)
+
+TOLD = {"seed": list(SEEDS.values()), "difficulty": ["hard"] * 3}
+LAYOUTS: dict[str, Callable[..., Any]] = {
+    "frames": write_frames,
+    "robomme-h5": write_h5,
+    "lerobot": partial(write_lerobot, **TOLD),
+    "lerobot v3.0 video": partial(write_lerobot, stored="video", **TOLD),
+    "lerobot v2.1": partial(write_lerobot, version="v2.1", **TOLD),
+    "lerobot v2.1 video": partial(write_lerobot, version="v2.1", stored="video", **TOLD),
+}
+
+
+@pytest.fixture(params=LAYOUTS)
+def source(request: pytest.FixtureRequest, tmp_path: Path) -> Source:
+    LAYOUTS[request.param](tmp_path / "made", EPISODES)
+    return open_source(f"{request.param.split()[0]}:{tmp_path / 'made'}")
+
+
+def recorded(folder: Path) -> list[Path]:
+    """The files that hold frames."""
+    files = [path for path in folder.glob("made/**/*.*") if path.is_file()]
+    return [path for path in files if "meta" not in path.parts and path.name != "frames.parquet"]
+
+
+def test_episodes_and_frames(source: Source) -> None:
+    listed = source.episodes()
+    assert [str(episode.id) for episode in listed] == list(EPISODES)
+    copy, again = pickle.loads(pickle.dumps((source, listed)))  # as a worker process gets them
+    for episode in again:
+        recording = copy.read(episode, None)
+        assert (recording.seed, recording.difficulty) == (SEEDS[str(episode.id)], "hard")
+        assert recording.simulator == ("robomme" if source.provenance["kind"][0] == "r" else None)
+        assert recording.exact is True
+        check_recording(recording, EPISODES[str(episode.id)])
+    assert list(source.provenance) == ["kind"]  # no local paths
+    assert (source.time_limit, source.whole) == (1800, True)
+
+
+def test_only_the_cameras_asked_for_are_read(source: Source) -> None:
+    episode = source.episodes()[0]
+    frames = list(source.read(episode, ("wrist",)).frames)
+    assert [list(frame.images) for frame in frames] == [["wrist"]] * 12
+    with pytest.raises(InvalidOptionError, match="'wirst' is none of front, wrist.*\n.*'wrist'"):
+        source.read(episode, ("front", "wirst"))
+
+
+def test_keys_tell_when_a_file_changes(source: Source, tmp_path: Path) -> None:
+    before = [episode.key for episode in source.episodes()]
+    assert [episode.key for episode in source.episodes()] == before
+    for path in recorded(tmp_path):
+        os.utime(path, (4e9, 4e9))
+    after = [episode.key for episode in source.episodes()]
+    assert all(new != old for new, old in zip(after, before, strict=True))
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="looks for open files in /proc")
+def test_stopping_early_releases_the_files(source: Source, tmp_path: Path) -> None:
+    frames = source.read(source.episodes()[0], None).frames
+    next(frames)
+    frames.close()
+    opened = {str(path.resolve()) for path in Path("/proc/self/fd").iterdir()}
+    assert not [path for path in opened if path.startswith(str(tmp_path))]
+
+
+def test_files_that_are_gone_since_they_were_listed(source: Source, tmp_path: Path) -> None:
+    episode = source.episodes()[0]
+    for path in recorded(tmp_path):
+        path.unlink()
+    with pytest.raises((SourceError, MissingFileError), match=r"made|changed"):
+        list(source.read(episode, None).frames)
+
+
+# --- opening them ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -31,13 +114,13 @@ from robomme_interference_data.errors import InvalidIdError, InvalidOptionError,
 def test_what_is_no_source_lists_all_kinds(text: str, hint: str | None) -> None:
     with pytest.raises(InvalidOptionError, match=f"--source {text!r} is not one of") as caught:
         open_source(text)
-    assert all(usage in caught.value.message for usage, _ in KINDS.values())
+    assert all(usage in caught.value.message for usage in KINDS.values())
     assert hint is None or hint in str(caught.value.hint)
 
 
 def test_the_docs_know_all_kinds() -> None:
     table = (Path(__file__).parents[2] / "docs" / "sources.md").read_text()
-    for usage, _ in KINDS.values():
+    for usage in KINDS.values():
         assert "| `" + usage.replace(" or ", "` or `") in table
 
 
@@ -73,38 +156,28 @@ def test_recordings_check_themselves(values: dict[str, Any], message: str) -> No
 
 # --- the sample ----------------------------------------------------------------------------------
 
-SAMPLE = SampleSource(("VideoRepick", "Drawer"), size=32)
+FEW = ("VideoRepick", "Drawer")
+SAMPLE = SampleSource(FEW, size=32)
 
 
 def test_the_sample() -> None:
     seen: set[bytes] = set()
     lengths = {}
     for episode in SAMPLE.episodes():
-        recording = SAMPLE.read(episode, None)
-        frames = list(recording.frames)
-        name, shown = str(episode.id), [frame.is_demonstration for frame in frames]
-        lengths[name] = (len(frames), shown.index(False))
-        goal = f"watch the video carefully, then do the {episode.id.family} task again"
-        seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4])
-        difficulty = ("easy", "medium", "hard")[episode.id.index]
-        told = (recording.goals, recording.seed, recording.difficulty, recording.simulator)
-        assert told == ((goal,), seed, difficulty, "sample")
+        frames = list(SAMPLE.read(episode, None).frames)
+        shown = [frame.is_demonstration for frame in frames]
+        lengths[str(episode.id)] = (len(frames), shown.index(False))
         for one, other in pairwise(frames):  # an action is the state that follows
             assert one.action is not None
             assert np.array_equal(one.action, other.state)
         views = {frame.images[camera].tobytes() for frame in frames[::8] for camera in frame.images}
         assert not views & seen, "two episodes have a frame in common"
         seen |= views
-    assert lengths == {
-        "VideoRepick/train/0": (260, 48),
-        "VideoRepick/train/1": (200, 64),  # too short for a unit
-        "VideoRepick/train/2": (260, 48),
-        "VideoRepick/test/0": (260, 48),
-        "Drawer/train/0": (260, 48),
-        "Drawer/train/1": (260, 64),
-        "Drawer/train/2": (260, 48),
-        "Drawer/test/0": (260, 48),
-    }
+    by_number = {"train/0": (260, 48), "train/1": (260, 64), "train/2": (260, 48)}
+    by_number["test/0"] = (260, 48)
+    expected = {f"{family}/{n}": by_number[n] for family in FEW for n in by_number}
+    # Too short for a unit.
+    assert lengths == expected | {"VideoRepick/train/1": (200, 64)}
 
 
 def test_families_of_the_sample() -> None:

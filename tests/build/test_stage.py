@@ -1,20 +1,25 @@
 """One episode staged: cut while it is read, encoded, decoded again, hashed; and what is refused."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 from support.made_up import MadeUpSource, picture
 
 from robomme_interference_data.build_dataset import stage
-from robomme_interference_data.build_dataset.cut import NothingToStore, cut_demonstration, cut_unit
+from robomme_interference_data.build_dataset.config import BuildPlan
+from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
+from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.stage import StagedEpisode, StageTask, read_staged
 from robomme_interference_data.digest import feature_digest
-from robomme_interference_data.encode import CODECS
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.video import iter_frames
@@ -23,8 +28,7 @@ NAME = "MoveCube/test/0"
 
 
 def task(folder: Path, source: MadeUpSource, kind: str, **options: Any) -> StageTask:
-    known = {"cameras": None, "codec": CODECS["av1-lossless"], "folder": folder}
-    return StageTask(kind, (source,), **{**known, **options})
+    return StageTask(BuildPlan(kind, (source,), (), **options), folder)
 
 
 def staged(
@@ -34,93 +38,25 @@ def staged(
     return task(folder, source, kind, **options)((0, episode), Worker(0))
 
 
-# --- cuts ----------------------------------------------------------------------------------------
-
-
-class Counted:
-    """Frames, and how many of them were asked for."""
-
-    def __init__(self, length: int, lesson: int | None):
-        self.source = MadeUpSource({NAME: (length, lesson)})
-        self.asked = 0
-        self.lesson = lesson
-        self.length = length
-
-    def __iter__(self) -> Iterator[Frame]:
-        for number in range(self.length):
-            self.asked += 1
-            yield self.source.frame(NAME, number, self.lesson)
-
-
-@pytest.mark.parametrize(("length", "lesson"), [(3, 1), (30, 12), (30, 29)])
-def test_a_demonstration_ends_with_the_first_live_frame(length: int, lesson: int) -> None:
-    frames = Counted(length, lesson)
-    stored = list(cut_demonstration(frames))
-    assert [frame.state[0] for frame in stored] == list(range(lesson + 1))
-    assert frames.asked == lesson + 1  # nothing beyond is read
-
-
-@pytest.mark.parametrize("length", [249, 250, 256, 1000])
-def test_a_unit_is_32_frames_eight_apart(length: int) -> None:
-    frames = Counted(length, None)
-    stored = list(cut_unit(frames))
-    assert [frame.state[0] for frame in stored] == [8 * number for number in range(32)]
-    assert frames.asked == 249
-
-
-@pytest.mark.parametrize(
-    ("cut", "length", "lesson", "told"),
-    [
-        (cut_demonstration, 5, 0, "no demonstration frame"),
-        (cut_demonstration, 0, 0, "no live observation after the demonstration"),
-        (cut_demonstration, 5, 5, "no live observation after the demonstration"),
-        (cut_unit, 248, None, "248 raw frames; a unit needs 249"),
-        (cut_unit, 0, None, "0 raw frames"),
-    ],
-)
-def test_what_yields_nothing(cut: Any, length: int, lesson: int | None, told: str) -> None:
-    with pytest.raises(NothingToStore, match=told):
-        list(cut(Counted(length, lesson)))
-
-
-def test_demonstrations_must_be_marked() -> None:
-    with pytest.raises(SourceError, match="does not mark") as caught:
-        list(cut_demonstration(Counted(5, None)))
-    assert "--columns is_demo=NAME" in str(caught.value.hint)
-
-
-# --- stage ---------------------------------------------------------------------------------------
-
-
 def test_a_demonstration(tmp_path: Path) -> None:
     made = staged(tmp_path, MadeUpSource({NAME: (40, 20)}))
-    known = made.staged
-    assert (known.length, known.exec_start_idx, known.skipped) == (21, 20, None)
+    known = made.record
+    assert (known.length, known.exec_start_idx) == (21, 20)
     assert known.goals == (f"do {NAME}",)
-    assert (known.seed, known.difficulty, known.simulator, known.exact) == (
-        7,
-        "easy",
-        "made-up",
-        True,
-    )
+    told = (known.seed, known.difficulty, known.simulator, known.exact)
+    assert told == (7, "easy", "made-up", True)
     front = np.stack([picture(f"{NAME} front", number) for number in range(21)])
     states = np.arange(21, dtype=np.float32)[:, None].repeat(8, 1)
     whole = {"observation.images.front": front, "observation.state": states, "action": 0 - states}
     assert known.feature_sha256 == {name: feature_digest(v) for name, v in whole.items()}
     assert known.lesson_sha256 == {name: feature_digest(v[:20]) for name, v in whole.items()}
-    assert known.features == {name: v.shape[1:] for name, v in whole.items()}
-    decoded = np.stack(list(iter_frames(made.video("front"), 0, None, 10)))
+    assert made.features == {name: v.shape[1:] for name, v in whole.items()}
+    decoded = np.stack(list(iter_frames(made.video("observation.images.front"), 0, None, 10)))
     np.testing.assert_array_equal(decoded, front)
     np.testing.assert_array_equal(made.vectors("action"), 0 - states)
-    stats = known.stats["observation.images.front"]
     pixels = front[:, ::4, ::4]  # every fourth row and column
-    assert stats["mean"] == pytest.approx(pixels.mean((0, 1, 2)))
-    assert stats["max"] == pytest.approx(pixels.max((0, 1, 2)))
-
-
-def test_a_unit_has_no_lesson(tmp_path: Path) -> None:
-    known = staged(tmp_path, MadeUpSource({NAME: (300, None)}), "distractors").staged
-    assert (known.length, known.exec_start_idx, known.lesson_sha256) == (32, None, None)
+    mean = made.stats("observation.images.front")["mean"]
+    np.testing.assert_allclose(mean, pixels.mean((0, 1, 2)))
 
 
 def test_an_episode_that_yields_nothing_is_remembered(tmp_path: Path) -> None:
@@ -139,11 +75,7 @@ def test_what_is_staged_is_not_read_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"cameras": ("front",)},
-        {"codec": CODECS["lerobot-default"]},
-        {"kind": "distractors"},
-    ],
+    [{"cameras": ("front",)}, {"codec": "lerobot-default"}, {"kind": "distractors"}],
 )
 def test_what_decides_the_content_decides_the_folder(
     tmp_path: Path, change: dict[str, Any]
@@ -151,7 +83,7 @@ def test_what_decides_the_content_decides_the_folder(
     source = MadeUpSource({NAME: (300, 20)})
     [episode] = source.episodes()
     one = task(tmp_path, source, "demonstrations")
-    other = dataclasses.replace(one, **change)
+    other = dataclasses.replace(one, plan=dataclasses.replace(one.plan, **change))
     assert one.place((0, episode)) != other.place((0, episode))
     moved = dataclasses.replace(episode, key=(300, 21))
     assert one.place((0, episode)) != one.place((0, moved))
@@ -168,13 +100,13 @@ def test_of_a_lossy_codec_the_decoded_frames_are_hashed(tmp_path: Path) -> None:
         for frame in [source.frame(NAME, number, 4)]
     }
     source.wrong[NAME] = big
-    made = staged(tmp_path, source, codec=CODECS["lerobot-default"])
-    decoded = np.stack(list(iter_frames(made.video("front"), 0, None, 10)))
-    digests = made.staged.feature_sha256, made.staged.lesson_sha256
+    made = staged(tmp_path, source, codec="lerobot-default")
+    decoded = np.stack(list(iter_frames(made.video("observation.images.front"), 0, None, 10)))
+    digests = made.record.feature_sha256, made.record.lesson_sha256
     assert digests[0]["observation.images.front"] == feature_digest(decoded)
     assert digests[1] is not None
     assert digests[1]["observation.images.front"] == feature_digest(decoded[:4])
-    assert not made.staged.exact
+    assert not made.record.exact
 
 
 def wrong_frame(**changes: Any) -> Frame:
@@ -186,11 +118,7 @@ def wrong_frame(**changes: Any) -> Frame:
     ("number", "frame", "told"),
     [
         (3, wrong_frame(state=np.full(8, np.nan, np.float32)), r"state of stored frame 3 is \[nan"),
-        (
-            0,
-            wrong_frame(state=np.full(8, np.inf, np.float32)),
-            "state of stored frame 0",
-        ),
+        (0, wrong_frame(state=np.full(8, np.inf, np.float32)), "state of stored frame 0"),
         (3, wrong_frame(action=np.full(8, np.nan, np.float32)), "action of stored frame 3"),
         (3, wrong_frame(state=np.zeros(8)), "expected finite float32"),
         (3, wrong_frame(state=np.zeros(7, np.float32)), "All frames of an episode"),
@@ -216,7 +144,7 @@ def test_an_unknown_camera(tmp_path: Path) -> None:
 
 def test_frames_too_small_for_a_lossy_codec(tmp_path: Path) -> None:
     with pytest.raises(BuildError, match="24×16 pixels are too small for lerobot-default"):
-        staged(tmp_path, MadeUpSource({NAME: (40, 20)}), codec=CODECS["lerobot-default"])
+        staged(tmp_path, MadeUpSource({NAME: (40, 20)}), codec="lerobot-default")
 
 
 def test_a_video_that_decodes_to_something_else(
@@ -230,3 +158,84 @@ def test_a_video_that_decodes_to_something_else(
     with pytest.raises(BuildError, match="does not decode to the frames"):
         staged(tmp_path, MadeUpSource({NAME: (40, 20)}))
     assert list(tmp_path.iterdir()) == []
+
+
+# --- statistics of images -------------------------------------------------------------------------
+
+IMAGES = st.tuples(st.integers(1, 5), st.integers(1, 13), st.integers(1, 13), st.just(3))
+
+
+@given(arrays(np.uint8, IMAGES))
+def test_statistics_against_numpy_in_any_order(images: NDArray[np.uint8]) -> None:
+    stats, backward = ImageStats(), ImageStats()
+    for image, last in zip(images, images[::-1], strict=True):
+        stats.add(image)
+        backward.add(last)
+    result = stats.result()
+    assert all(v.tobytes() == backward.result()[name].tobytes() for name, v in result.items())
+    pixels = images[:, ::4, ::4].reshape(-1, 3).astype(np.float64)  # every fourth row and column
+    assert result["count"].tolist() == [len(pixels)]
+    np.testing.assert_array_equal(result["min"], pixels.min(0))
+    np.testing.assert_array_equal(result["max"], pixels.max(0))
+    np.testing.assert_allclose(result["mean"], pixels.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(result["std"], pixels.std(0), rtol=1e-9, atol=1e-9)
+    for name, quantile in (("q01", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("q99", 0.99)):
+        # The smallest value that at least so many of the pixels do not exceed.
+        expected = np.quantile(pixels, quantile, axis=0, method="inverted_cdf")
+        np.testing.assert_array_equal(result[name], expected)
+
+
+# --- cuts ----------------------------------------------------------------------------------------
+
+DEMONSTRATIONS, DISTRACTORS = "demonstrations", "distractors"
+
+
+def marks(lesson: int | None, length: int) -> Generator[Frame]:
+    """Yield frames that only say their number, as state, and whether they are the lesson."""
+    for step in range(length):
+        shown = None if lesson is None else step < lesson
+        yield Frame({}, np.array([step], np.float32), None, shown)
+
+
+def steps(frames: Any) -> list[int]:
+    return [int(frame.state[0]) for frame in frames]
+
+
+def test_units_and_demonstrations() -> None:
+    # fmt: off
+    assert steps(CUTS[DISTRACTORS](marks(None, 249))) == [
+        0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120,
+        128, 136, 144, 152, 160, 168, 176, 184, 192, 200, 208, 216, 224, 232, 240, 248,
+    ]
+    # fmt: on
+    assert steps(CUTS[DEMONSTRATIONS](marks(3, 100))) == [0, 1, 2, 3]  # 3: the query frame
+
+
+@given(lesson=st.none() | st.integers(0, 400), length=st.integers(0, 400))
+def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
+    lesson: int | None, length: int
+) -> None:
+    for kind, needed in ((DISTRACTORS, 249), (DEMONSTRATIONS, (lesson or 0) + 1)):
+        read = marks(lesson, length)
+        try:
+            found = steps(CUTS[kind](read))
+        except (NothingToStore, SourceError):
+            assert length < needed or not lesson
+            continue
+        assert found == list(range(0, needed, 8 if kind == DISTRACTORS else 1))
+        assert steps(read) == list(range(needed, length))  # what is left
+
+
+@pytest.mark.parametrize(
+    ("kind", "lesson", "length", "reason"),
+    [
+        (DISTRACTORS, None, 248, "248 raw frames; a unit needs 249"),
+        (DEMONSTRATIONS, 0, 100, "no demonstration frame"),
+        (DEMONSTRATIONS, 100, 100, "no live observation after the demonstration"),
+    ],
+)
+def test_nothing_to_store(kind: str, lesson: int | None, length: int, reason: str) -> None:
+    with pytest.raises(NothingToStore, match=reason):
+        list(CUTS[kind](marks(lesson, length)))
+    with pytest.raises(SourceError, match=r"does not mark(.|\n)*build distractors"):
+        list(CUTS[DEMONSTRATIONS](marks(None, 10)))

@@ -5,7 +5,9 @@ import random
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,8 @@ from robomme_interference_data.files import sha256_file
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
 DATA = "distractors/data/chunk-000/file-003.parquet"
-VIDEO = "distractors/videos/observation.images.front/chunk-000/file-003.mp4"
+FRONT = "videos/observation.images.front"
+VIDEO = f"distractors/{FRONT}/chunk-000/file-003.mp4"
 HEADER = "manifests/manifest.json"
 ROWS = "manifests/buffers.parquet"
 
@@ -59,7 +62,8 @@ def first_changed(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
 
 def test_a_clean_split() -> None:
     counted: list[int] = []
-    assert list(verify_split(GOLDEN, advance=counted.append)) == []
+    shown = SimpleNamespace(start=lambda text, frames: None, advance=counted.append)
+    assert list(verify_split(GOLDEN, progress=shown)) == []
     assert counted == [49] * len(QUERIES) + [32] * UNITS
     assert found(GOLDEN) == []
 
@@ -102,14 +106,12 @@ def _expect_of_header(root: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [EPISODES, DATA, VIDEO, ROWS, "distractors/meta/tasks.parquet"])
-@pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_missing_and_cut_files(own_split: Path, path: str, damage: str) -> None:
+def test_missing_and_cut_files(own_split: Path, path: str) -> None:
     file = own_split / path
-    if damage == "missing":
-        file.unlink()
-    else:
-        file.write_bytes(file.read_bytes()[:-9])
-    expect(own_split, "missing|SHA-256|cannot be read", decode=path == VIDEO)
+    file.write_bytes(file.read_bytes()[:-9])
+    expect(own_split, "SHA-256|cannot be read", decode=path == VIDEO)
+    file.unlink()
+    expect(own_split, "missing", decode=path == VIDEO)
 
 
 @pytest.mark.parametrize("path", ["data/x.parquet", "videos/extra.mp4", "meta/more.json"])
@@ -131,17 +133,9 @@ def test_a_file_too_many(own_split: Path, path: str) -> None:
         (DATA, first_changed("episode_index", 4), "episode 3"),
         (EPISODES, first_changed("dataset_from_index", 7), "dataset_from_index"),
         (EPISODES, first_changed("dataset_to_index", 7), "dataset_to_index"),
-        (
-            EPISODES,
-            first_changed("videos/observation.images.front/to_timestamp", 1.0),
-            "to_timestamp",
-        ),
-        (
-            EPISODES,
-            first_changed("videos/observation.images.front/from_timestamp", 0.5),
-            "from_timestamp",
-        ),
-        (EPISODES, first_changed("videos/observation.images.front/file_index", 1), "is shared by"),
+        (EPISODES, first_changed(f"{FRONT}/to_timestamp", 1.0), "to_timestamp"),
+        (EPISODES, first_changed(f"{FRONT}/from_timestamp", 0.5), "from_timestamp"),
+        (EPISODES, first_changed(f"{FRONT}/file_index", 1), "is shared by"),
         (EPISODES, first_changed("data/file_index", 1), "is shared by episodes"),
         (EPISODES, first_changed("tasks", ["another"]), "tasks of"),
         (EPISODES, first_changed("goals", ["another"]), "revision is"),
@@ -166,52 +160,37 @@ def test_tables_that_mean_something_else(
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "told"),
+    ("name", "field", "value", "told"),
     [
-        ("meta/stats.json", lambda v: {}, "stats.json: has no finite statistics"),
-        (
-            "meta/stats.json",
-            lambda v: {**v, "action": {"mean": [float("nan")]}},
-            "no finite statistics of action",
-        ),
-        ("meta/info.json", lambda v: {**v, "total_frames": 1}, "total_frames is 1"),
-        ("meta/info.json", lambda v: {**v, "total_episodes": 1}, "does not list the episodes"),
-        ("meta/info.json", lambda v: {**v, "splits": {}}, "splits is {}"),
-        ("meta/info.json", lambda v: {**v, "features": None}, "features is None"),
-        ("meta/info.json", lambda v: {**v, "fps": "10"}, "fps is '10'"),
-        (
-            "meta/info.json",
-            lambda v: {**v, "video_path": "../../etc/{video_key}"},
-            "leads out of it",
-        ),
-        (
-            "meta/info.json",
-            lambda v: {**v, "video_path": "{video_key.__class__}"},
-            "cannot be filled in",
-        ),
-        ("meta/interference.json", lambda v: {**v, "codec": "h264"}, "codec 'h264' is unknown"),
-        ("meta/interference.json", lambda v: {**v, "unit": None}, "unit is None"),
-        ("meta/interference.json", lambda v: {**v, "kind": "demonstrations"}, "kind is"),
-        ("meta/interference.json", lambda v: {**v, "exact": False}, "exact is False"),
-        ("meta/interference.json", lambda v: {**v, "sources": 3}, "sources: 3"),
-        (
-            "meta/interference.json",
-            lambda v: {**v, "counts": {**v["counts"], "frames": 1}},
-            "counts is",
-        ),
+        ("stats", "action", None, "stats.json: has no finite statistics of action"),
+        ("stats", "action", {"mean": [float("nan")]}, "no finite statistics of action"),
+        ("info", "total_frames", 1, "total_frames is 1"),
+        ("info", "total_episodes", 1, "does not list the episodes"),
+        ("info", "splits", {}, "splits is {}"),
+        ("info", "features", None, "features is None"),
+        ("info", "fps", "10", "fps is '10'"),
+        ("info", "video_path", "../../etc/{video_key}", "leads out of it"),
+        ("info", "video_path", "{video_key.__class__}", "cannot be filled in"),
+        ("interference", "codec", "h264", "codec 'h264' is unknown"),
+        ("interference", "unit", None, "unit is None"),
+        ("interference", "kind", "demonstrations", "kind is"),
+        ("interference", "exact", False, "exact is False"),
+        ("interference", "sources", 3, "sources: 3"),
+        ("interference", "cameras", ["front"], "cameras is"),
+        ("interference", "counts", {"episodes": 17, "frames": 1, "families": {}}, "counts is"),
     ],
 )
 def test_json_that_means_something_else(
-    own_split: Path, name: str, change: Callable[[Any], Any], told: str
+    own_split: Path, name: str, field: str, value: Any, told: str
 ) -> None:
-    path = own_split / "distractors" / name
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    path = own_split / f"distractors/meta/{name}.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     renew_sums(own_split / "distractors")
     expect(own_split, told)
 
 
 def test_frames_that_are_not_the_hashed_ones(own_split: Path) -> None:
-    videos = own_split / "distractors/videos/observation.images.front/chunk-000"
+    videos = own_split / f"distractors/{FRONT}/chunk-000"
     shutil.copyfile(videos / "file-005.mp4", videos / "file-003.mp4")
     renew_sums(own_split / "distractors")
     expect(own_split, r"observation\.images\.front \(frames\) does not have", decode=True)
@@ -251,12 +230,6 @@ def renew_header(root: Path, **changes: Any) -> None:
         (first_changed("lesson_share", 0.5), r"lesson_share is 0\.5; the rules give 0\.0"),
         (first_changed("goals", ["x"]), "goals is 'x' at 0; the rules give"),
         (first_changed("history_frames", 5), "the sessions hold 0 frames"),
-        (
-            lambda t: put(
-                t, "sessions", [*t["sessions"].to_pylist()[:1], [], *t["sessions"].to_pylist()[2:]]
-            ),
-            "the sessions hold 0 frames",
-        ),
     ],
 )
 def test_rows_that_the_rules_do_not_give(
@@ -311,12 +284,7 @@ def audited(root: Path, queries: list[Any], units: list[Any], *conditions: str) 
     return audit_split(load_split(root))
 
 
-def query(name: str, **changes: Any) -> Any:
-    return record("demonstrations", name, **changes)
-
-
-def unit(name: str, **changes: Any) -> Any:
-    return record("distractors", name, **changes)
+query, unit = partial(record, "demonstrations"), partial(record, "distractors")
 
 
 def test_use_by_hand(tmp_path: Path) -> None:
@@ -328,20 +296,13 @@ def test_use_by_hand(tmp_path: Path) -> None:
         *("no-history", "k0", "k1"),
     )
     assert report.leaks == []
-    assert {
-        name: {str(one): n for one, n in uses.items()} for name, uses in report.uses.items()
-    } == {
-        "no-history": {"MoveCube/train/0": 0, "Drawer/train/5": 0},
-        "k0": {"MoveCube/train/0": 0, "Drawer/train/5": 0},
-        "k1": {"MoveCube/train/0": 1, "Drawer/train/5": 2},
-    }
+    used = {name: list(uses.values()) for name, uses in report.uses.items()}
+    assert used == {"no-history": [0, 0], "k0": [0, 0], "k1": [1, 2]}
     uses, families = report.tables()
     assert uses.rows[2] == ("k1", 2, 1, 1.5, 2, 0)
     assert families.rows == (("MoveCube", 1, 1, 1, 1, 1), ("Drawer", 1, 2, 2, 2, 2))
-    assert json.loads(json.dumps(report.as_dict()))["units"] == {
-        "MoveCube/train/0": 1,
-        "Drawer/train/5": 2,
-    }
+    units = json.loads(json.dumps(report.as_dict()))["units"]
+    assert units == {"MoveCube/train/0": 1, "Drawer/train/5": 2}
 
 
 def test_the_golden_split_leaks_nothing() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.identity import counts_of, revision_of
-from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
+from robomme_interference_data.build_dataset.identity import identity_of
+from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
 from robomme_interference_data.build_dataset.sources.base import choose_cameras
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
@@ -21,7 +21,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.files import LocalFiles, write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import DatasetIdentity, EpisodeRecord
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 SHAPES = {"observation.images.front": (4, 6, 3), "observation.state": (8,)}
@@ -67,11 +67,7 @@ def write_metadata(root: Path, kind: str, records: Iterable[EpisodeRecord]) -> D
         "video_path": "videos/{video_key}/file-{file_index:03d}.mp4",
     }
     write_json(root / INFO_PATH, info)
-    unit = {"frames": 32, "stride": 8} if kind == "distractors" else None
-    identity = DatasetIdentity(
-        1, kind, "1.0.0", revision_of(listed), True, "av1-lossless", ("front",), unit, (), (),
-        counts_of(listed), "0" * 64,
-    )  # fmt: skip
+    identity = identity_of(listed, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
     path = root / EPISODES_DIR / "file-000.parquet"
     path.parent.mkdir(parents=True)
@@ -80,7 +76,7 @@ def write_metadata(root: Path, kind: str, records: Iterable[EpisodeRecord]) -> D
 
 
 @dataclass
-class MadeUpSource:
+class MadeUpSource(Source):
     """A source in memory; what it does wrong is asked for by episode.
 
     Attributes:
@@ -92,14 +88,8 @@ class MadeUpSource:
     lengths: dict[str, tuple[int, int | None]]
     wrong: dict[str, dict[int, Any]] = field(default_factory=dict)
     actions: bool = True
-    kind: str = "made-up"
-    whole: bool = True
-    time_limit: float = 60.0
     cameras: tuple[str, ...] = ("front",)
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        return {"kind": self.kind}
+    provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "made-up"})
 
     def episodes(self) -> list[SourceEpisode]:
         return sorted(
@@ -111,9 +101,6 @@ class MadeUpSource:
         chosen = choose_cameras(cameras, self.cameras)
         frames = self._frames(str(episode.id), chosen)
         return Recording((f"do {episode.id}",), 7, "easy", "made-up", True, frames)
-
-    def close(self) -> None:
-        pass
 
     def _frames(self, name: str, cameras: tuple[str, ...]) -> Generator[Frame]:
         length, lesson = self.lengths[name]

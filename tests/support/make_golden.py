@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
-from robomme_interference_data.build_dataset.build import BuildPlan, build_dataset
-from robomme_interference_data.build_dataset.config import list_episodes
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.console import WorkProgress

@@ -31,6 +31,15 @@ def copy_split(folder: Path) -> Path:
     return Path(shutil.copytree(GOLDEN, folder))
 
 
+def contents(root: Path) -> dict[str, bytes]:
+    """Return all files under a folder."""
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
 def dataset(root: Path, name: str) -> Dataset:
     """Open a dataset of a split."""
     return Dataset(LocalFiles(root / name))

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 from support.build_server import BuildServer
+from support.splits import contents
 
-from robomme_interference_data.build_dataset.build import work_folder
 from robomme_interference_data.build_dataset.stage import read_staged
+from robomme_interference_data.files import work_folder
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 
@@ -31,14 +32,6 @@ def command(out: Path, workers: int = 2) -> list[str]:
     """Build six units and one that is too short, of small cameras."""
     options = ["--cameras", "front", "--workers", str(workers), "--out", str(out)]
     return ["build", "distractors", "--source", "sample:MoveCube,PatternLock", *options]
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +59,17 @@ def staged(out: Path) -> dict[Path, int]:
     }
 
 
-def disturb(
+@pytest.mark.parametrize("times", [2, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_stopped_at_random_moments(
     server: BuildServer,
-    out: Path,
     undisturbed: tuple[dict[str, bytes], float],
+    tmp_path: Path,
     sent: signal.Signals,
     times: int,
 ) -> None:
     """Stop builds of one output at random moments, then let one complete."""
+    out = tmp_path / "out"
     expected, duration = undisturbed
     moments = random.Random(sent)
     for _ in range(times):
@@ -100,27 +96,6 @@ def disturb(
     assert finished.code == 0, finished.stderr
     assert contents(out) == expected
     assert [path.name for path in out.parent.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_stopped_at_random_moments(
-    server: BuildServer,
-    undisturbed: tuple[dict[str, bytes], float],
-    tmp_path: Path,
-    sent: signal.Signals,
-) -> None:
-    disturb(server, tmp_path / "out", undisturbed, sent, times=2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_stopped_at_many_random_moments(
-    server: BuildServer,
-    undisturbed: tuple[dict[str, bytes], float],
-    tmp_path: Path,
-    sent: signal.Signals,
-) -> None:
-    disturb(server, tmp_path / "out", undisturbed, sent, times=12)
 
 
 def test_a_worker_that_is_killed_is_replaced(

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from robomme_interference_data import load_buffer
-from robomme_interference_data.build_dataset.build import BuildPlan, build_dataset
-from robomme_interference_data.build_dataset.config import list_episodes
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify import verify_split

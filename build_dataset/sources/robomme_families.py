@@ -1,0 +1,80 @@
+"""RoboMME's sixteen families: how their seeds, their recordings and their goals tell them apart.
+
+A goal's rule names words that every wording has and, where two families share those, words that
+it never has. Colours, numbers, order of clauses, case and punctuation are free, so that older and
+newer wordings of the recordings pass. The rules are ours, made to tell the families apart;
+`VideoUnmask` and `VideoUnmaskSwap` have the same goals in RoboMME and cannot be told apart.
+"""
+
+import re
+from typing import NamedTuple
+
+__all__ = ["BLOCKS", "ROBOMME", "families_for_goal"]
+
+
+class _Family(NamedTuple):
+    """A family.
+
+    Attributes:
+        code: Its number in RoboMME's seeds.
+        block: Place of its 100 episodes in RoboMME's LeRobot datasets, which have no family column
+            (`lerobot/robomme`, `Yinpei/robomme_data_lerobot`).
+        has: Patterns that a goal must all have.
+        lacks: Patterns of which a goal may have none.
+    """
+
+    code: int
+    block: int
+    has: tuple[str, ...]
+    lacks: tuple[str, ...] = ()
+
+
+_VIDEO = r"\bvideo\b"
+_HIDDEN = r"\bcontainers?\b.*\bhid(?:e|es|ing|den)\b"
+_SAME_OBJECT = r"\bsame (?:\w+ )?(?:cube|block)\b"
+_ON_TARGET = r"\bplace\b.*\bcube on the\b.*\btarget\b"
+_ORDINAL = r"(?:first|second|third|\w+th|\d+(?:st|nd|rd|th)|last)"  # fourth, fifth, … twentieth
+
+ROBOMME = {
+    # counting
+    "BinFill": _Family(4, 12, (r"\bcubes?\b.*\b(?:in|into) the bin\b",)),
+    "PickXtimes": _Family(
+        1, 5, (r"\bpick up\b.*\bcube\b.*\bplace it on the target\b",), (_VIDEO, r"\bleft\b")
+    ),
+    "SwingXtimes": _Family(3, 7, (r"\bcube\b.*\bright[- ]side target\b.*\bleft[- ]side target\b",)),
+    "StopCube": _Family(2, 6, (r"\bstop the cube\b.*\btarget\b",)),
+    # permanence
+    "VideoUnmask": _Family(6, 15, (_VIDEO, _HIDDEN)),
+    "VideoUnmaskSwap": _Family(5, 4, (_VIDEO, _HIDDEN)),
+    "ButtonUnmask": _Family(8, 2, (r"\bpress the button\b", _HIDDEN), (_VIDEO, r"\bbuttons\b")),
+    "ButtonUnmaskSwap": _Family(7, 1, (r"\bpress\b.*\bbuttons\b", _HIDDEN), (_VIDEO,)),
+    # reference
+    "PickHighlight": _Family(12, 8, (r"\bcubes?\b", r"\bhighlight")),
+    "VideoRepick": _Family(9, 14, (_VIDEO, r"\bpick(?:ed)? up\b", _SAME_OBJECT)),
+    "VideoPlaceButton": _Family(
+        10, 3, (_VIDEO, _ON_TARGET, r"\b(?:before|after) the button was pressed\b")
+    ),
+    "VideoPlaceOrder": _Family(
+        11, 13, (_VIDEO, _ON_TARGET, rf"\b{_ORDINAL} target\b"), (r"\bbutton was pressed\b",)
+    ),
+    # imitation
+    "MoveCube": _Family(14, 9, (_VIDEO, r"\bmove the cube\b", r"\bsame (?:manner|way)\b")),
+    "InsertPeg": _Family(13, 10, (_VIDEO, r"\bpeg\b", r"\binsert\b")),
+    "PatternLock": _Family(15, 0, (_VIDEO, r"\b(?:re)?trace\b", r"\bsame (?:pattern|path)\b")),
+    "RouteStick": _Family(16, 11, (_VIDEO, r"\bnavigate around the sticks\b")),
+}
+"""By name."""
+
+BLOCKS = tuple(sorted(ROBOMME, key=lambda name: ROBOMME[name].block))
+"""The families in the order of their blocks."""
+
+
+def families_for_goal(goal: str) -> tuple[str, ...]:
+    """Return RoboMME's families that a goal text can belong to; empty if to none."""
+    text = " ".join(goal.lower().split())
+    return tuple(
+        family
+        for family, (_, _, has, lacks) in ROBOMME.items()
+        if all(re.search(pattern, text) for pattern in has)
+        and not any(re.search(pattern, text) for pattern in lacks)
+    )
