@@ -12,8 +12,6 @@ from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Column, Table
 
-__all__ = ["Audit", "Leak", "audit_split"]
-
 
 @dataclass(frozen=True)
 class Leak:

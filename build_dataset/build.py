@@ -39,8 +39,6 @@ from robomme_interference_data.execution import Executor, Outcome
 from robomme_interference_data.files import canonical_json, working
 from robomme_interference_data.records import EpisodeRecord
 
-__all__ = ["BuildResult", "build_dataset"]
-
 _ADVICE = "Choose another --out, or remove the folder first."
 
 

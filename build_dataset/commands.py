@@ -28,8 +28,6 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.settings import with_settings
 
-__all__ = ["app", "audit", "verify"]
-
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",

@@ -22,16 +22,6 @@ from robomme_interference_data.settings import setting
 if TYPE_CHECKING:
     from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
 
-__all__ = [
-    "BuildConfig",
-    "BuildPlan",
-    "PlanConfig",
-    "list_episodes",
-    "plan_all",
-    "plan_build",
-    "position_limit",
-]
-
 _CPUS = os.cpu_count() or 1
 
 

@@ -17,8 +17,6 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import SourceError
 
-__all__ = ["CUTS", "NothingToStore", "cut_demonstration", "cut_unit"]
-
 
 class NothingToStore(Exception):
     """An episode yields nothing; the text says why."""

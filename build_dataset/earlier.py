@@ -16,8 +16,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.records import EpisodeRecord
 
-__all__ = ["Earlier", "EarlierEpisode", "read_earlier"]
-
 
 @dataclass(frozen=True)
 class EarlierEpisode:

@@ -42,8 +42,6 @@ from robomme_interference_data.files import (
 from robomme_interference_data.records import Counts, DatasetIdentity, EpisodeRecord
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
-__all__ = ["complete_dataset", "identity_of", "listed_files"]
-
 _LEROBOTS = ("episode_index", "length")
 """Fields of a record that LeRobot writes."""
 

@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STATISTICS", "ImageStats", "before_scaling"]
-
 STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 """Names of the statistics in LeRobot's order, which is that of its columns."""
 

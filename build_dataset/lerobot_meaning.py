@@ -20,8 +20,6 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import read_json
 from robomme_interference_data.parquet import RowSpan
 
-__all__ = ["lerobot_violations"]
-
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
 

@@ -24,8 +24,6 @@ from robomme_interference_data.encode import Codec
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.records import EpisodeRecord
 
-__all__ = ["StoredEpisode", "load_lerobot", "require_lerobot", "write_lerobot"]
-
 _OWN_FILES_MB = 1e-6
 """Bound on the size of a file, a byte: no episode shares one with another."""
 

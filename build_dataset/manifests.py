@@ -57,8 +57,6 @@ from robomme_interference_data.records import (
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 from robomme_interference_data.sampling import lesson_frames, lesson_share
 
-__all__ = ["ManifestPlan", "plan_manifests", "planned_buffers", "write_manifests"]
-
 _BATCH = 1024
 """Rows in a row group: few bytes find one buffer."""
 

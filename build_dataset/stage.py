@@ -31,8 +31,6 @@ from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.video import iter_frames
 
-__all__ = ["StageTask", "Staged", "StagedEpisode", "read_staged"]
-
 _RECORD = "record.json"
 _LAYOUT = 3
 """Version of a staged episode's folder."""

@@ -30,8 +30,6 @@ from robomme_interference_data.records import EpisodeRecord, ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.split import load_split
 
-__all__ = ["Violation", "verify_split"]
-
 
 @dataclass(frozen=True)
 class Violation:

@@ -9,8 +9,6 @@ from robomme_interference_data.errors import RolloutError
 from robomme_interference_data.query import Query
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 
-__all__ = ["STATE_TOLERANCE", "check_episode", "check_lesson"]
-
 STATE_TOLERANCE = 0.01
 """How far, rad or m, the first live state may be from the recorded one: on another machine floating
 point differs in its last bits, and an episode of another version of the suite by more."""

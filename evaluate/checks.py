@@ -36,8 +36,6 @@ from robomme_interference_data.simulators.registry import (
 )
 from robomme_interference_data.split import Split
 
-__all__ = ["applicable", "check_plan", "check_settings", "check_simulator", "default_system"]
-
 
 def default_system(config: RunConfig) -> str:
     """Return the name under which rows stand if none is given.

@@ -22,8 +22,6 @@ from robomme_interference_data.sampling import spread
 from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.strip import session_colors
 
-__all__ = ["Clip", "check_drawing", "clip_name", "history_picture"]
-
 _VIEW = 256  # side of a camera's picture
 _WIDTH = 4 * _VIEW  # history to the left, then front and wrist, then the facts
 _HEAD = 24

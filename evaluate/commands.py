@@ -15,8 +15,6 @@ from robomme_interference_data.console import (
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.settings import with_settings
 
-__all__ = ["evaluate", "merge"]
-
 
 @with_settings
 def evaluate(config: RunConfig, as_json: AsJson = False) -> None:

@@ -9,8 +9,6 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import Rollout
 from robomme_interference_data.settings import setting
 
-__all__ = ["Run", "RunConfig"]
-
 
 @dataclass(frozen=True)
 class RunConfig:

@@ -24,20 +24,6 @@ from robomme_interference_data.files import atomic_path, canonical_json, hold, w
 from robomme_interference_data.records import FINAL, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
-__all__ = [
-    "ERRORS_LOG",
-    "RunHeader",
-    "RunLog",
-    "Start",
-    "check_same_run",
-    "count_statuses",
-    "is_done",
-    "open_log",
-    "read_record",
-    "read_run",
-    "whole_lines",
-]
-
 ERRORS_LOG = "errors.log"
 
 

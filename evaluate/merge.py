@@ -17,8 +17,6 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import TIMING_COLUMNS, Rollout
 from robomme_interference_data.rows import to_dict
 
-__all__ = ["Merged", "merge_runs"]
-
 _OWN = frozenset({*TIMING_COLUMNS, "attempt", "video"})
 """Columns in which two runs of the same rollout may differ."""
 

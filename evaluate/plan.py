@@ -11,8 +11,6 @@ from robomme_interference_data.errors import InvalidOptionError, UnknownNameErro
 from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers
 from robomme_interference_data.records import Rollout
 
-__all__ = ["Plan", "WorkItem", "plan_work", "shuffle_work"]
-
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 
 

@@ -16,8 +16,6 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.tables import Column, Table
 
-__all__ = ["RunProgress", "rate_table"]
-
 
 class RunProgress:
     """A table of successes so far, a bar, and the time left, on stderr.

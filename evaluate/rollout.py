@@ -28,8 +28,6 @@ from robomme_interference_data.split import Split
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
 
-__all__ = ["read_ahead", "run_rollout"]
-
 _FRAMES_AHEAD = 256
 """Frames of the history that are decoded ahead at most: 50 MB of a camera of 256 × 256."""
 

@@ -43,8 +43,6 @@ from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.split import Split, load_split
 
-__all__ = ["Listener", "RunResult", "run_evaluation"]
-
 _PACKAGES = ("robomme-interference-data", "numpy", "av", "mani-skill", "sapien", "torch")
 
 _ERROR_LETTERS = 2000

@@ -15,17 +15,6 @@ from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
 from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
 
-__all__ = [
-    "PAPER_SYSTEMS",
-    "SYSTEMS",
-    "System",
-    "base_of",
-    "check_history",
-    "display_name",
-    "is_bound",
-    "name_system",
-]
-
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _TOO_ALIKE = 0.9  # of difflib's ratio: one letter in ten
 

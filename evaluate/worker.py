@@ -23,8 +23,6 @@ from robomme_interference_data.split import Split, load_split
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
 
-__all__ = ["RolloutTask", "make_selector", "simulator_options"]
-
 
 class RolloutTask:
     """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.

@@ -20,8 +20,6 @@ from robomme_interference_data.retrieval.grade import ALL, grade
 from robomme_interference_data.retrieval.select import Measured, Rule
 from robomme_interference_data.tables import Table
 
-__all__ = ["Calibration", "Trial", "calibrate", "sweep_steps"]
-
 _DIGITS = 6
 
 

@@ -10,8 +10,6 @@ from robomme_interference_data.drawing import GREY, INK, open_figure, save_figur
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell
 
-__all__ = ["draw_calibration", "draw_cells"]
-
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
 _MARKERS = "osD^vPX"
 _SHARES = ("purity", "coverage")

@@ -19,8 +19,6 @@ from robomme_interference_data.errors import InvalidOptionError, MissingFileErro
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.select import Measured
 
-__all__ = ["calibrate", "index", "retrieval_score", "retrieve"]
-
 SplitFolder = Annotated[Path, typer.Argument(help="Folder of the split.")]
 EncoderName = Annotated[
     str,

@@ -13,8 +13,6 @@ from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import MIN_FRAMES, Choice, Measured
 from robomme_interference_data.strip import LESSON_COLOR, session_colors
 
-__all__ = ["draw_retrieval"]
-
 # Inches.
 _WIDTH, _HEIGHT = 7.2, 6.1
 _LEFT, _RIGHT = 0.55, 7.1  # of what shares the axis of frames

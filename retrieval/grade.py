@@ -19,8 +19,6 @@ from robomme_interference_data.retrieval.select import Measured, Rule, choose
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 
-__all__ = ["ALL", "PASS_MARK", "Cell", "Grade", "cell_table", "cells", "grade", "verdict"]
-
 PASS_MARK = 0.9
 """Least mean purity and mean coverage of a good cell (released reference)."""
 

@@ -59,8 +59,6 @@ from robomme_interference_data.retrieval.encoders import Encoder, encoder_digest
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.rows import to_dict
 
-__all__ = ["IndexReport", "build_index"]
-
 
 @dataclass(frozen=True)
 class IndexReport:

@@ -10,8 +10,6 @@ from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import METHODS, Choice, Measured, Rule
 from robomme_interference_data.tables import percent
 
-__all__ = ["Reasons", "reasons"]
-
 
 @dataclass(frozen=True)
 class Reasons:

@@ -8,8 +8,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Span", "adjacent_cosines", "cosines", "segments", "typical_cosine"]
-
 Span = tuple[int, int]
 """First frame, and the one after the last."""
 

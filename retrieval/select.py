@@ -19,9 +19,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Session
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines, segments
 
-__all__ = ["METHODS", "MIN_FRAMES", "Choice", "Measured", "Rule"]
-__all__ += ["choose", "measure", "parse_rules"]
-
 ADAPTIVE: Final = "adaptive"
 
 MIN_FRAMES = 4

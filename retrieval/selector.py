@@ -18,8 +18,6 @@ from robomme_interference_data.retrieval.encoders import (
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import Rule, choose, measure
 
-__all__ = ["Selector"]
-
 
 class Selector:
     """Chooses the span of a history that goes with what the robot sees.

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.stats import newcombe_paired
 
-__all__ = ["DRAWS", "LEAST", "Floats", "Interval", "bootstrap", "enough", "paired_interval"]
-__all__ += ["Statistic", "difference", "mean", "retention", "slope"]
-
 Floats = NDArray[np.float64]
 
 DRAWS = 10_000

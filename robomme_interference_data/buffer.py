@@ -30,8 +30,6 @@ from robomme_interference_data.records import (
     place_sessions,
 )
 
-__all__ = ["Buffer", "Chunk"]
-
 _PIECE = 128
 """Frames that one thread decodes at a time: a multiple of the key frame distance (16)."""
 

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.files import atomic_path
 
-__all__ = ["DecodedCache", "default_cache_folder"]
-
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
 
 _told: set[Path] = set()

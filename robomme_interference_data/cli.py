@@ -20,8 +20,6 @@ from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.settings import spread_values
 from robomme_interference_data.simulators import commands as simulating
 
-__all__ = ["app", "main"]
-
 
 class _Root(TyperGroup):
     """Keeps the order of `_GROUPS`, and lets options take several values: `--conditions k0 k7`."""

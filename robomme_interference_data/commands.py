@@ -9,8 +9,6 @@ import typer
 
 from robomme_interference_data.console import MESSAGES, AsJson, print_json
 
-__all__ = ["doctor", "list_buffers", "show"]
-
 
 def list_buffers(
     split: Annotated[Path, typer.Argument(help="Folder of the split.")],

@@ -13,17 +13,6 @@ from robomme_interference_data.constants import MAX_K
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.records import SessionEntry
 
-__all__ = [
-    "DEFAULT_CONDITIONS",
-    "KINDS",
-    "NO_HISTORY",
-    "Condition",
-    "Kind",
-    "Material",
-    "in_order",
-    "parse_condition",
-]
-
 NO_HISTORY = "no-history"
 """The condition with an empty buffer (paper)."""
 

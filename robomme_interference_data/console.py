@@ -22,8 +22,6 @@ from rich.progress import (
 )
 from rich.text import Text
 
-__all__ = ["MESSAGES", "AsJson", "WorkProgress", "command_line", "print_json", "stoppable"]
-
 MESSAGES = Console(stderr=True, soft_wrap=True, markup=False, emoji=False, highlight=False)
 """What commands say beside their output: lines are never wrapped, so that paths can be copied."""
 

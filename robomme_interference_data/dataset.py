@@ -26,8 +26,6 @@ from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.records import DatasetIdentity, EpisodeRecord
 from robomme_interference_data.rows import from_dict, read_header
 
-__all__ = ["Dataset", "camera_feature"]
-
 
 def camera_feature(camera: str) -> str:
     """Return the feature name of a camera, whether `observation.images.` is given or not."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.files import canonical_json
 
-__all__ = ["FeatureDigests", "combine", "feature_digest"]
-
 
 def combine(digests: Mapping[str, str]) -> str:
     """Return the digest of a span from the digests of its features, by feature name."""

@@ -21,8 +21,6 @@ from packaging.requirements import Requirement
 from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.tables import Column, Table
 
-__all__ = ["Check", "any_failed", "checks", "report"]
-
 DISTRIBUTION = "robomme-interference-data"
 
 CODECS = (("libaom-av1", "w"), ("libsvtav1", "w"), ("libdav1d", "r"))

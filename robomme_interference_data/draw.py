@@ -29,8 +29,6 @@ from robomme_interference_data.constants import FAMILIES, RULE_VERSION
 from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["UnitPool"]
-
 
 class UnitPool:
     """The distractor units that buffers draw from.

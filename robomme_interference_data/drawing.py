@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
 from robomme_interference_data.files import atomic_path
 
-__all__ = ["GREY", "INK", "Page", "ink_on", "open_figure", "open_page", "save_figure"]
-__all__ += ["tidy", "tint"]
-
 INK, GREY = "#222222", "#767676"
 
 _DPI = 180

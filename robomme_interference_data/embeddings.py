@@ -31,18 +31,6 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import Files, LocalFiles, parse_sums, sha256_file
 from robomme_interference_data.rows import read_header
 
-__all__ = [
-    "CENTRE_FILE",
-    "INDEX_SUMS",
-    "EmbeddingIndex",
-    "EncoderRecord",
-    "IndexHeader",
-    "encoder_id",
-    "episode_file",
-    "index_folder",
-    "normalised",
-]
-
 CENTRE_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import BuildError, InvalidOptionError
 
-__all__ = ["CLIP", "CODECS", "RECORDING", "Codec", "VideoEncoder", "get_codec"]
-
 
 @dataclass(frozen=True)
 class Codec:

@@ -10,45 +10,6 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, Self
 
-__all__ = [
-    "InterferenceError",
-    # what was asked for
-    "InvalidIdError",
-    "UnknownNameError",
-    "InvalidOptionError",
-    "MissingExtraError",
-    # what was read
-    "MissingFileError",
-    "HubError",
-    "FormatError",
-    "HashMismatchError",
-    "TruncatedVideoError",
-    "SourceError",
-    "BadRowsError",
-    "MissingIndexError",
-    "StaleIndexError",
-    # what was to be written
-    "BuildError",
-    "PoolTooSmallError",
-    "HistoryTooLongError",
-    # simulators
-    "NoRendererError",
-    "MotionError",
-    "SimulatorCrashError",
-    # evaluation
-    "PolicyError",
-    "PolicyServerError",
-    "WireError",
-    "RolloutError",
-    "RunFolderError",
-    # processes
-    "WorkerError",
-    "WorkerRetiredError",
-    # helpers
-    "first_line",
-    "nearest",
-]
-
 
 class InterferenceError(Exception):
     """Base of all errors of this package.

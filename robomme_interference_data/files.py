@@ -19,22 +19,6 @@ from robomme_interference_data.errors import (
     MissingFileError,
 )
 
-__all__ = [
-    "Files",
-    "LocalFiles",
-    "atomic_path",
-    "canonical_json",
-    "format_sums",
-    "hold",
-    "parse_sums",
-    "read_json",
-    "sha256_file",
-    "work_folder",
-    "working",
-    "write_json",
-    "write_text",
-]
-
 
 class Files(Protocol):
     """The one way in which this package reaches the files of a dataset or split.

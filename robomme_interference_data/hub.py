@@ -19,8 +19,6 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.files import LocalFiles, check_relative
 
-__all__ = ["HubFiles", "locate"]
-
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 

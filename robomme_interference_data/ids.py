@@ -8,8 +8,6 @@ from typing import Self
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, nearest
 
-__all__ = ["EpisodeId", "format_numbers", "parse_numbers"]
-
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")

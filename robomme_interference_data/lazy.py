@@ -7,11 +7,9 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-__all__ = ["lazily"]
-
 
 def lazily(package: str, *modules: str) -> Callable[[str], Any]:
-    """Return a package's `__getattr__`, which looks for a name in `__all__` of its modules.
+    """Return a package's `__getattr__`, which finds what its `__all__` names in its modules.
 
     Args:
         package: Its `__name__`.
@@ -21,8 +19,7 @@ def lazily(package: str, *modules: str) -> Callable[[str], Any]:
     def find(name: str) -> Any:
         if name in import_module(package).__all__:
             for module in modules:
-                found = import_module(module, package)
-                if name in found.__all__:
+                if hasattr(found := import_module(module, package), name):
                     return getattr(found, name)
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 

@@ -30,8 +30,6 @@ from robomme_interference_data.lerobot_layout import (
 )
 from robomme_interference_data.parquet import RowSpan, open_parquet, reading
 
-__all__ = ["LeRobotFiles"]
-
 _V21_EPISODES = "meta/episodes.jsonl"
 _V21_TASKS = "meta/tasks.jsonl"
 _ROWS_KEPT = 1024

@@ -7,8 +7,6 @@ from typing import Any
 
 from robomme_interference_data.errors import FormatError
 
-__all__ = ["VERSIONS", "EpisodePlace", "check_info", "fill_template", "place_episode"]
-
 VERSIONS = ("v3.0", "v2.1")
 
 _MAX_VALUES = 1 << 28

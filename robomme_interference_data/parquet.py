@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, InterferenceError
 
-__all__ = ["RowSpan", "is_listed", "open_parquet", "reading"]
-
 _IMAGES_AT_ONCE = 8
 
 

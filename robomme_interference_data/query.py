@@ -11,8 +11,6 @@ from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord, QueryFrame
 
-__all__ = ["Query"]
-
 
 @dataclass(frozen=True)
 class Query:

@@ -13,21 +13,6 @@ from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = [
-    "KEY_COLUMNS",
-    "ROLES",
-    "TIMING_COLUMNS",
-    "BufferManifest",
-    "DatasetIdentity",
-    "EpisodeRecord",
-    "ManifestHeader",
-    "QueryFrame",
-    "Rollout",
-    "Session",
-    "SessionEntry",
-    "Status",
-]
-
 ROLES = ("lesson", "distractor", "filler", "contradiction")
 """What a session is to its query: its own demonstration (or a part of it), a session of another
 family, material without content, or one that contradicts the lesson. The paper's conditions use

@@ -19,8 +19,6 @@ from robomme_interference_data.errors import FormatError, first_line
 from robomme_interference_data.files import read_json
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["arrow_schema", "from_dict", "from_table", "read_header", "to_dict", "to_table"]
-
 _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
     str: (pa.string(), (str,), "text"),
     int: (pa.int64(), (int,), "a whole number"),

@@ -5,8 +5,6 @@ from collections.abc import Iterable, Sequence
 from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.records import Session
 
-__all__ = ["even_sample", "lesson_frames", "lesson_share", "spread"]
-
 
 def even_sample(history_frames: int, samples: int = SAMPLE_FRAMES) -> list[int]:
     """Return the frames that an even sample takes at the first step: FrameSamp's rule.

@@ -22,8 +22,6 @@ from functools import wraps
 from types import NoneType, UnionType
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
-__all__ = ["setting", "spread_values", "with_settings"]
-
 _SETTING = "setting"
 
 

@@ -34,8 +34,6 @@ from robomme_interference_data.query import Query
 from robomme_interference_data.records import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import from_table, read_header
 
-__all__ = ["Split", "load_buffer", "load_split"]
-
 _BATCH = 1024
 """Rows that are read at a time."""
 

@@ -8,8 +8,6 @@ which takes seconds to import; the tests hold both against SciPy's.
 import math
 from collections.abc import Sequence
 
-__all__ = ["cohens_h", "holm", "mcnemar", "newcombe", "newcombe_paired", "wilson"]
-
 _Z = 1.959963984540054  # the 97.5% quantile of the standard normal distribution
 
 

@@ -11,8 +11,6 @@ from robomme_interference_data.drawing import Page, ink_on, open_page, tint
 from robomme_interference_data.records import Session
 from robomme_interference_data.sampling import even_sample, spread
 
-__all__ = ["Block", "arrange", "draw_strip", "session_colors"]
-
 LESSON_COLOR = "#D55E00"
 COLORS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#0072B2", "#F0E442", "#999999", "#000000")
 """Okabe and Ito's palette, which people with a colour vision deficiency can tell apart too, and

@@ -11,8 +11,6 @@ import pyarrow as pa
 
 from robomme_interference_data.rows import arrow_schema, to_dict
 
-__all__ = ["Column", "Kind", "Table", "percent", "points"]
-
 Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
 
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, MissingFileError, TruncatedVideoError
 
-__all__ = ["iter_frames"]
-
 
 def iter_frames(
     path: Path,

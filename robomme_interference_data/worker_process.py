@@ -17,17 +17,6 @@ from typing import Any, Protocol
 
 from robomme_interference_data.errors import InterferenceError, WorkerError
 
-__all__ = [
-    "Outcome",
-    "Task",
-    "Worker",
-    "WorkerProcess",
-    "attempt",
-    "end_if_starting",
-    "end_workers",
-    "wait_for",
-]
-
 _CLOSE_S = 10.0
 """Seconds that workers without work have to close what they hold."""
 

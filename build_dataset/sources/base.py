@@ -13,17 +13,6 @@ from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import InvalidOptionError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = [
-    "Frame",
-    "Recording",
-    "Source",
-    "SourceEpisode",
-    "choose_cameras",
-    "compose",
-    "demonstration_length",
-    "file_state",
-]
-
 
 @dataclass(frozen=True)
 class Frame:

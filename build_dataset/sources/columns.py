@@ -5,8 +5,6 @@ from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError, SourceError, UnknownNameError
 
-__all__ = ["CAMERAS", "resolve_columns"]
-
 CAMERAS = ("front", "wrist")
 
 _USUAL = {

@@ -11,8 +11,6 @@ from robomme_interference_data.build_dataset.sources.robomme_families import BLO
 from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["ids_by_block", "ids_by_columns", "ids_by_file"]
-
 _BLOCK = 100
 _CSV = ("episode_index,family on the first line, and split and index if wanted", "0,MoveCube")
 _JSON = ("one object, episode index to family", '{"0": "MoveCube", "1": "InsertPeg"}')

@@ -34,8 +34,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.video import iter_frames
 
-__all__ = ["FramesSource"]
-
 _VIDEO_SUFFIXES = (".mkv", ".mp4", ".avi", ".mov", ".webm")
 _REQUIRED_CAMERA = "front"
 

@@ -15,8 +15,6 @@ from robomme_interference_data.errors import FormatError, InvalidIdError, Source
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan, is_listed
 
-__all__ = ["TABLE", "EpisodeRows", "read_frames_table"]
-
 TABLE = "frames.parquet"
 """Name of the table in a frames folder."""
 

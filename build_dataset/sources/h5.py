@@ -30,8 +30,6 @@ from robomme_interference_data.ids import EpisodeId
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["H5Source", "identify"]
-
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
 _AGAIN = "Record or download the file again, or move it out of the folder."

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, SourceError
 
-__all__ = ["decode_image", "decode_images", "info_is_exact", "is_png", "probe_video"]
-
 _RGB_FORMATS = (
     *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
     *("rgba", "bgra", "argb", "abgr", "gbrap"),

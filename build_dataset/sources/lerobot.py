@@ -44,8 +44,6 @@ from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.rows import from_dict
 
-__all__ = ["LeRobotSource"]
-
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _MEND = "Correct the dataset, or leave the episode out."
 _MEND_FAMILIES = (

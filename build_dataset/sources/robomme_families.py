@@ -9,8 +9,6 @@ newer wordings of the recordings pass. The rules are ours, made to tell the fami
 import re
 from typing import NamedTuple
 
-__all__ = ["BLOCKS", "ROBOMME", "families_for_goal"]
-
 
 class _Family(NamedTuple):
     """A family.

@@ -21,8 +21,6 @@ from robomme_interference_data.build_dataset.sources.base import (
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["SampleSource"]
-
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
 _EPISODES = {"train": 3, "test": 1}
 _FRAMES = 260

@@ -23,8 +23,6 @@ from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
-__all__ = ["SimulatorSource"]
-
 
 class SimulatorSource(Source):
     """The episodes of the nine families that have demonstrations.

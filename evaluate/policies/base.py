@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.simulators.base import Observation, Simulator
 
-__all__ = ["Frames", "Policy", "RolloutInfo"]
-
 Frames = Mapping[str, NDArray[np.uint8]]
 """Camera name (`front`, `wrist`) to `(T, H, W, 3) uint8` RGB."""
 

@@ -12,8 +12,6 @@ from robomme_interference_data.evaluate.policies.base import Frames, Policy, Rol
 from robomme_interference_data.sampling import even_sample
 from robomme_interference_data.simulators.base import Observation, Simulator
 
-__all__ = ["MEMORIES", "Hold", "Privileged", "ReplayPolicy", "follow"]
-
 MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
     "full": range,
     "framesamp": lambda live: even_sample(live)[:-1],

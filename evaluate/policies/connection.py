@@ -16,8 +16,6 @@ from robomme_interference_data.console import MESSAGES
 from robomme_interference_data.errors import PolicyServerError, WireError
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
 
-__all__ = ["API_KEY_VARIABLE", "ServerConnection"]
-
 API_KEY_VARIABLE = "ROBOMME_POLICY_API_KEY"
 """Environment variable with the key that servers behind a gate ask for."""
 

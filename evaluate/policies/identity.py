@@ -22,8 +22,6 @@ from robomme_interference_data.evaluate.policies.registry import (
     policy_options,
 )
 
-__all__ = ["describe_policy", "plain", "policy_identity"]
-
 _WITHOUT_EFFECT = {
     "websocket": ("server", "connect_s", "response_s"),
     "lerobot": ("source", "device"),

@@ -37,8 +37,6 @@ from robomme_interference_data.files import LocalFiles, format_sums
 from robomme_interference_data.hub import locate
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
-__all__ = ["LeRobotPolicy", "find_policy"]
-
 _IMAGE_SHAPE = (3, 256, 256)
 """Shape of an image of the simulators, channels first."""
 

@@ -8,8 +8,6 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from robomme_interference_data.errors import InvalidOptionError
 
-__all__ = ["bind_options", "signature_of"]
-
 _WORDS = {
     str: "text",
     int: "a whole number",

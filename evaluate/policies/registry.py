@@ -18,16 +18,6 @@ from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.options import bind_options, signature_of
 from robomme_interference_data.simulators.base import CAMERAS
 
-__all__ = [
-    "BUILTINS",
-    "PolicySpec",
-    "check_workers",
-    "make_policy",
-    "parse_policy",
-    "pin_policy",
-    "policy_options",
-]
-
 BUILTINS = ("replay", "oracle", "guess", "hold")
 """Policies without learned weights."""
 

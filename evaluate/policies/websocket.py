@@ -15,8 +15,6 @@ from robomme_interference_data.evaluate.policies.base import Frames, Policy, Rol
 from robomme_interference_data.evaluate.policies.connection import ServerConnection
 from robomme_interference_data.simulators.base import Observation
 
-__all__ = ["WebsocketPolicy"]
-
 
 class WebsocketPolicy(Policy):
     """A policy server, by host and port.

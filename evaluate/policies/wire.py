@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import WireError
 
-__all__ = ["pack", "unpack"]
-
 _KINDS = "biufSU"
 """Of NumPy data in messages: booleans, numbers, and texts of fixed length."""
 

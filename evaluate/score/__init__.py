@@ -6,8 +6,6 @@ from pathlib import Path
 
 from robomme_interference_data.settings import setting
 
-__all__ = ["Against", "Grid", "Settings"]
-
 
 class Against(StrEnum):
     """What rates can be set against."""

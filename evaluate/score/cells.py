@@ -18,8 +18,6 @@ from robomme_interference_data.records import Status
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Column, Table, percent
 
-__all__ = ["Cell", "cells_of", "coverage_table", "main_grids", "rate_table"]
-
 _ERROR = STATUSES.index(Status.ERROR)
 _NOTE = (
     "Rates with 95% Wilson intervals. n is the number of episodes that count: an error is neither "

@@ -13,8 +13,6 @@ from robomme_interference_data.settings import with_settings
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.score.rows import Rows
 
-__all__ = ["compare", "score"]
-
 
 @with_settings
 def score(

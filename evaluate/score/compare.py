@@ -17,8 +17,6 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 
-__all__ = ["Comparison", "compare"]
-
 
 @dataclass(frozen=True)
 class Comparison:

@@ -14,8 +14,6 @@ from robomme_interference_data.evaluate.systems import SYSTEMS, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 
-__all__ = ["STATUSES", "Cube", "Flags", "Statuses", "counting", "cubes_of", "success"]
-
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
 """By their numbers in a cube."""
 

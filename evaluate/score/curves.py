@@ -14,9 +14,6 @@ from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 
-__all__ = ["Data", "Look", "curve", "dodged", "explained", "label_ends", "legend", "looks_of"]
-__all__ += ["set_axes", "short", "spread"]
-
 # Okabe and Ito's colours, safe for the colour-blind: one for what the memory is made of.
 _COLOURS = {
     "none": "#767676",

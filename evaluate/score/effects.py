@@ -28,9 +28,6 @@ from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_t
 from robomme_interference_data.stats import cohens_h, wilson
 from robomme_interference_data.tables import Table
 
-__all__ = ["START", "SURE", "Contrast", "contrast_table", "decay_table", "effects_of"]
-__all__ += ["lift_table", "noise_table"]
-
 START = "k0"
 """The condition that retention and contrasts begin at."""
 

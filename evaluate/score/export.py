@@ -9,8 +9,6 @@ from robomme_interference_data.evaluate.score.rows import RELEASED_SIMULATOR, Ro
 from robomme_interference_data.files import atomic_path
 from robomme_interference_data.records import Status
 
-__all__ = ["RELEASED_COLUMNS", "export"]
-
 RELEASED_COLUMNS = (
     *("family", "condition", "episode", "seed", "difficulty", "status", "success", "steps"),
     *("retrieval_model", "retrieval_selected_lesson_fraction"),

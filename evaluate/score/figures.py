@@ -18,8 +18,6 @@ from robomme_interference_data.evaluate.score.effects import SURE
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 
-__all__ = ["FIGURES", "draw_figure", "draw_figures"]
-
 _FEW = 4
 """Up to so many systems, small panels show intervals."""
 

@@ -10,8 +10,6 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.tables import percent, points
 
-__all__ = ["headline"]
-
 
 def headline(score: Score, simulator: str) -> str:
     """Return the main finding of one simulator's rows, computed from them.

@@ -11,8 +11,6 @@ from robomme_interference_data.bootstrap import LEAST, Interval, paired_interval
 from robomme_interference_data.evaluate.score.cube import Statuses, counting, success
 from robomme_interference_data.stats import holm, mcnemar
 
-__all__ = ["COLUMNS", "Pairs", "how_to_read", "pair", "tested"]
-
 COLUMNS = (
     "low:points high:points interval pairs:count gained:count lost:count flips:rate p:p p_holm:p"
 )

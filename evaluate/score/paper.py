@@ -10,8 +10,6 @@ from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats import newcombe, wilson
 from robomme_interference_data.tables import Table
 
-__all__ = ["not_compared", "paper_table", "published"]
-
 _NOTE = (
     "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August "
     "2026), Tables 3 and 4. complete: over the benchmark's 450 episodes, as the published rates "

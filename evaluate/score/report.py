@@ -28,8 +28,6 @@ from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import sha256_file, write_text
 from robomme_interference_data.rows import to_dict
 
-__all__ = ["flips", "load_jinja2", "write_report"]
-
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 

@@ -24,8 +24,6 @@ from robomme_interference_data.evaluate.score.values import parsed, shown
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.records import Status
 
-__all__ = ["RELEASED_SIMULATOR", "Rows", "read_rows"]
-
 RELEASED_SIMULATOR = "robomme"
 """The simulator of rows that name none."""
 

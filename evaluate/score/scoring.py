@@ -14,8 +14,6 @@ from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.files import write_text
 from robomme_interference_data.tables import Table
 
-__all__ = ["TABLES", "Score", "score", "write_score"]
-
 TABLES = ("main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage", "paper")
 """Every table that a score may have."""
 

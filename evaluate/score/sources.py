@@ -27,8 +27,6 @@ from robomme_interference_data.parquet import open_parquet, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, read_header
 
-__all__ = ["COLUMNS", "Codes", "Part", "find_sources", "read_part"]
-
 Codes = NDArray[np.int64]
 
 _SCHEMA = arrow_schema(Rollout)

@@ -17,8 +17,6 @@ from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.records import FINAL, Status
 from robomme_interference_data.simulators.registry import SIMULATORS
 
-__all__ = ["parsed", "shown"]
-
 _NAMES = {"family": FAMILIES, "episode_split": SPLITS, "difficulty": DIFFICULTIES}
 _NAMES |= {"status": tuple(map(str, FINAL))}
 _NUMBERS = {

@@ -11,8 +11,6 @@ from robomme_interference_data.embeddings import encoder_id
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.files import canonical_json
 
-__all__ = ["Encoder", "encoder_digest", "encoder_name", "make_encoder", "published_threshold"]
-
 _KINDS = ("siglip", "thumbnail")
 
 _PAPER_CUT = 0.923

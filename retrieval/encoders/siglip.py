@@ -21,8 +21,6 @@ from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.hub import locate
 from robomme_interference_data.retrieval.encoders import encoder_name
 
-__all__ = ["Siglip"]
-
 _FILES = ("*.json", "*.safetensors")
 
 _VERSION = 1

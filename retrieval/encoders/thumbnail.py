@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
 
-__all__ = ["Thumbnail"]
-
 CELLS = 8
 """Cells along each side. More cells follow the arm, which moves, more than the scene, which
 stays."""

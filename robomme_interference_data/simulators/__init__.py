@@ -34,4 +34,4 @@ __all__ = [
     "Status",
 ]
 
-__getattr__ = lazily(__name__, ".registry", ".base", "..records")
+__getattr__ = lazily(__name__, ".registry", ".base")

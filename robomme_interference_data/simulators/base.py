@@ -17,17 +17,6 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 
-__all__ = [
-    "ACTION_SIZE",
-    "CAMERAS",
-    "Demonstration",
-    "EpisodeInfo",
-    "Observation",
-    "Simulator",
-    "action_array",
-    "camera_names",
-]
-
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""
 

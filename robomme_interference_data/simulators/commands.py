@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["simulate"]
-
 POLICIES = ("oracle", "guess", "none")
 """Built-in policies; `none` plays the demonstration only, which is all that robomme can do."""
 

@@ -7,8 +7,6 @@ from typing import Any
 from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
 from robomme_interference_data.simulators.base import Simulator
 
-__all__ = ["SIMULATORS", "find_simulator", "make_simulator", "simulator_versions"]
-
 
 def _tabletop(**options: Any) -> Simulator:
     try:

@@ -35,8 +35,6 @@ from robomme_interference_data.simulators.base import (
     camera_names,
 )
 
-__all__ = ["PYTHON_VARIABLE", "RoboMMESimulator", "find_python"]
-
 PYTHON_VARIABLE = "ROBOMME_PYTHON"
 """Environment variable with the path of RoboMME's interpreter."""
 

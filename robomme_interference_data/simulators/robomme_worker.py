@@ -19,8 +19,6 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-__all__ = ["receive", "send"]
-
 LISTS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
 """Camera name to the key under which RoboMME returns its frames."""
 

@@ -8,8 +8,6 @@ on, so that `gymnasium.make("tabletop/MoveCube-v1")` finds them. Gymnasium impor
 
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 
-__all__ = ["SUITE_VERSION", "register_environments"]
-
 SUITE_VERSION = 2
 """Version of the episodes; raised with every change to scenes, motions, goals or judgements.
 

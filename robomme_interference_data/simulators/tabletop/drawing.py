@@ -23,8 +23,6 @@ from mani_skill.sensors.camera import CameraConfig
 from robomme_interference_data.simulators.tabletop.motion import ROD
 from robomme_interference_data.simulators.tabletop.renderer import SHADERS
 
-__all__ = ["PANDA", "SHADER", "UPRIGHT", "Colour", "draw_low_polygon", "material"]
-
 Colour = tuple[float, float, float]
 
 UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)

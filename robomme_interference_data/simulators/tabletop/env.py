@@ -26,8 +26,6 @@ from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
 from robomme_interference_data.simulators.tabletop.renderer import make_renderer
 
-__all__ = ["FRONT_EYE", "FRONT_TARGET", "FRONT_VIEW", "TabletopEnv"]
-
 # The table up to x = 0.14 m, and at its home pose the whole arm but for the top of its shoulder.
 FRONT_EYE = (0.80, 0.0, 0.64)  # m
 FRONT_TARGET = (-0.30, 0.0, 0.21)  # m

@@ -6,8 +6,6 @@ from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 
-__all__ = ["EPISODES", "difficulty_of", "episode_ids", "guess_of", "seed_of", "turn_of"]
-
 EPISODES = {"train": 100, "val": 50, "test": 50}
 """Episodes per family in each split."""
 

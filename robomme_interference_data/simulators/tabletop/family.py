@@ -12,8 +12,6 @@ from robomme_interference_data.simulators.tabletop.drawing import Colour
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 
-__all__ = ["Family"]
-
 
 class Family(ABC):
     """One episode of a task family.

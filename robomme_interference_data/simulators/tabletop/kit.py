@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, Colour, material
 from robomme_interference_data.simulators.tabletop.motion import Point
 
-__all__ = ["COLOURS", "CUBE", "SIDE", "Body", "Kit", "Place"]
-
 COLOURS: dict[str, Colour] = {
     "red": (0.85, 0.08, 0.08),
     "green": (0.10, 0.62, 0.16),

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FPS
 from robomme_interference_data.errors import MotionError
 
-__all__ = ["BASE", "HOME", "REST_QPOS", "ROD", "Arm", "Point", "Script", "eased"]
-
 Script = Iterator[None]
 
 Point = Sequence[float] | NDArray[np.float64]

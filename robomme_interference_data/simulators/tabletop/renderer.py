@@ -11,8 +11,6 @@ import sapien
 
 from robomme_interference_data.errors import NoRendererError
 
-__all__ = ["SHADERS", "make_renderer"]
-
 SHADERS = Path(__file__).parent / "shaders"
 """Folder of the suite's own shaders. Those that sapien brings take ten seconds to compile."""
 

@@ -19,8 +19,6 @@ from robomme_interference_data.simulators.base import (
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
 
-__all__ = ["TabletopSimulator"]
-
 POLICIES = ("oracle", "guess")
 
 

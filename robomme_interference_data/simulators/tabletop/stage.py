@@ -11,20 +11,6 @@ from numpy.typing import NDArray
 from robomme_interference_data.simulators.tabletop.kit import Body, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script, eased
 
-__all__ = [
-    "ABOVE",
-    "Spot",
-    "along",
-    "exchanges",
-    "is_near",
-    "lanes",
-    "off_line",
-    "push_down",
-    "row",
-    "shuffled",
-    "swap",
-]
-
 Spot = tuple[float, float]
 Vector = NDArray[np.float64]
 

@@ -14,8 +14,6 @@ from robomme_interference_data.simulators.tabletop.families.video_unmask import 
 from robomme_interference_data.simulators.tabletop.families.video_unmask_swap import VideoUnmaskSwap
 from robomme_interference_data.simulators.tabletop.family import Family
 
-__all__ = ["family_class"]
-
 _FAMILIES: dict[str, type[Family]] = {
     each.__name__: each
     for each in (

@@ -13,8 +13,6 @@ from robomme_interference_data.simulators.tabletop.kit import COLOURS, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import row
 
-__all__ = ["InsertPeg"]
-
 LENGTH, GRIP = 0.14, 0.04  # m: a peg, and from its middle to where it is held
 HOLE, DEPTH = 0.036, 0.08  # m, of the box
 LIFTED = 0.03  # m, height of the peg's middle

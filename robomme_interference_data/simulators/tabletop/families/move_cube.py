@@ -12,8 +12,6 @@ from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import is_near, off_line
 
-__all__ = ["MoveCube"]
-
 Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook

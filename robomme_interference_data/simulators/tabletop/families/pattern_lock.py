@@ -13,8 +13,6 @@ from robomme_interference_data.simulators.tabletop.kit import Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, Spot
 
-__all__ = ["PatternLock", "StickFamily"]
-
 SIDE, SPACING, RADIUS = 4, 0.075, 0.02  # buttons in a row; m; m
 TALL, HIGH = 0.010, 0.10  # m, a button, and the stick's tip above the buttons
 

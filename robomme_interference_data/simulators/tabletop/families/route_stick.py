@@ -13,8 +13,6 @@ from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line
 
-__all__ = ["RouteStick"]
-
 Route = tuple[tuple[int, ...], tuple[int, ...]]
 
 COUNT, SPACING = 5, 0.105  # targets; m from one to the next, with a post in the middle

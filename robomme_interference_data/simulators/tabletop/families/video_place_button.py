@@ -15,8 +15,6 @@ from robomme_interference_data.simulators.tabletop.stage import (
     swap,
 )
 
-__all__ = ["PlaceFamily", "VideoPlaceButton"]
-
 RADIUS = 0.035  # m, of a target
 
 

@@ -6,8 +6,6 @@ from robomme_interference_data.simulators.tabletop.families.video_place_button i
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 
-__all__ = ["VideoPlaceOrder"]
-
 ORDINALS = ("first", "second", "third")
 
 

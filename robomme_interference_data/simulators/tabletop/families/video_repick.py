@@ -8,8 +8,6 @@ from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import exchanges, push_down, row, swap
 
-__all__ = ["VideoRepick"]
-
 LIFTED = 0.06  # m, height of the cube's middle
 TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 

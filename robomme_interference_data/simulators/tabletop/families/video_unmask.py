@@ -11,8 +11,6 @@ from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, 
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
 
-__all__ = ["VideoUnmask"]
-
 HIGH = 0.72  # m, above what the cameras see
 LIFTED = 0.05  # m, of the right container
 PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02

@@ -9,8 +9,6 @@ from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import exchanges, swap
 
-__all__ = ["VideoUnmaskSwap"]
-
 
 class VideoUnmaskSwap(VideoUnmask):
     """As VideoUnmask, then containers change places in pairs, once, twice or three times.
