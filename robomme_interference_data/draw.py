@@ -23,7 +23,8 @@ Rule version 1, for a query of family F and index i:
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from functools import cached_property
+from functools import cache, partial
+from itertools import islice
 
 from robomme_interference_data.constants import FAMILIES, RULE_VERSION
 from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
@@ -42,7 +43,7 @@ class UnitPool:
     """
 
     def __init__(self, units: Iterable[EpisodeId], seed: int = 0):
-        self.seed = seed
+        self._hash = cache(partial(_hash, seed))  # the same for many queries
         families: dict[str, list[EpisodeId]] = {}
         for unit in units:
             families.setdefault(unit.family, []).append(unit)
@@ -53,7 +54,6 @@ class UnitPool:
             members.sort(key=lambda unit: self._hash("unit", str(unit)))
             families[family] = members
         self._families = dict(sorted(families.items()))
-        self._eligible: dict[str, _Eligible] = {}
 
     def __len__(self) -> int:
         return sum(len(members) for members in self._families.values())
@@ -76,100 +76,65 @@ class UnitPool:
         Raises:
             PoolTooSmallError: The other families together have fewer than `k` units.
         """
-        eligible = self._eligible.get(query.family)
-        if eligible is None:
-            others = {f: units for f, units in self._families.items() if f != query.family}
-            eligible = self._eligible[query.family] = _Eligible(self, query.family, others)
-        if k > eligible.count:
+        others = {name: units for name, units in self._families.items() if name != query.family}
+        count = sum(map(len, others.values()))
+        if k > count:
             raise PoolTooSmallError(
                 f"{query} needs {k} distractor units of other families; the pool has "
-                f"{eligible.count} ({', '.join(eligible.families) or 'no family'})",
+                f"{count} ({', '.join(others) or 'no family'})",
                 "Build distractors from more episodes or families, or plan a smaller k.",
             )
-        units = eligible.units(query)
-        return [next(units) for _ in range(k)]
+        return list(islice(self._units(query, others), k))
 
-    def _hash(self, *parts: str) -> bytes:
-        text = "\n".join((f"robomme-interference draw {RULE_VERSION}", str(self.seed), *parts))
-        return hashlib.sha256(text.encode()).digest()
+    def _units(self, query: EpisodeId, others: dict[str, list[EpisodeId]]) -> Iterator[EpisodeId]:
+        """Yield all units of other families for a query, in buffer order."""
+        largest = max(map(len, others.values()), default=0)
+        order = self._order(query, list(others))
+        numbers = {name: self._number(query, name, largest) for name in order}
+        taken = dict.fromkeys(order, 0)
+
+        def joined(name: str, turn: int) -> int:
+            """Return in how many of the queries before the turn the family has joined."""
+            return (numbers[name] + turn) * len(others[name]) // largest
+
+        def next_unit(name: str) -> EpisodeId:
+            unit = others[name][(joined(name, 0) + taken[name]) % len(others[name])]
+            taken[name] += 1
+            return unit
+
+        for turn in range(largest):
+            joining = [
+                name
+                for name in order
+                if taken[name] < len(others[name]) and joined(name, turn + 1) > joined(name, turn)
+            ]
+            waiting = [name for name in order if name not in joining] if turn == 0 else []
+            yield from map(next_unit, joining + waiting)
+        for name in order:
+            yield from (next_unit(name) for _ in range(len(others[name]) - taken[name]))
+
+    def _order(self, query: EpisodeId, names: list[str]) -> list[str]:
+        """Return the other families in the order of the query's block, rotated."""
+        block, rotation = divmod(query.index, max(1, len(names)))
+        parts = ("order", query.split, query.family, str(block))
+        order = sorted(names, key=lambda name: self._hash(*parts, name))
+        return order[rotation:] + order[:rotation]
+
+    def _number(self, query: EpisodeId, family: str, largest: int) -> int:
+        """Return the query's number among all that may draw from a family, plus an offset."""
+        drawing = [name for name in FAMILIES if name != family]
+        if query.family in drawing:
+            rank = drawing.index(query.family)
+        else:
+            rank = self._offset("rank", query.family) % len(drawing)
+        # Families start at different places, so that small ones join at different queries.
+        offset = self._offset("offset", query.split, family) % largest
+        return query.index * len(drawing) + rank + offset
 
     def _offset(self, *parts: str) -> int:
         return int.from_bytes(self._hash(*parts)[:8])
 
 
-class _Eligible:
-    """The families that queries of one family draw from."""
-
-    def __init__(self, pool: UnitPool, query_family: str, families: dict[str, list[EpisodeId]]):
-        self.pool = pool
-        self.query_family = query_family
-        self.families = families
-        self.count = sum(map(len, families.values()))
-        self.largest = max(map(len, families.values()), default=0)
-        self._orders: dict[tuple[str, int], list[str]] = {}
-        self._offsets: dict[tuple[str, str], int] = {}
-
-    @cached_property
-    def _numbering(self) -> dict[str, tuple[int, int]]:
-        """For each family: how many benchmark families draw from it, and the query's rank."""
-        numbering = {}
-        for family in self.families:
-            drawing = [name for name in FAMILIES if name != family]
-            if self.query_family in drawing:
-                rank = drawing.index(self.query_family)
-            else:
-                rank = self.pool._offset("rank", self.query_family) % len(drawing)
-            numbering[family] = (len(drawing), rank)
-        return numbering
-
-    def units(self, query: EpisodeId) -> Iterator[EpisodeId]:
-        """Yield all eligible units for a query, in buffer order."""
-        order = self._order(query)
-        numbers = {family: self._number(query, family) for family in order}
-        taken = dict.fromkeys(order, 0)
-
-        def next_unit(family: str) -> EpisodeId:
-            units = self.families[family]
-            unit = units[(self._joined(family, numbers[family]) + taken[family]) % len(units)]
-            taken[family] += 1
-            return unit
-
-        for turn in range(self.largest):
-            joining = [
-                family
-                for family in order
-                if taken[family] < len(self.families[family])
-                and self._joined(family, numbers[family] + turn + 1)
-                > self._joined(family, numbers[family] + turn)
-            ]
-            waiting = [family for family in order if family not in joining] if turn == 0 else []
-            yield from map(next_unit, joining + waiting)
-        for family in order:
-            yield from (
-                next_unit(family) for _ in range(len(self.families[family]) - taken[family])
-            )
-
-    def _order(self, query: EpisodeId) -> list[str]:
-        block, rotation = divmod(query.index, len(self.families)) if self.families else (0, 0)
-        order = self._orders.get((query.split, block))
-        if order is None:
-            parts = ("order", query.split, self.query_family, str(block))
-            order = sorted(self.families, key=lambda family: self.pool._hash(*parts, family))
-            if len(self._orders) > 64:  # queries come by index: older blocks are done
-                self._orders.clear()
-            self._orders[query.split, block] = order
-        return order[rotation:] + order[:rotation]
-
-    def _number(self, query: EpisodeId, family: str) -> int:
-        """Return the query's number among all that may draw from a family, plus an offset."""
-        drawing, rank = self._numbering[family]
-        offset = self._offsets.get((query.split, family))
-        if offset is None:
-            # Families start at different places, so that small ones join at different queries.
-            offset = self.pool._offset("offset", query.split, family) % self.largest
-            self._offsets[query.split, family] = offset
-        return query.index * drawing + rank + offset
-
-    def _joined(self, family: str, number: int) -> int:
-        """Return in how many of the queries before `number` the family has joined."""
-        return number * len(self.families[family]) // self.largest
+def _hash(seed: int, *parts: str) -> bytes:
+    text = "\n".join((f"robomme-interference draw {RULE_VERSION}", str(seed), *parts))
+    return hashlib.sha256(text.encode()).digest()

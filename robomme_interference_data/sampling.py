@@ -1,6 +1,8 @@
 """What a sample of a history holds, whatever sessions the history is made of: pure."""
 
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
+from functools import partial
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.records import Session
@@ -63,19 +65,9 @@ def lesson_share(
     Returns:
         Share from 0 to 1.
     """
-    frames = stop - start
-    count = min(samples, frames + 1)
-    inside = 0
-    for session in sessions:
-        if session.role == "lesson":
-            first, last = (
-                min(max(edge - start, 0), frames) for edge in (session.start, session.stop)
-            )
-            inside += _before(last, frames, count) - _before(first, frames, count)
-    return inside / count
-
-
-def _before(index: int, frames: int, count: int) -> int:
-    """Return how many of an even sample's history frames come before one."""
-    # floor(j·t / (n − 1)) < index for the first ⌈index·(n − 1) / t⌉ numbers j.
-    return -(-index * (count - 1) // frames) if frames else 0
+    sample = even_sample(stop - start, samples)
+    before = partial(bisect_left, sample, hi=len(sample) - 1)
+    lessons = (one for one in sessions if one.role == "lesson")
+    return sum(before(one.stop - start) - before(one.start - start) for one in lessons) / len(
+        sample
+    )
