@@ -10,7 +10,7 @@ from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, D
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
-from robomme_interference_data.tables import Column, Table
+from robomme_interference_data.tables import Table
 
 
 @dataclass(frozen=True)
@@ -50,23 +50,22 @@ class Audit:
 
     def tables(self) -> tuple[Table, Table]:
         """Return the uses of a unit by condition, and the families at each place."""
-        counts = ("units", "min", "mean", "max", "unused")
-        columns = tuple(Column(name, "ratio" if name == "mean" else "count") for name in counts)
-        rows = tuple((name, *_usage(uses.values())) for name, uses in self.uses.items())
-        uses = Table("uses", "Uses of a unit", (Column("condition"), *columns), rows)
+        counts = "units:count min:count mean:ratio max:count"
+        rows = ((name, *_usage(uses.values())) for name, uses in self.uses.items())
+        uses = Table.make("uses", "Uses of a unit", f"condition {counts} unused:count", rows)
         places = self.places.get(self.fullest, {})
         families: dict[str, list[int]] = {}
         for unit, count in sorted(self.uses[self.fullest].items()):
             families.setdefault(unit.family, []).append(count)
-        numbered = tuple(Column(str(place), "count") for place in sorted(places))
-        mix = tuple(
+        numbered = " ".join(f"{place}:count" for place in sorted(places))
+        mix = (
             (family, *_usage(found)[:4], *(places[place][family] for place in sorted(places)))
             for family, found in families.items()
         )
-        return uses, Table(
+        return uses, Table.make(
             "families",
             f"Families of the units under {self.fullest}",
-            (Column("family"), *columns[:4], *numbered),
+            f"family {counts} {numbered}",
             mix,
             "Columns 1, 2, …: buffers with the family at that place among their units.",
         )

@@ -22,8 +22,7 @@ from robomme_interference_data.build_dataset.lerobot_writer import (
     require_lerobot,
     write_lerobot,
 )
-from robomme_interference_data.build_dataset.sources import SourceEpisode
-from robomme_interference_data.build_dataset.stage import StagedEpisode, StageTask, read_staged
+from robomme_interference_data.build_dataset.stage import Staged, StageTask, Task, read_staged
 from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH
 from robomme_interference_data.encode import get_codec
@@ -85,16 +84,12 @@ def build_dataset(
     with working(out) as work:
         earlier = _earlier(out, plan)
         known = earlier.ids() if earlier else set()
-        stored: list[StoredEpisode] = list(earlier.episodes) if earlier else []
+        stored = list(earlier.episodes) if earlier else []
         skipped = dict(earlier.skipped) if earlier else {}
         todo = [task for task in plan.tasks if task[1].id not in known]
         before = len(stored)
         if todo or not earlier:
-            for one in _stage(work, plan, todo, stored[:1], executor, progress):
-                if one.staged.skipped is None:
-                    stored.append(one)
-                else:
-                    skipped[str(one.staged.episode_id)] = one.staged.skipped
+            _stage(work, plan, todo, stored, skipped, executor, progress)
             _write(work, out, plan, earlier, stored, skipped, progress)
         shutil.rmtree(work, ignore_errors=True)
     frames = sum(one.record.length for one in stored)
@@ -138,23 +133,23 @@ def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
 def _stage(
     work: Path,
     plan: BuildPlan,
-    todo: Sequence[tuple[int, SourceEpisode]],
-    known: Sequence[StoredEpisode],
+    todo: Sequence[Task],
+    stored: list[StoredEpisode],
+    skipped: dict[str, str],
     executor: Executor,
     progress: WorkProgress,
-) -> list[StagedEpisode]:
-    """Stage episodes, which must fit those that are known; what succeeds is kept."""
+) -> None:
+    """Stage episodes, and add each to those that are stored, which it must fit, or skipped."""
     task = StageTask(plan, work / "episodes")
     limit = plan.time_limit or max(source.time_limit for source in plan.sources)
-    staged: list[StagedEpisode] = []
-    alike = list(known)
 
-    def take(one: StagedEpisode, *, before: bool) -> None:
-        staged.append(one)
+    def take(one: Task, staged: Staged, *, before: bool) -> None:
         progress.advance(1, before=before)
-        if one.staged.skipped is None:
-            alike.append(one)
-            _check_alike(alike[0], one)
+        if staged.skipped is not None:
+            skipped[str(staged.episode_id)] = staged.skipped
+        else:
+            stored.append(staged.stored(task.place(one)))
+            _check_alike(stored[0], stored[-1])
 
     missing = []
     progress.start("Reading and encoding", len(todo))
@@ -163,20 +158,19 @@ def _stage(
         if done is None:
             missing.append(one)
         else:
-            take(done, before=True)
+            take(one, done, before=True)
     failures: list[Outcome] = []
     # Closed before anybody looks at what is staged: an error would keep the workers running.
     with closing(executor.run(task, missing, time_limit=limit)) as outcomes:
         for outcome in outcomes:
             if outcome.error is None:
-                take(outcome.value, before=False)
+                take(outcome.task, outcome.value, before=False)
                 continue
             failures.append(outcome)
             if isinstance(outcome.error, InvalidOptionError | MissingExtraError):
                 break  # the others will say the same
     if failures:
         raise _failure(failures, len(todo))
-    return staged
 
 
 def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:

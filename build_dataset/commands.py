@@ -16,6 +16,7 @@ from robomme_interference_data.build_dataset.config import (
 from robomme_interference_data.console import (
     MESSAGES,
     AsJson,
+    SplitFolder,
     WorkProgress,
     print_json,
     stoppable,
@@ -161,7 +162,7 @@ def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
 
 
 def verify(
-    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    split: SplitFolder,
     decode: Annotated[
         bool, typer.Option(help="Decode all frames; without, files, tables and rules are checked.")
     ] = True,
@@ -194,7 +195,7 @@ def verify(
 
 
 def audit(
-    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    split: SplitFolder,
     as_json: AsJson = False,
 ) -> None:
     """Print how often units are used and where families stand; fails on any leak.

@@ -1,6 +1,7 @@
 """What a dataset that is there keeps when it grows: its episodes are not encoded again."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,40 +10,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.image_stats import before_scaling
+from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.constants import EPISODES_DIR, REPORT_PATH
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.files import LocalFiles, read_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.records import EpisodeRecord
-
-
-@dataclass(frozen=True)
-class EarlierEpisode:
-    """An episode of a dataset that grows; see `StoredEpisode`."""
-
-    dataset: Dataset
-    record: EpisodeRecord
-    features: dict[str, tuple[int, ...]]
-    statistics: dict[str, Any]
-
-    def video(self, feature: str) -> Path:
-        """See `StoredEpisode`."""
-        place = self.dataset.lerobot.place(self.record.episode_index)
-        return self.dataset.files.path(place.videos[feature][0])
-
-    def vectors(self, feature: str) -> NDArray[np.float32]:
-        """See `StoredEpisode`."""
-        return self.dataset.lerobot.vectors(self.record.episode_index, feature)
-
-    def stats(self, feature: str) -> dict[str, NDArray[Any]]:
-        """See `StoredEpisode`."""
-        prefix = f"stats/{feature}/"
-        return {
-            name.removeprefix(prefix): before_scaling(name, np.ravel(value))
-            for name, value in self.statistics.items()
-            if name.startswith(prefix)
-        }
 
 
 @dataclass(frozen=True)
@@ -56,7 +30,7 @@ class Earlier:
     """
 
     dataset: Dataset
-    episodes: tuple[EarlierEpisode, ...]
+    episodes: tuple[StoredEpisode, ...]
     skipped: dict[str, str]
 
     def ids(self) -> set[EpisodeId]:
@@ -80,7 +54,23 @@ def read_earlier(root: Path) -> Earlier:
     report = read_json(root / REPORT_PATH)
     skipped = {str(one["episode_id"]): str(one["why"]) for one in report["skipped"]}
     episodes = (
-        EarlierEpisode(dataset, record, dataset.features, told)
+        _stored(dataset, record, told)
         for record, told in zip(dataset.records(), statistics, strict=True)
     )
     return Earlier(dataset, tuple(episodes), skipped)
+
+
+def _stored(dataset: Dataset, record: EpisodeRecord, statistics: dict[str, Any]) -> StoredEpisode:
+    place = dataset.lerobot.place(record.episode_index)
+    stats: dict[str, dict[str, NDArray[Any]]] = {feature: {} for feature in place.videos}
+    for column, value in statistics.items():
+        _, feature, name = column.split("/")
+        if feature in stats:
+            stats[feature][name] = before_scaling(name, np.ravel(value))
+    return StoredEpisode(
+        record,
+        dataset.features,
+        {feature: dataset.files.path(path) for feature, (path, _) in place.videos.items()},
+        stats,
+        partial(dataset.lerobot.vectors, record.episode_index),
+    )

@@ -51,7 +51,7 @@ class ImageStats:
 
 def before_scaling(name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Return what LeRobot divided by 255 when it stored a statistic of images, bit for bit."""
-    if name.endswith("/count"):
+    if name == "count":
         return values
     found = []
     for value in values.astype(np.float64):

@@ -18,7 +18,6 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import read_json
-from robomme_interference_data.parquet import RowSpan
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
@@ -31,7 +30,7 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
         InterferenceError: A file cannot be read.
     """
     yield from _info(dataset)
-    tasks = _tasks(dataset)
+    tasks = dataset.lerobot.tasks
     if list(tasks.values()) != list(range(len(tasks))):
         yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
     used = {record.goal for record in dataset.records()}
@@ -89,12 +88,6 @@ def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
             finite = False
         if not values or not finite:
             yield STATS_PATH, f"has no finite statistics of {name}"
-
-
-def _tasks(dataset: Dataset) -> dict[str, int]:
-    """Return the index of each task text, as `meta/tasks.parquet` lists them."""
-    rows = RowSpan(dataset.files.path(TASKS_PATH)).table().to_pylist()
-    return {str(r.get("task", r.get("__index_level_0__"))): r.get("task_index") for r in rows}
 
 
 def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterator[tuple[str, str]]:

@@ -10,11 +10,12 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,30 +32,23 @@ _PANDA = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6", "joi
 """Joint positions in rad; gripper: opening in m in a state, −1 closed to 1 open in an action."""
 
 
-class StoredEpisode(Protocol):
-    """An episode that is encoded and checked, wherever it lies."""
+@dataclass(frozen=True)
+class StoredEpisode:
+    """An episode that is encoded and checked, wherever it lies; maps are by feature.
 
-    @property
-    def record(self) -> EpisodeRecord:
-        """What the dataset says of it; the writer gives it its number."""
-        ...
+    Attributes:
+        record: What the dataset says of it; the writer gives it its number.
+        features: Shape of one value: cameras `(H, W, 3)`, vectors `(D,)`.
+        videos: The files of the cameras.
+        stats: Statistics of the cameras' images, on the scale 0 to 255.
+        vectors: Reads states or actions, `(T, D) float32`, of a feature.
+    """
 
-    @property
-    def features(self) -> dict[str, tuple[int, ...]]:
-        """Shape of one value by feature: cameras `(H, W, 3)`, vectors `(D,)`."""
-        ...
-
-    def video(self, feature: str) -> Path:
-        """Return the video file of a camera."""
-        ...
-
-    def vectors(self, feature: str) -> NDArray[np.float32]:
-        """Return states or actions, `(T, D) float32`."""
-        ...
-
-    def stats(self, feature: str) -> dict[str, NDArray[Any]]:
-        """Return the statistics of a camera's images, on the scale 0 to 255."""
-        ...
+    record: EpisodeRecord
+    features: dict[str, tuple[int, ...]]
+    videos: dict[str, Path]
+    stats: dict[str, dict[str, NDArray[Any]]]
+    vectors: Callable[[str], NDArray[np.float32]]
 
 
 def require_lerobot() -> None:
@@ -156,8 +150,8 @@ class _ReadyVideos:
         for feature in self._features:
             # LeRobot moves the file away and removes the folder that it was in.
             copy = Path(tempfile.mkdtemp(dir=self._folder)) / "episode.mp4"
-            shutil.copyfile(self.next.video(feature), copy)
-            videos[feature] = (copy, self.next.stats(feature))
+            shutil.copyfile(self.next.videos[feature], copy)
+            videos[feature] = (copy, self.next.stats[feature])
         return videos
 
     def cancel_episode(self) -> None:

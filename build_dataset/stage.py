@@ -11,7 +11,6 @@ import tempfile
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import STATISTICS, ImageStats
+from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, DEMONSTRATIONS, FPS, STATE
 from robomme_interference_data.digest import FeatureDigests
@@ -56,44 +56,20 @@ class Staged:
     features: dict[str, tuple[int, ...]]
     stats: dict[str, dict[str, tuple[float, ...]]]
 
-
-@dataclass(frozen=True)
-class StagedEpisode:
-    """A staged episode, which yields something, and the folder that holds it; see `StoredEpisode`.
-
-    Raises:
-        ValueError: By `record`: the episode yields nothing.
-    """
-
-    staged: Staged
-    folder: Path
-
-    @property
-    def record(self) -> EpisodeRecord:
-        """See `StoredEpisode`."""
-        if self.staged.record is None:
-            raise ValueError(f"{self.staged.episode_id}: {self.staged.skipped}")
-        return self.staged.record
-
-    @property
-    def features(self) -> dict[str, tuple[int, ...]]:
-        """See `StoredEpisode`."""
-        return self.staged.features
-
-    def video(self, feature: str) -> Path:
-        """See `StoredEpisode`."""
-        return self.folder / f"{feature}.mp4"
-
-    def vectors(self, feature: str) -> NDArray[np.float32]:
-        """See `StoredEpisode`."""
-        values: NDArray[np.float32] = np.load(self.folder / f"{feature}.npy")
-        return values
-
-    def stats(self, feature: str) -> dict[str, NDArray[Any]]:
-        """See `StoredEpisode`."""
+    def stored(self, folder: Path) -> StoredEpisode:
+        """Return the episode, which yields something, in the folder that it was staged in."""
+        assert self.record is not None
         # In this order whether it was staged just now or read again: columns follow it.
-        found = {name: np.array(self.staged.stats[feature][name]) for name in STATISTICS}
-        return {**found, "count": found["count"].astype(np.int64)}
+        stats = {
+            feature: {name: np.array(values[name]) for name in STATISTICS}
+            for feature, values in self.stats.items()
+        }
+        for values in stats.values():
+            values["count"] = values["count"].astype(np.int64)
+        videos = {feature: folder / f"{feature}.mp4" for feature in stats}
+        return StoredEpisode(
+            self.record, self.features, videos, stats, lambda name: np.load(folder / f"{name}.npy")
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +98,7 @@ class StageTask:
         }
         return self.folder / hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
 
-    def __call__(self, task: Task, worker: Worker) -> StagedEpisode:
+    def __call__(self, task: Task, worker: Worker) -> Staged:
         """Cut, encode, check and record one episode.
 
         Raises:
@@ -150,7 +126,7 @@ class StageTask:
             raise error.about(episode.id) from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-        return StagedEpisode(staged, place)
+        return staged
 
     def close(self) -> None:
         """Release what sources hold."""
@@ -199,10 +175,10 @@ class StageTask:
         return Staged(episode, None, record, writer.features, stats)
 
 
-def read_staged(folder: Path) -> StagedEpisode | None:
-    """Return the staged episode in a folder; None if there is no such folder."""
+def read_staged(folder: Path) -> Staged | None:
+    """Return what is known of the episode that a folder holds; None if there is no such folder."""
     path = folder / _RECORD
-    return StagedEpisode(read_header(path, Staged), folder) if path.is_file() else None
+    return read_header(path, Staged) if path.is_file() else None
 
 
 class _Writer:

@@ -14,7 +14,7 @@ from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.evaluate.log import count_statuses, is_done
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import Rollout, Status
-from robomme_interference_data.tables import Column, Table
+from robomme_interference_data.tables import Table
 
 
 class RunProgress:
@@ -105,11 +105,11 @@ def rate_table(rows: Iterable[Rollout]) -> Table:
     conditions = sorted(
         {name for _, name in cells}, key=lambda name: parse_condition(name).sort_key
     )
-    return Table(
+    return Table.make(
         "rates",
         "Successes by family and condition",
-        (Column("family"), *map(Column, conditions)),
-        tuple((f, *(_rate(cells.get((f, c), [])) for c in conditions)) for f in families),
+        " ".join(["family", *conditions]),
+        ((f, *(_rate(cells.get((f, c), [])) for c in conditions)) for f in families),
     )
 
 

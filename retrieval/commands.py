@@ -9,6 +9,11 @@ import typer
 from robomme_interference_data.console import (
     MESSAGES,
     AsJson,
+    ConditionName,
+    Picture,
+    QueryName,
+    SplitFolder,
+    SplitOption,
     WorkProgress,
     print_json,
     stoppable,
@@ -19,7 +24,6 @@ from robomme_interference_data.errors import InvalidOptionError, MissingFileErro
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.select import Measured
 
-SplitFolder = Annotated[Path, typer.Argument(help="Folder of the split.")]
 EncoderName = Annotated[
     str,
     typer.Option(
@@ -99,15 +103,13 @@ def index(
 
 
 def retrieve(
-    episode: Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")],
-    condition: Annotated[str, typer.Argument(help="Condition, such as k3.")],
-    split: Annotated[
-        Path, typer.Option(envvar="ROBOMME_INTERFERENCE_SPLIT", help="Folder of the split.")
-    ] = Path(),
+    episode: QueryName,
+    condition: ConditionName,
+    split: SplitOption = Path(),
     encoder: EncoderName = "thumbnail",
     rule: Annotated[str, typer.Option(help="RULE, as for retrieval-score.")] = "max",
     camera: Camera = "front",
-    out: Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")] = None,
+    out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
     """Tell which part of a history goes with the stored first live observation, and why.
@@ -199,7 +201,7 @@ def calibrate(
         typer.Option(help="First and last threshold to try, in steps of 0.01."),
     ] = (0.80, 0.99),
     camera: Camera = "front",
-    out: Annotated[Path | None, typer.Option(help="Figure to write, .png or .svg.")] = None,
+    out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit the cosine below which histories are cut, and show what others would give.

@@ -7,11 +7,20 @@ from typing import Annotated
 
 import typer
 
-from robomme_interference_data.console import MESSAGES, AsJson, print_json
+from robomme_interference_data.console import (
+    MESSAGES,
+    AsJson,
+    ConditionName,
+    Picture,
+    QueryName,
+    SplitFolder,
+    SplitOption,
+    print_json,
+)
 
 
 def list_buffers(
-    split: Annotated[Path, typer.Argument(help="Folder of the split.")],
+    split: SplitFolder,
     family: Annotated[str | None, typer.Option(help="Only this family.")] = None,
     condition: Annotated[str | None, typer.Option(help="Only this condition, as k3.")] = None,
     difficulty: Annotated[str | None, typer.Option(help="Only easy, medium or hard.")] = None,
@@ -27,38 +36,31 @@ def list_buffers(
     """
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.split import load_split
-    from robomme_interference_data.tables import Column, Table
+    from robomme_interference_data.tables import Table
 
     opened = load_split(split)
     found = opened.manifests(family=family, condition=condition, difficulty=difficulty)
     if as_json:
         print_json([to_dict(manifest) for manifest in found])
         return
-    columns = (
-        *(Column(name) for name in ("episode", "condition", "difficulty")),
-        *(Column(name, "count") for name in ("lesson", "history")),
-        Column("share", "ratio"),
-    )
     values = attrgetter(
         "episode_id", "condition", "difficulty", "lesson_frames", "history_frames", "lesson_share"
     )
-    table = Table(
+    table = Table.make(
         "buffers",
         str(opened.root),
-        columns,
-        tuple(map(values, found)),
+        "episode condition difficulty lesson:count history:count share:ratio",
+        map(values, found),
         "lesson, history: frames; share: of lesson in an even 32-frame sample",
     )
     typer.echo(table.text())
 
 
 def show(
-    episode: Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")],
-    condition: Annotated[str, typer.Argument(help="Condition, such as k3.")],
-    split: Annotated[
-        Path, typer.Option(envvar="ROBOMME_INTERFERENCE_SPLIT", help="Folder of the split.")
-    ] = Path(),
-    out: Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")] = None,
+    episode: QueryName,
+    condition: ConditionName,
+    split: SplitOption = Path(),
+    out: Picture = None,
     camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
     as_json: AsJson = False,
 ) -> None:
@@ -72,7 +74,7 @@ def show(
     """
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.split import load_buffer
-    from robomme_interference_data.tables import Column, Table
+    from robomme_interference_data.tables import Table
 
     buffer = load_buffer(episode, condition, split=split)
     if out is not None:
@@ -84,14 +86,11 @@ def show(
     if as_json:
         print_json(to_dict(manifest))
         return
-    table = Table(
+    table = Table.make(
         "sessions",
         f"{manifest}: {manifest.goal}",
+        "session:count role family episode frames",
         (
-            Column("session", "count"),
-            *(Column(name) for name in ("role", "family", "episode", "frames")),
-        ),
-        tuple(
             (number, one.role, one.family, str(one.source), f"{one.start} to {one.stop - 1}")
             for number, one in enumerate(buffer.sessions)
         ),

@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any, Self
 
 import typer
@@ -25,8 +26,15 @@ from rich.text import Text
 MESSAGES = Console(stderr=True, soft_wrap=True, markup=False, emoji=False, highlight=False)
 """What commands say beside their output: lines are never wrapped, so that paths can be copied."""
 
+# Parameters that several commands have.
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
-"""The parameter `as_json` of a command that can."""
+SplitFolder = Annotated[Path, typer.Argument(help="Folder of the split.")]
+SplitOption = Annotated[
+    Path, typer.Option(envvar="ROBOMME_INTERFERENCE_SPLIT", help="Folder of the split.")
+]
+QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
+ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]
+Picture = Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")]
 
 
 def print_json(value: Any) -> None:

@@ -21,11 +21,6 @@ def combine(digests: Mapping[str, str]) -> str:
     return hashlib.sha256(canonical_json(dict(digests)).encode()).hexdigest()
 
 
-def feature_digest(values: NDArray[Any]) -> str:
-    """Return the digest of one feature: `(T, H, W, 3) uint8` images or `(T, D) float32`."""
-    return hashlib.sha256(_bytes(values)).hexdigest()
-
-
 class FeatureDigests:
     """Digests of several features, computed while frames pass by."""
 
@@ -34,19 +29,13 @@ class FeatureDigests:
 
     def update(self, feature: str, values: NDArray[Any]) -> None:
         """Add the next value, or several stacked along a first axis, of a feature."""
-        running = self._running.get(feature)
-        if running is None:
-            running = self._running[feature] = hashlib.sha256()
-        running.update(_bytes(values))
+        if values.dtype == np.float32:
+            values = values.astype("<f4", copy=False)
+        elif values.dtype != np.uint8:
+            raise TypeError(f"digests are over uint8 or float32 values, not {values.dtype}")
+        running = self._running.setdefault(feature, hashlib.sha256())
+        running.update(np.ascontiguousarray(values).data)
 
     def current(self) -> dict[str, str]:
         """Return the digests of all that came so far, by feature name; more may follow."""
         return {name: running.copy().hexdigest() for name, running in self._running.items()}
-
-
-def _bytes(values: NDArray[Any]) -> memoryview:
-    if values.dtype == np.float32:
-        values = values.astype("<f4", copy=False)
-    elif values.dtype != np.uint8:
-        raise TypeError(f"digests are over uint8 or float32 values, not {values.dtype}")
-    return np.ascontiguousarray(values).data

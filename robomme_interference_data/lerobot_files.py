@@ -110,12 +110,14 @@ class LeRobotFiles:
         return table.combine_chunks()
 
     @cached_property
-    def tasks(self) -> set[str]:
-        """The task texts that the dataset lists."""
+    def tasks(self) -> dict[str, Any]:
+        """The index of each task text that the dataset lists."""
         if self.version == "v2.1":
-            return {str(row.get("task")) for row in self._json_lines(_V21_TASKS)}
-        rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
-        return {str(row.get("task", row.get("__index_level_0__"))) for row in rows}
+            rows = list(self._json_lines(_V21_TASKS))
+        else:
+            rows = RowSpan(self.files.path(TASKS_PATH)).table().to_pylist()
+        texts = (str(row.get("task", row.get("__index_level_0__"))) for row in rows)
+        return {text: row.get("task_index") for text, row in zip(texts, rows, strict=True)}
 
     def row(self, index: int) -> dict[str, Any]:
         """Return the per-episode columns of an episode as plain values.

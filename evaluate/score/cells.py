@@ -16,7 +16,7 @@ from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.records import Status
 from robomme_interference_data.stats import wilson
-from robomme_interference_data.tables import Column, Table, percent
+from robomme_interference_data.tables import Table, percent
 
 _ERROR = STATUSES.index(Status.ERROR)
 _NOTE = (
@@ -170,9 +170,8 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         note = _NOTE
         note += f" Not ranked either, as they use no memory: {', '.join(bounds)}." * bool(bounds)
         note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
-        columns = (Column("system"), *map(Column, conditions))
         title = f"Success by system and condition, {simulator}"
-        grids.append(Table(simulator, title, columns, tuple(rows), note))
+        grids.append(Table.make(simulator, title, " ".join(["system", *conditions]), rows, note))
     return grids
 
 

@@ -68,18 +68,21 @@ class EpisodeInfo:
     """What may be known of an episode besides its frames. The hidden answer is not in it.
 
     Attributes:
-        goal: The goal in words: the first of `goals`.
         goals: All wordings of the goal; at least one.
         difficulty: `easy`, `medium` or `hard`.
         seed: Seed of the scene.
         simulator: Name under which the simulator is registered.
     """
 
-    goal: str
     goals: tuple[str, ...]
     difficulty: str
     seed: int
     simulator: str
+
+    @property
+    def goal(self) -> str:
+        """The goal in words: the first of its wordings."""
+        return self.goals[0]
 
 
 Begun = tuple[Demonstration, Observation, EpisodeInfo]

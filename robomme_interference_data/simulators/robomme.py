@@ -148,8 +148,7 @@ class RoboMMESimulator(Simulator):
         images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
         lesson = Demonstration(images, arrays["states"][:-1], no_actions)
-        goals = tuple(about["goals"])
-        info = EpisodeInfo(goals[0], goals, about["difficulty"], about["seed"], self.name)
+        info = EpisodeInfo(tuple(about["goals"]), about["difficulty"], about["seed"], self.name)
         return lesson, first, info
 
     def _execute(

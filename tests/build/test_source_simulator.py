@@ -42,7 +42,7 @@ class Played:
         told = 5 if self.name == "tabletop" else 0  # RoboMME tells no actions
         states = np.repeat(np.arange(5, dtype=np.float32)[:, None], 8, 1)
         lesson = Demonstration(self.images(5), states, np.ones((told, 8), np.float32))
-        info = EpisodeInfo("goal", ("goal", "other"), "easy", self.index, self.name)
+        info = EpisodeInfo(("goal", "other"), "easy", self.index, self.name)
         return lesson, self.seen(), info
 
     def act(self, policy: str) -> np.ndarray:

@@ -1,6 +1,7 @@
 """One episode staged: cut while it is read, encoded, decoded again, hashed; and what is refused."""
 
 import dataclasses
+import hashlib
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,18 @@ from robomme_interference_data.build_dataset import stage
 from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import ImageStats
+from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame
-from robomme_interference_data.build_dataset.stage import StagedEpisode, StageTask, read_staged
-from robomme_interference_data.digest import feature_digest
+from robomme_interference_data.build_dataset.stage import Staged, StageTask, read_staged
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.video import iter_frames
 
 NAME = "MoveCube/test/0"
+
+
+def digest(values: NDArray[Any]) -> str:
+    return hashlib.sha256(values.tobytes()).hexdigest()
 
 
 def task(folder: Path, source: MadeUpSource, kind: str, **options: Any) -> StageTask:
@@ -33,13 +38,19 @@ def task(folder: Path, source: MadeUpSource, kind: str, **options: Any) -> Stage
 
 def staged(
     folder: Path, source: MadeUpSource, kind: str = "demonstrations", **options: Any
-) -> StagedEpisode:
+) -> tuple[Staged, Path]:
     [episode] = source.episodes()
-    return task(folder, source, kind, **options)((0, episode), Worker(0))
+    one = task(folder, source, kind, **options)
+    return one((0, episode), Worker(0)), one.place((0, episode))
+
+
+def stored(folder: Path, source: MadeUpSource, **options: Any) -> StoredEpisode:
+    made, place = staged(folder, source, **options)
+    return made.stored(place)
 
 
 def test_a_demonstration(tmp_path: Path) -> None:
-    made = staged(tmp_path, MadeUpSource({NAME: (40, 20)}))
+    made = stored(tmp_path, MadeUpSource({NAME: (40, 20)}))
     known = made.record
     assert (known.length, known.exec_start_idx) == (21, 20)
     assert known.goals == (f"do {NAME}",)
@@ -48,22 +59,22 @@ def test_a_demonstration(tmp_path: Path) -> None:
     front = np.stack([picture(f"{NAME} front", number) for number in range(21)])
     states = np.arange(21, dtype=np.float32)[:, None].repeat(8, 1)
     whole = {"observation.images.front": front, "observation.state": states, "action": 0 - states}
-    assert known.feature_sha256 == {name: feature_digest(v) for name, v in whole.items()}
-    assert known.lesson_sha256 == {name: feature_digest(v[:20]) for name, v in whole.items()}
+    assert known.feature_sha256 == {name: digest(v) for name, v in whole.items()}
+    assert known.lesson_sha256 == {name: digest(v[:20]) for name, v in whole.items()}
     assert made.features == {name: v.shape[1:] for name, v in whole.items()}
-    decoded = np.stack(list(iter_frames(made.video("observation.images.front"), 0, None, 10)))
+    decoded = np.stack(list(iter_frames(made.videos["observation.images.front"], 0, None, 10)))
     np.testing.assert_array_equal(decoded, front)
     np.testing.assert_array_equal(made.vectors("action"), 0 - states)
     pixels = front[:, ::4, ::4]  # every fourth row and column
-    mean = made.stats("observation.images.front")["mean"]
+    mean = made.stats["observation.images.front"]["mean"]
     np.testing.assert_allclose(mean, pixels.mean((0, 1, 2)))
 
 
 def test_an_episode_that_yields_nothing_is_remembered(tmp_path: Path) -> None:
     source = MadeUpSource({NAME: (200, None)})
-    made = staged(tmp_path, source, "distractors")
-    assert made.staged.skipped == "200 raw frames; a unit needs 249"
-    assert read_staged(made.folder) == made
+    made, place = staged(tmp_path, source, "distractors")
+    assert made.skipped == "200 raw frames; a unit needs 249"
+    assert read_staged(place) == made
 
 
 def test_what_is_staged_is_not_read_again(tmp_path: Path) -> None:
@@ -100,12 +111,12 @@ def test_of_a_lossy_codec_the_decoded_frames_are_hashed(tmp_path: Path) -> None:
         for frame in [source.frame(NAME, number, 4)]
     }
     source.wrong[NAME] = big
-    made = staged(tmp_path, source, codec="lerobot-default")
-    decoded = np.stack(list(iter_frames(made.video("observation.images.front"), 0, None, 10)))
+    made = stored(tmp_path, source, codec="lerobot-default")
+    decoded = np.stack(list(iter_frames(made.videos["observation.images.front"], 0, None, 10)))
     digests = made.record.feature_sha256, made.record.lesson_sha256
-    assert digests[0]["observation.images.front"] == feature_digest(decoded)
+    assert digests[0]["observation.images.front"] == digest(decoded)
     assert digests[1] is not None
-    assert digests[1]["observation.images.front"] == feature_digest(decoded[:4])
+    assert digests[1]["observation.images.front"] == digest(decoded[:4])
     assert not made.record.exact
 
 

@@ -1,6 +1,7 @@
 """Digests over decoded data can be recomputed with hashlib alone."""
 
 import hashlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from robomme_interference_data.digest import FeatureDigests, combine, feature_digest
+from robomme_interference_data.digest import FeatureDigests, combine
 
 
 def images(count: int) -> NDArray[np.uint8]:
@@ -17,6 +18,12 @@ def images(count: int) -> NDArray[np.uint8]:
 
 def vectors(count: int) -> NDArray[np.float32]:
     return np.random.default_rng(count).normal(size=(count, 8)).astype(np.float32)
+
+
+def feature_digest(values: NDArray[Any]) -> str:
+    digests = FeatureDigests()
+    digests.update("feature", values)
+    return digests.current()["feature"]
 
 
 def test_feature_digest_by_hand() -> None:

@@ -23,7 +23,7 @@ from robomme_interference_data.strip import session_colors
 pytestmark = pytest.mark.usefixtures("trouble")
 
 K1 = WorkItem("k1", EPISODE)
-INFO = EpisodeInfo("do as shown", ("do as shown",), "easy", 1, "world")
+INFO = EpisodeInfo(("do as shown",), "easy", 1, "world")
 VIEW = Observation({"front": np.full((256, 256, 3), 90, np.uint8)}, np.zeros(8, np.float32))
 
 

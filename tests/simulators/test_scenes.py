@@ -23,7 +23,6 @@ from robomme_interference_data.simulators.tabletop.env import FRONT_EYE, FRONT_T
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
     episode_ids,
-    guess_of,
     seed_of,
     turn_of,
 )
@@ -107,10 +106,10 @@ def test_answers_are_these() -> None:
 def test_a_guess_tells_nothing_of_the_answer(count: int) -> None:
     """Of 1,800 guesses 1,800 / count are right, give or take four standard deviations."""
     seeds = [seed_of(episode) for episode in episode_ids()]
-    right = sum(guess_of(seed, count) == turn_of(seed, count) for seed in seeds)
+    right = sum(turn_of(seed, count, stream=1) == turn_of(seed, count) for seed in seeds)
     sigma = math.sqrt(1800 * (count - 1)) / count
     assert abs(right - 1800 / count) < 4 * sigma
-    guessed = Counter(guess_of(seed, count) for seed in seeds)
+    guessed = Counter(turn_of(seed, count, stream=1) for seed in seeds)
     assert all(abs(guessed[answer] - 1800 / count) < 4 * sigma for answer in range(count))
 
 

@@ -40,7 +40,7 @@ class Double(Simulator):
             np.zeros((5, 8), np.float32),
             np.ones((5, 8), np.float32),
         )
-        info = EpisodeInfo("goal", ("goal",), "easy", episode.index, "double")
+        info = EpisodeInfo(("goal",), "easy", episode.index, "double")
         return lesson, Observation(self._images(episode), np.zeros(8, np.float32)), info
 
     def _execute(

@@ -75,7 +75,7 @@ class World:
             lesson_images(query) if demonstration else {}, states, np.zeros_like(states)
         )
         goals = query.record.goals
-        info = EpisodeInfo(query.goal, goals, str(query.difficulty), query.seed or 0, "world")
+        info = EpisodeInfo(goals, str(query.difficulty), query.seed or 0, "world")
         return lesson, self.seen, info
 
     def step(self, action: NDArray[np.float32], observe: bool = True) -> tuple[Observation, Status]:

@@ -19,7 +19,7 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
-from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, guess_of, turn_of
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, turn_of
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
@@ -147,7 +147,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         turn = turn_of(number, len(answers))
         answer = _index(options.get("answer", turn), -len(answers), len(answers), "answer")
         self.episode, self.answer = episode, answers[answer]
-        self.guess = answers[guess_of(number, len(answers))]
+        self.guess = answers[turn_of(number, len(answers), stream=1)]
         observed, info = super().reset(seed=number, options=options)
         if self.demonstrating:
             info["demonstration"] = self._demonstrate()

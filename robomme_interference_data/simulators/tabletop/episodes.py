@@ -36,7 +36,7 @@ def turn_of(seed: int, count: int, stream: int = 0) -> int:
 
     In each group of episodes of a family, split and difficulty each answer occurs equally often,
     to within one. It does so once in every `count` episodes of the group, in a new order; another
-    `stream` has orders of its own.
+    `stream` has orders of its own: answers are of stream 0, guesses of 1.
     """
     family, number = divmod(seed, _FAMILY_SPAN)
     split, number = divmod(number, _SPLIT_SPAN)
@@ -44,14 +44,6 @@ def turn_of(seed: int, count: int, stream: int = 0) -> int:
     block, place = divmod(number, count)
     order = RandomState([family, split, difficulty, block, stream]).permutation(count)
     return int(order[place])
-
-
-def guess_of(seed: int, count: int) -> int:
-    """Return which of `count` answers is guessed in the episode of a seed, whatever the right one.
-
-    Guesses take turns as answers do.
-    """
-    return turn_of(seed, count, stream=1)
 
 
 def difficulty_of(seed: int) -> str:

@@ -59,7 +59,7 @@ class TabletopSimulator(Simulator):
         self.env.family = episode.family
         self.env.demonstrated = self._cameras if demonstration else ()
         _, info = self.env.reset(seed=seed)
-        about = EpisodeInfo(info["goal"], info["goals"], info["difficulty"], seed, self.name)
+        about = EpisodeInfo(info["goals"], info["difficulty"], seed, self.name)
         return info["demonstration"], self.env.observe(self._cameras), about
 
     def _execute(
