@@ -50,8 +50,9 @@ from robomme_interference_data.files import (
     atomic_path,
     canonical_json,
     format_sums,
-    hold,
     sha256_file,
+    work_folder,
+    working,
     write_json,
     write_text,
 )
@@ -121,10 +122,7 @@ def build_index(
     works = [_Work(root, one, encoder, camera) for root, one in zip(roots, datasets, strict=True)]
     with ExitStack() as held:
         for work in works:
-            work.hidden.mkdir(parents=True, exist_ok=True)
-            what = f"another process makes {work.folder}"
-            busy = BuildError(what, "Wait for it to end, or stop it.")
-            held.enter_context(hold(work.hidden / "lock", busy))
+            held.enter_context(working(work.folder))
         progress.start(encoder.name, sum(sum(work.lengths) for work in works))
         pool: EmbeddingIndex | None = None
         reports = {}
@@ -185,7 +183,7 @@ class _Work:
         self.lengths = [record.length for record in dataset.records()]
         self.computed = {"in": encoder.computed_in, "batch": encoder.batch}
         self.folder = root / index_folder(encoder.name, camera)
-        self.hidden = self.folder.with_name(f".{self.folder.name}")
+        self.hidden = work_folder(self.folder)
         # Features that were made otherwise have another place: they are never mixed.
         made_of = canonical_json([encoder.fingerprint, self.computed, dataset.revision])
         kept = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
@@ -264,6 +262,7 @@ class _Work:
             sums=sha256_file(made / INDEX_SUMS),
         )
         write_json(made / INDEX_HEADER, to_dict(header))
-        shutil.rmtree(self.folder, ignore_errors=True)
+        if self.folder.exists():
+            self.folder.rename(self.hidden / "before")
         made.rename(self.folder)
         return header

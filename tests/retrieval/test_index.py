@@ -14,7 +14,7 @@ from support.splits import QUERIES, UNITS
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.embeddings import normalised
 from robomme_interference_data.errors import BuildError, MissingIndexError
-from robomme_interference_data.files import hold
+from robomme_interference_data.files import hold, work_folder
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.select import measure
@@ -171,7 +171,7 @@ def test_what_cannot_be_embedded(own_split: Path) -> None:
 
 
 def test_two_do_not_make_one_index(own_split: Path) -> None:
-    folder = own_split / "demonstrations" / "index" / ".thumbnail"
+    folder = work_folder(own_split / "demonstrations" / "index" / "thumbnail")
     folder.mkdir(parents=True)
     with hold(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
         make_index(own_split)
