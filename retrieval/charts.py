@@ -6,11 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.conditions import in_order, parse_condition
-from robomme_interference_data.drawing import GREY, INK, open_figure, save_figure, tidy
+from robomme_interference_data.drawing import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PINK,
+    SKY,
+    VERMILION,
+    open_figure,
+    save_figure,
+    tidy,
+)
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell
 
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
+_COLOURS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, INK)
 _MARKERS = "osD^vPX"
 _SHARES = ("purity", "coverage")
 _LINES = ("-", "--")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import SAMPLE_FRAMES
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Session
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines, segments
@@ -61,8 +61,7 @@ class Rule:
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            what = f"there is no method {self.method!r}"
-            raise UnknownNameError(what, nearest(self.method, METHODS))
+            raise UnknownNameError.none("method", self.method, METHODS)
         if self.cut != ADAPTIVE and not (isinstance(self.cut, float | int) and -1 <= self.cut <= 1):
             expected = f"a cosine, from −1 to 1, or {ADAPTIVE}, such as max/0.923"
             raise InvalidOptionError.expected(f"the cut of {self.method}", self.cut, expected)

@@ -42,13 +42,11 @@ class Kind:
 
     Attributes:
         name: `k` for the paper's conditions with history, `no-history`, and so on.
-        asks: What the conditions ask of a memory, in a few words.
         rule: From a query's material and `k` to its sessions.
         counted: Whether its conditions have a `k` in their name.
     """
 
     name: str
-    asks: str
     rule: Callable[[Material, int], tuple[SessionEntry, ...]] = field(compare=False)
     counted: bool = True
 
@@ -62,8 +60,8 @@ def _lesson_first(material: Material, k: int) -> tuple[SessionEntry, ...]:
 
 
 _KINDS = (
-    Kind(NO_HISTORY, "how far one gets without history", _nothing, counted=False),
-    Kind("k", "whether the lesson is found behind k sessions of other families", _lesson_first),
+    Kind(NO_HISTORY, _nothing, counted=False),
+    Kind("k", _lesson_first),
 )
 
 KINDS: dict[str, Kind] = {kind.name: kind for kind in _KINDS}

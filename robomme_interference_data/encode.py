@@ -1,4 +1,4 @@
-"""Encode frames as video with PyAV: datasets, recordings, and clips to look at."""
+"""Encode frames as video with PyAV: datasets, and clips to look at."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -68,9 +68,6 @@ CODECS = {
 """The codecs that a dataset can be built with, by name."""
 
 
-RECORDING = Codec(name="ffv1", vcodec="ffv1", pix_fmt="bgr0", settings={}, options={}, exact=True)
-"""How recordings are kept in a frames folder: lossless and quick, but no codec of LeRobot's."""
-
 CLIP = Codec(
     name="clip",
     vcodec="libx264",
@@ -126,7 +123,7 @@ class VideoEncoder:
         self._path = path
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
         with self._errors():
-            # Matroska would write a random number otherwise.
+            # No version of FFmpeg is written then.
             self._container = av.open(
                 str(path), "w", format=container, container_options={"fflags": "+bitexact"}
             )

@@ -44,6 +44,11 @@ class UnknownNameError(InterferenceError, LookupError):
         """Return the error for a name that is not there: `what` it names, and what there is."""
         return cls(f"{what} {given!r} is not in {where}", nearest(str(given), map(str, known)))
 
+    @classmethod
+    def none(cls, what: str, given: str, known: Iterable[str]) -> Self:
+        """Return the error for a name that nothing has: `what` it names, and what there is."""
+        return cls(f"there is no {what} {given!r}", nearest(given, known))
+
 
 class InvalidOptionError(InterferenceError, ValueError):
     """An option or argument outside what it may be."""

@@ -8,7 +8,7 @@ tries it again, nor ends what the task had started, nor tells where it hung.
 from collections import deque
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypedDict, Unpack
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
 from robomme_interference_data.worker_process import (
@@ -25,17 +25,29 @@ from robomme_interference_data.worker_process import (
 __all__ = ["Executor", "Outcome", "Processes", "Serial", "Task", "Worker", "end_if_starting"]
 
 
+_ATTEMPTS = 2
+
+
+class Limits(TypedDict, total=False):
+    """What may be said of tasks.
+
+    Attributes:
+        time_limit: Seconds that one task may take, and as many for the start of a worker; None,
+            as if it is not given, for no limit.
+        attempts: How often a task is started before what went wrong is reported; 2 by default.
+        again: Errors of this package after which a task is started again; none by default.
+    """
+
+    time_limit: float | None
+    attempts: int
+    again: tuple[type[Exception], ...]
+
+
 class Executor(Protocol):
     """Runs tasks."""
 
     def run(
-        self,
-        function: Task,
-        tasks: Iterable[Any],
-        *,
-        time_limit: float | None = None,
-        attempts: int = 2,
-        again: tuple[type[Exception], ...] = (),
+        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
     ) -> Generator[Outcome]:
         """Call a function on every task; yield outcomes as they come.
 
@@ -48,10 +60,7 @@ class Executor(Protocol):
         Args:
             function: What to do of a task.
             tasks: Picklable tasks.
-            time_limit: Seconds that one task may take, and as many for the start of a worker; None
-                for no limit.
-            attempts: How often a task is started before what went wrong is reported.
-            again: Errors of this package after which a task is started again.
+            limits: See `Limits`.
 
         Raises:
             WorkerError: A worker ended before its first task, as it does when the script that it
@@ -66,23 +75,17 @@ class Serial:
     """Runs tasks in this process, one after the other; there are no time limits."""
 
     def run(
-        self,
-        function: Task,
-        tasks: Iterable[Any],
-        *,
-        time_limit: float | None = None,
-        attempts: int = 2,
-        again: tuple[type[Exception], ...] = (),
+        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
     ) -> Generator[Outcome]:
         """Call a function on every task; see `Executor.run`."""
-        worker = Worker(0)
+        worker, attempts = Worker(0), limits.get("attempts", _ATTEMPTS)
         try:
             for task in tasks:
                 for number in range(1, attempts + 1):
                     outcome = Outcome(task, *attempt(function, task, worker), number)
                     if isinstance(outcome.error, WorkerRetiredError):
                         raise outcome.error
-                    if not isinstance(outcome.error, again):
+                    if not isinstance(outcome.error, limits.get("again", ())):
                         break
                 yield outcome
         finally:
@@ -109,16 +112,11 @@ class Processes:
             raise InvalidOptionError.expected("workers", self.workers, "1 or more")
 
     def run(
-        self,
-        function: Task,
-        tasks: Iterable[Any],
-        *,
-        time_limit: float | None = None,
-        attempts: int = 2,
-        again: tuple[type[Exception], ...] = (),
+        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
     ) -> Generator[Outcome]:
         """Call a function on every task in worker processes; see `Executor.run`."""
         end_if_starting()
+        time_limit, again = limits.get("time_limit"), limits.get("again", ())
         waiting = deque((task, 1) for task in tasks)
         to_start = deque(range(self.workers))  # numbers of workers that do not run
         running: list[WorkerProcess] = []
@@ -145,7 +143,7 @@ class Processes:
                         waiting.appendleft((outcome.task, outcome.attempts))
                         if not running and not to_start:
                             raise outcome.error
-                    elif outcome.attempts < attempts and (
+                    elif outcome.attempts < limits.get("attempts", _ATTEMPTS) and (
                         worker.over or isinstance(outcome.error, again)
                     ):
                         waiting.append((outcome.task, outcome.attempts + 1))

@@ -32,7 +32,6 @@ from robomme_interference_data.parquet import RowSpan, open_parquet, reading
 
 _V21_EPISODES = "meta/episodes.jsonl"
 _V21_TASKS = "meta/tasks.jsonl"
-_ROWS_KEPT = 1024
 
 
 class LeRobotFiles:
@@ -131,8 +130,6 @@ class LeRobotFiles:
             )
         row = self._rows.get(index)
         if row is None:
-            if len(self._rows) > _ROWS_KEPT:
-                self._rows.clear()
             row = self._rows[index] = self.table.slice(index, 1).to_pylist()[0]
         return row
 

@@ -7,14 +7,25 @@ from pathlib import Path
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
-from robomme_interference_data.drawing import Page, ink_on, open_page, tint
+from robomme_interference_data.drawing import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    SKY,
+    VERMILION,
+    YELLOW,
+    Page,
+    ink_on,
+    open_page,
+    tint,
+)
 from robomme_interference_data.records import Session
 from robomme_interference_data.sampling import even_sample, spread
 
-LESSON_COLOR = "#D55E00"
-COLORS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#0072B2", "#F0E442", "#999999", "#000000")
-"""Okabe and Ito's palette, which people with a colour vision deficiency can tell apart too, and
-grey; its vermilion is the lesson's."""
+LESSON_COLOR = VERMILION
+COLORS = (SKY, ORANGE, GREEN, PINK, BLUE, YELLOW, "#999999", "#000000")
+"""Of the other sessions."""
 
 # Inches.
 _WIDTH = 7.2  # text width of a two-column page

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError, SourceError, UnknownNameError
-
-CAMERAS = ("front", "wrist")
+from robomme_interference_data.simulators.base import CAMERAS
 
 _USUAL = {
     "front": ("observation.images.front", "image", "observation.images.image"),

@@ -21,7 +21,7 @@ from robomme_interference_data.build_dataset.sources.base import (
     demonstration_length,
     file_state,
 )
-from robomme_interference_data.build_dataset.sources.columns import CAMERAS, resolve_columns
+from robomme_interference_data.build_dataset.sources.columns import resolve_columns
 from robomme_interference_data.build_dataset.sources.families import (
     ids_by_block,
     ids_by_columns,
@@ -43,6 +43,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.rows import from_dict
+from robomme_interference_data.simulators.base import CAMERAS
 
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _MEND = "Correct the dataset, or leave the episode out."

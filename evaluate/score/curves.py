@@ -9,24 +9,34 @@ from itertools import groupby
 from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_condition
-from robomme_interference_data.drawing import INK, tidy
+from robomme_interference_data.drawing import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PINK,
+    SKY,
+    VERMILION,
+    tidy,
+)
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 
-# Okabe and Ito's colours, safe for the colour-blind: one for what the memory is made of.
+# One for what the memory is made of.
 _COLOURS = {
-    "none": "#767676",
-    "frames": "#0072B2",
-    "tokens": "#56B4E9",
-    "hidden state": "#009E73",
-    "text": "#E69F00",
-    "text with points": "#D55E00",
-    "text with points and key frames": "#CC79A7",
-    "all frames": "#009E73",
-    "last frames": "#E69F00",
+    "none": GREY,
+    "frames": BLUE,
+    "tokens": SKY,
+    "hidden state": GREEN,
+    "text": ORANGE,
+    "text with points": VERMILION,
+    "text with points and key frames": PINK,
+    "all frames": GREEN,
+    "last frames": ORANGE,
 }
-_OWN = ("#CC79A7", "#009E73", "#E69F00", "#56B4E9", "#D55E00", "#0072B2")
+_OWN = (PINK, GREEN, ORANGE, SKY, VERMILION, BLUE)
 # Marker and line: one for how it enters the policy.
 _SHAPES = {
     "modulator": ("o", "-"),

@@ -11,7 +11,7 @@ from robomme_interference_data.constants import (
     PROTOCOL_VERSION,
     SPLITS,
 )
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.score.sources import COLUMNS
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.records import FINAL, Status
@@ -65,7 +65,7 @@ def parsed(name: str, value: Any) -> Any:
 
 def _check_simulator(name: str) -> None:
     if name not in SIMULATORS and name.lower() in SIMULATORS:
-        raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
+        raise UnknownNameError.none("simulator", name, SIMULATORS)
     if not _SIMULATOR.fullmatch(name):
         raise ValueError("up to 128 letters, digits, '.', '_', '-' and ':'")
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.embeddings import encoder_id
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.files import canonical_json
 
 _KINDS = ("siglip", "thumbnail")
@@ -68,7 +68,7 @@ def encoder_name(name: str) -> str:
     """
     kind, colon, model = name.partition(":")
     if kind not in _KINDS:
-        raise UnknownNameError(f"there is no encoder {name!r}", nearest(kind, _KINDS))
+        raise UnknownNameError.none("encoder", kind, _KINDS)
     if colon and (kind == "thumbnail" or not model):
         expected = "thumbnail, siglip, or siglip:ID with the id or folder of a model"
         raise InvalidOptionError.expected("encoder", name, expected)

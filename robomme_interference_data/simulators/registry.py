@@ -4,7 +4,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from robomme_interference_data.errors import MissingExtraError, UnknownNameError, nearest
+from robomme_interference_data.errors import MissingExtraError, UnknownNameError
 from robomme_interference_data.simulators.base import Simulator
 
 
@@ -53,7 +53,7 @@ def find_simulator(name: str) -> Callable[..., Simulator]:
         return SIMULATORS[name]
     module, _, function = name.partition(":")
     if not function:
-        raise UnknownNameError(f"there is no simulator {name!r}", nearest(name, SIMULATORS))
+        raise UnknownNameError.none("simulator", name, SIMULATORS)
     try:
         found: Callable[..., Simulator] = getattr(import_module(module), function)
     except (ModuleNotFoundError, AttributeError) as error:

@@ -8,4 +8,4 @@ from robomme_interference_data.conditions import KINDS, Kind
 @pytest.fixture
 def filler(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kind of conditions, `filler-k<n>`, of which scoring knows nothing."""
-    monkeypatch.setitem(KINDS, "filler", Kind("filler", "a test", KINDS["k"].rule))
+    monkeypatch.setitem(KINDS, "filler", Kind("filler", KINDS["k"].rule))
