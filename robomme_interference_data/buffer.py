@@ -100,19 +100,9 @@ class Buffer:
         return self.manifest.condition
 
     @property
-    def k(self) -> int:
-        """Number of sessions that the condition adds."""
-        return self.manifest.k
-
-    @property
     def goal(self) -> str:
         """The query's goal in words: the first of its wordings."""
         return self.manifest.goal
-
-    @property
-    def exec_start_idx(self) -> int:
-        """Number of history frames before the first live observation."""
-        return self.manifest.history_frames
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -77,6 +77,10 @@ class LocalFiles:
         found = (self.root / folder).rglob(f"*{suffix}")
         return sorted(p.relative_to(self.root).as_posix() for p in found if p.is_file())
 
+    def snapshot(self, *patterns: str) -> Path:
+        """Return the folder; see `HubFiles.snapshot`."""
+        return self.root
+
     def describe(self) -> str:
         """Return the folder."""
         return str(self.root)

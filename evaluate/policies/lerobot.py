@@ -33,7 +33,7 @@ from robomme_interference_data.errors import (
     PolicyError,
 )
 from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
-from robomme_interference_data.files import LocalFiles, format_sums
+from robomme_interference_data.files import format_sums
 from robomme_interference_data.hub import locate
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
@@ -207,10 +207,7 @@ def find_policy(path: str) -> tuple[Path, str]:
         HubError: The Hub does not know the model, or cannot be reached.
     """
     files = locate(path, "model")
-    if isinstance(files, LocalFiles):
-        folder, name = files.root, path
-    else:
-        folder, name = files.snapshot(*_FILES), f"{files.repo_id}@{files.commit}"
+    folder, name = files.snapshot(*_FILES), files.describe()
     missing = [one for one in _NEEDED if not (folder / one).is_file()]
     if missing:
         raise MissingFileError(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
-from robomme_interference_data.evaluate.log import RunHeader, whole_lines
+from robomme_interference_data.evaluate.log import RunHeader, rows_that_count, whole_lines
 from robomme_interference_data.parquet import open_parquet, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, read_header
@@ -206,9 +206,7 @@ def _read_record(path: Path, with_system: bool) -> Part:
     sizes = [max(1, len(codes[name][1])) for name in KEY_COLUMNS]
     key = np.ravel_multi_index([codes[name][0] for name in KEY_COLUMNS], sizes)
     status, names = codes["status"]
-    _, last = np.unique(key[::-1], return_index=True)
-    kept = status != (names.index(Status.ERROR) if Status.ERROR in names else -1)
-    kept[len(key) - 1 - last] = True
-    rows = np.flatnonzero(kept)
+    broke = status == (names.index(Status.ERROR) if Status.ERROR in names else -1)
+    rows = rows_that_count(key, broke)
     columns = {name: (codes[name][0][rows], codes[name][1]) for name in COLUMNS}
     return Part(path, columns, len(rows), lambda row: int(rows[row]) + 1)

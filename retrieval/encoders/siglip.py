@@ -17,8 +17,7 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     first_line,
 )
-from robomme_interference_data.files import LocalFiles
-from robomme_interference_data.hub import locate
+from robomme_interference_data.hub import HubFiles, locate
 from robomme_interference_data.retrieval.encoders import encoder_name
 
 _FILES = ("*.json", "*.safetensors")
@@ -62,10 +61,8 @@ class Siglip:
         self.name = encoder_name(f"siglip:{model}")
         files = locate(model, "model")
         origin: dict[str, str | None] = {"model": None, "revision": None}
-        if isinstance(files, LocalFiles):
-            folder = files.root
-        else:
-            folder = files.snapshot(*_FILES)
+        folder = files.snapshot(*_FILES)
+        if isinstance(files, HubFiles):
             origin = {"model": files.repo_id, "revision": files.commit}
         try:
             self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))

@@ -60,8 +60,8 @@ def test_lesson_first_then_the_units(condition: str, episode: str) -> None:
     k = int(condition[1:]) if condition != "no-history" else 0
     lesson = [] if condition == "no-history" else [("lesson", 0, LESSON)]
     frames = len(lesson) * LESSON + 32 * k
-    assert (str(made.episode_id), made.condition, made.k) == (episode, condition, k)
-    assert len(made) == made.exec_start_idx == frames
+    assert (str(made.episode_id), made.condition, made.manifest.k) == (episode, condition, k)
+    assert len(made) == frames
     assert made.cameras == CAMERAS
     starts = [LESSON + 32 * number for number in range(k)]
     assert [(one.role, one.start, one.stop) for one in made.sessions] == [

@@ -107,7 +107,7 @@ def test_a_split_of_real_frames(shared_data: Path, recordings: Path, tmp_path: P
         lesson = video_frames(lessons / f"{family}_test_0_front.mkv")
         states = np.load(lessons / f"{family}_test_0.npz")["state"]
         buffer = load_buffer(f"{family}/test/0", k=1, split=split, verify=True)
-        assert (len(lesson), buffer.exec_start_idx) == (start + 1, start + 32)
+        assert (len(lesson), len(buffer)) == (start + 1, start + 32)
         assert np.array_equal(buffer.frames("front"), [*lesson[:start], *unit])
         assert np.array_equal(buffer.states[:start], states[:start])
         assert np.array_equal(buffer.query.frame("front"), lesson[start])
