@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.errors import InvalidOptionError, SourceError, nearest
+from robomme_interference_data.errors import SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
 
 
@@ -138,18 +138,6 @@ def file_state(path: Path) -> tuple[int, int] | None:
     found = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
     latest = max((one.st_mtime_ns for one in found), default=0)
     return latest, sum(one.st_size for one in found)
-
-
-def choose_cameras(wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the cameras that are wanted of those that are there, sorted.
-
-    Raises:
-        InvalidOptionError: One is not there.
-    """
-    for camera in wanted or ():
-        if camera not in there:
-            raise InvalidOptionError.one_of("camera", camera, there)
-    return tuple(sorted(there if wanted is None else set(wanted)))
 
 
 def demonstration_length(flags: ArrayLike, what: str) -> int:

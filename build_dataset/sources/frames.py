@@ -16,7 +16,6 @@ from robomme_interference_data.build_dataset.sources.base import (
     Recording,
     Source,
     SourceEpisode,
-    choose_cameras,
     compose,
     file_state,
 )
@@ -32,6 +31,7 @@ from robomme_interference_data.build_dataset.sources.images import (
 from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
+from robomme_interference_data.simulators.base import choose_cameras
 from robomme_interference_data.video import iter_frames
 
 _VIDEO_SUFFIXES = (".mkv", ".mp4", ".avi", ".mov", ".webm")

@@ -19,13 +19,13 @@ from robomme_interference_data.build_dataset.sources.base import (
     Recording,
     Source,
     SourceEpisode,
-    choose_cameras,
     demonstration_length,
     file_state,
 )
 from robomme_interference_data.build_dataset.sources.robomme_families import ROBOMME
 from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import choose_cameras
 
 if TYPE_CHECKING:
     import h5py

@@ -16,7 +16,6 @@ from robomme_interference_data.build_dataset.sources.base import (
     Recording,
     Source,
     SourceEpisode,
-    choose_cameras,
     compose,
     demonstration_length,
     file_state,
@@ -43,7 +42,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.rows import from_dict
-from robomme_interference_data.simulators.base import CAMERAS
+from robomme_interference_data.simulators.base import CAMERAS, choose_cameras
 
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _MEND = "Correct the dataset, or leave the episode out."

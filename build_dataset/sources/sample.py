@@ -16,11 +16,10 @@ from robomme_interference_data.build_dataset.sources.base import (
     Recording,
     Source,
     SourceEpisode,
-    choose_cameras,
 )
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.base import CAMERAS
+from robomme_interference_data.simulators.base import choose_cameras
 
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
 _EPISODES = {"train": 3, "test": 1}
@@ -61,7 +60,7 @@ class SampleSource(Source):
         number = episode.key
         scene = _Scene(name, number, self._size)
         short = (number, name.split, name.index) == (0, "train", 1)
-        chosen = choose_cameras(cameras, CAMERAS)
+        chosen = choose_cameras(cameras)
         frames = scene.frames(_SHORT if short else _FRAMES, 48 + 16 * (name.index % 2), chosen)
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]

@@ -10,14 +10,13 @@ from robomme_interference_data.build_dataset.sources.base import (
     Recording,
     Source,
     SourceEpisode,
-    choose_cameras,
 )
 from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.base import (
-    CAMERAS,
     Demonstration,
     Observation,
     Simulator,
+    choose_cameras,
 )
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
@@ -57,7 +56,7 @@ class SimulatorSource(Source):
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Begin to play an episode; see `Source.read`."""
-        simulator = self._open(choose_cameras(cameras, CAMERAS))
+        simulator = self._open(choose_cameras(cameras))
         lesson, first, info = simulator.reset(str(episode.id))
         act = (lambda: simulator.act("oracle")) if self.whole else None
         frames = _play(simulator, lesson, first, act)

@@ -12,7 +12,6 @@ from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.errors import (
     InvalidOptionError,
     SimulatorCrashError,
-    UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
@@ -200,16 +199,16 @@ class Simulator(ABC):
         """Execute one action in the episode that runs."""
 
 
-def camera_names(simulator: str, cameras: Sequence[str]) -> tuple[str, ...]:
-    """Return the cameras that are asked of a simulator, in the order of `CAMERAS`.
+def choose_cameras(wanted: Sequence[str] | None, there: Sequence[str] = CAMERAS) -> tuple[str, ...]:
+    """Return the cameras that are wanted, None for all, of those that are there, sorted.
 
     Raises:
-        UnknownNameError: There is no such camera.
+        InvalidOptionError: One is not there.
     """
-    for camera in cameras:
-        if camera not in CAMERAS:
-            raise UnknownNameError.among("camera", camera, f"the {simulator} simulator", CAMERAS)
-    return tuple(camera for camera in CAMERAS if camera in cameras)
+    for camera in wanted or ():
+        if camera not in there:
+            raise InvalidOptionError.one_of("camera", camera, there)
+    return tuple(sorted(there if wanted is None else set(wanted)))
 
 
 def action_array(action: ArrayLike, *, chunk: bool = False) -> NDArray[np.float32]:

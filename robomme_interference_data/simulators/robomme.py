@@ -32,7 +32,7 @@ from robomme_interference_data.simulators.base import (
     EpisodeInfo,
     Observation,
     Simulator,
-    camera_names,
+    choose_cameras,
 )
 
 PYTHON_VARIABLE = "ROBOMME_PYTHON"
@@ -88,8 +88,7 @@ class RoboMMESimulator(Simulator):
             much to do: 300 to start, 190 for a reset, 120 for a step.
 
     Raises:
-        InvalidOptionError: No interpreter is given, or there is none at that path.
-        UnknownNameError: There is no such camera.
+        InvalidOptionError: No interpreter is given, none is at that path, or no such camera.
         MissingExtraError: That interpreter has no RoboMME, cannot import it, or has numpy 2.
         SimulatorCrashError: It died, or took too long to start.
     """
@@ -103,7 +102,7 @@ class RoboMMESimulator(Simulator):
         cameras: Sequence[str] = CAMERAS,
         answer_s: float = 900.0,
     ):
-        self._cameras = camera_names(self.name, cameras)
+        self._cameras = choose_cameras(cameras)
         self._python, self._answer_s = find_python(python), answer_s
         self._process = _Process(self._python, answer_s)
 

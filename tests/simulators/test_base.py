@@ -21,7 +21,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.simulators import Status, make_simulator
-from robomme_interference_data.simulators.base import action_array, camera_names
+from robomme_interference_data.simulators.base import action_array, choose_cameras
 from robomme_interference_data.simulators.commands import simulate
 
 DOUBLE = "support.simulator_doubles:make"
@@ -58,10 +58,10 @@ def test_a_missing_extra_names_the_line_to_type(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_cameras_are_a_list_of_known_names() -> None:
-    assert camera_names("tabletop", ["wrist", "front"]) == ("front", "wrist")
-    assert camera_names("tabletop", ()) == ()
-    with pytest.raises(UnknownNameError, match="Did you mean 'front'"):
-        camera_names("tabletop", ["fornt"])
+    assert choose_cameras(["wrist", "front"]) == ("front", "wrist")
+    assert choose_cameras(()) == ()
+    with pytest.raises(InvalidOptionError, match="Did you mean 'front'"):
+        choose_cameras(["fornt"])
 
 
 # --- actions ---------------------------------------------------------------------------------

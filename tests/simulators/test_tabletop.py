@@ -12,7 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.errors import MotionError, SimulatorCrashError, UnknownNameError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MotionError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators import Demonstration, Observation, Status
 
@@ -270,5 +275,5 @@ def test_bad_input_is_refused(blind: TabletopSimulator) -> None:
             blind.reset(wrong)
         with pytest.raises(SimulatorCrashError, match="no episode"):
             blind.act("oracle")
-    with pytest.raises(UnknownNameError, match="Did you mean 'front'"):
+    with pytest.raises(InvalidOptionError, match="Did you mean 'front'"):
         TabletopSimulator(cameras=("fornt",))

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.build_dataset.identity import identity_of
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
-from robomme_interference_data.build_dataset.sources.base import choose_cameras
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
@@ -23,6 +22,7 @@ from robomme_interference_data.files import LocalFiles, write_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+from robomme_interference_data.simulators.base import choose_cameras
 
 SHAPES = {"observation.images.front": (4, 6, 3), "observation.state": (8,)}
 

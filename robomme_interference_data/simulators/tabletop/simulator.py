@@ -14,7 +14,7 @@ from robomme_interference_data.simulators.base import (
     EpisodeInfo,
     Observation,
     Simulator,
-    camera_names,
+    choose_cameras,
 )
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
@@ -30,14 +30,14 @@ class TabletopSimulator(Simulator):
             times as fast: for policies that do not look.
 
     Raises:
-        UnknownNameError: There is no such camera.
+        InvalidOptionError: There is no such camera.
         NoRendererError: No Vulkan device of this machine can render.
     """
 
     name = "tabletop"
 
     def __init__(self, cameras: Sequence[str] = CAMERAS):
-        self._cameras = camera_names(self.name, cameras)
+        self._cameras = choose_cameras(cameras)
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
         self.env = TabletopEnv(render=bool(cameras), obs_mode="none")
         self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
