@@ -88,7 +88,7 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
         raise FormatError.damaged(path, first_line(error)) from None
 
 
-def read_header[T](path: Path, record: type[T], *, strict: bool = True) -> T:
+def read_header[T](path: Path, record: type[T]) -> T:
     """Read a JSON file with a `format_version` as a record.
 
     Raises:
@@ -99,7 +99,7 @@ def read_header[T](path: Path, record: type[T], *, strict: bool = True) -> T:
         version = value.get("format_version")
         if version != FORMAT_VERSION:
             raise FormatError.version(path, version, FORMAT_VERSION)
-    return from_dict(record, value, path, strict=strict)
+    return from_dict(record, value, path, strict=True)
 
 
 def _names(record: Any) -> list[str]:
