@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import FPS, MAX_STEPS
-from robomme_interference_data.drawing import GREEN, ORANGE, VERMILION
+from robomme_interference_data.drawing import Hue
 from robomme_interference_data.encode import CLIP, VideoEncoder
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.plan import WorkItem
@@ -32,9 +32,9 @@ _THUMB = _VIEW // _COLUMNS
 _SMALL = _THUMB - 4  # of a frame; its session's line is under it
 _COLORS = {
     Status.ONGOING: "#555555",
-    Status.SUCCESS: GREEN,
-    Status.FAIL: VERMILION,
-    Status.TIMEOUT: ORANGE,
+    Status.SUCCESS: Hue.GREEN,
+    Status.FAIL: Hue.VERMILION,
+    Status.TIMEOUT: Hue.ORANGE,
     Status.ERROR: "#000000",
 }
 _LAST = 10

@@ -6,23 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.conditions import in_order, parse_condition
-from robomme_interference_data.drawing import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PINK,
-    SKY,
-    VERMILION,
-    open_figure,
-    save_figure,
-    tidy,
-)
+from robomme_interference_data.drawing import GREY, INK, Hue, open_figure, save_figure, tidy
 from robomme_interference_data.retrieval.calibrate import Calibration
 from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell
 
-_COLOURS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, INK)
+_COLOURS = (Hue.BLUE, Hue.VERMILION, Hue.GREEN, Hue.PINK, Hue.ORANGE, Hue.SKY, INK)
 _MARKERS = "osD^vPX"
 _SHARES = ("purity", "coverage")
 _LINES = ("-", "--")

@@ -18,9 +18,13 @@ from robomme_interference_data.files import atomic_path
 
 INK, GREY = "#222222", "#767676"
 
-# Okabe and Ito's colours, which people with a colour vision deficiency can tell apart, too.
-BLUE, SKY, GREEN, YELLOW = "#0072B2", "#56B4E9", "#009E73", "#F0E442"
-ORANGE, VERMILION, PINK = "#E69F00", "#D55E00", "#CC79A7"
+
+class Hue:
+    """Okabe and Ito's colours, which people with a colour vision deficiency can tell apart, too."""
+
+    BLUE, SKY, GREEN, YELLOW = "#0072B2", "#56B4E9", "#009E73", "#F0E442"
+    ORANGE, VERMILION, PINK = "#E69F00", "#D55E00", "#CC79A7"
+
 
 _DPI = 180
 _METADATA = {".png": ("Software",), ".svg": ("Creator", "Date", "Format", "Type")}

@@ -7,24 +7,12 @@ from pathlib import Path
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
-from robomme_interference_data.drawing import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PINK,
-    SKY,
-    VERMILION,
-    YELLOW,
-    Page,
-    ink_on,
-    open_page,
-    tint,
-)
+from robomme_interference_data.drawing import Hue, Page, ink_on, open_page, tint
 from robomme_interference_data.records import Session
 from robomme_interference_data.sampling import even_sample, spread
 
-LESSON_COLOR = VERMILION
-COLORS = (SKY, ORANGE, GREEN, PINK, BLUE, YELLOW, "#999999", "#000000")
+LESSON_COLOR = Hue.VERMILION
+COLORS = (Hue.SKY, Hue.ORANGE, Hue.GREEN, Hue.PINK, Hue.BLUE, Hue.YELLOW, "#999999", "#000000")
 """Of the other sessions."""
 
 # Inches.

@@ -9,17 +9,7 @@ from itertools import groupby
 from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_condition
-from robomme_interference_data.drawing import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PINK,
-    SKY,
-    VERMILION,
-    tidy,
-)
+from robomme_interference_data.drawing import GREY, INK, Hue, tidy
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
@@ -27,16 +17,16 @@ from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
 # One for what the memory is made of.
 _COLOURS = {
     "none": GREY,
-    "frames": BLUE,
-    "tokens": SKY,
-    "hidden state": GREEN,
-    "text": ORANGE,
-    "text with points": VERMILION,
-    "text with points and key frames": PINK,
-    "all frames": GREEN,
-    "last frames": ORANGE,
+    "frames": Hue.BLUE,
+    "tokens": Hue.SKY,
+    "hidden state": Hue.GREEN,
+    "text": Hue.ORANGE,
+    "text with points": Hue.VERMILION,
+    "text with points and key frames": Hue.PINK,
+    "all frames": Hue.GREEN,
+    "last frames": Hue.ORANGE,
 }
-_OWN = (PINK, GREEN, ORANGE, SKY, VERMILION, BLUE)
+_OWN = (Hue.PINK, Hue.GREEN, Hue.ORANGE, Hue.SKY, Hue.VERMILION, Hue.BLUE)
 # Marker and line: one for how it enters the policy.
 _SHAPES = {
     "modulator": ("o", "-"),
