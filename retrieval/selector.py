@@ -29,6 +29,7 @@ class Selector:
         encoder: Name of the encoder, see `make_encoder`.
         rule: How to choose, as `Rule.parse` reads it; a method that chooses a segment.
         camera: Camera whose frames it compares.
+        device: Where to compute; None for a GPU if there is one.
 
     Raises:
         UnknownNameError: There is no such encoder or method.
@@ -36,13 +37,20 @@ class Selector:
         MissingExtraError, HubError, FormatError: See `make_encoder`.
     """
 
-    def __init__(self, encoder: str, *, rule: str = "max", camera: str = "front"):
+    def __init__(
+        self,
+        encoder: str,
+        *,
+        rule: str = "max",
+        camera: str = "front",
+        device: str | None = None,
+    ):
         self.rule = Rule.parse(rule, published_threshold(encoder))
         if self.rule.method == "top32":
             expected = "one that chooses a span: a policy is not handed single frames"
             raise InvalidOptionError.expected("rule", rule, expected)
         self.camera = camera.removeprefix(CAMERA_PREFIX)
-        self._encoder = make_encoder(encoder)
+        self._encoder = make_encoder(encoder, device=device)
 
     @property
     def name(self) -> str:

@@ -62,6 +62,5 @@ def lesson_share(sessions: Sequence[Session], start: int, stop: int) -> float:
     sample = even_sample(stop - start)
     before = partial(bisect_left, sample, hi=len(sample) - 1)
     lessons = (one for one in sessions if one.role == "lesson")
-    return sum(before(one.stop - start) - before(one.start - start) for one in lessons) / len(
-        sample
-    )
+    inside = sum(before(one.stop - start) - before(one.start - start) for one in lessons)
+    return inside / len(sample)
