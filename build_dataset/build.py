@@ -83,10 +83,10 @@ def build_dataset(
     out = out.resolve()  # a folder cannot be given the name of a link, or "."
     with working(out) as work:
         earlier = _earlier(out, plan)
-        known = earlier.ids() if earlier else set()
         stored = list(earlier.episodes) if earlier else []
         skipped = dict(earlier.skipped) if earlier else {}
-        todo = [task for task in plan.tasks if task[1].id not in known]
+        known = {*skipped, *(str(one.record.episode_id) for one in stored)}
+        todo = [task for task in plan.tasks if str(task[1].id) not in known]
         before = len(stored)
         if todo or not earlier:
             _stage(work, plan, todo, stored, skipped, executor, progress)

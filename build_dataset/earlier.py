@@ -14,7 +14,6 @@ from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.constants import EPISODES_DIR, REPORT_PATH
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.files import LocalFiles, read_json
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.records import EpisodeRecord
 
@@ -32,11 +31,6 @@ class Earlier:
     dataset: Dataset
     episodes: tuple[StoredEpisode, ...]
     skipped: dict[str, str]
-
-    def ids(self) -> set[EpisodeId]:
-        """Return the ids of all episodes that need not be read again."""
-        kept = {one.record.episode_id for one in self.episodes}
-        return kept | set(map(EpisodeId.parse, self.skipped))
 
 
 def read_earlier(root: Path) -> Earlier:

@@ -21,13 +21,11 @@ class EpisodePlace:
     """Where an episode lies in its dataset.
 
     Attributes:
-        index: Number of the episode in the dataset.
         length: Frames.
         data: Relative path of the parquet file with its rows.
         videos: Column to `(relative path, number of the first frame in that file)`.
     """
 
-    index: int
     length: int
     data: str
     videos: dict[str, tuple[str, int]]
@@ -125,4 +123,4 @@ def place_episode(
             what = f"{key}/from_timestamp {start!r} lies between two frames"
             raise FormatError.damaged(where, what)
         videos[name] = (path(info["video_path"], key, video_key=name), first)
-    return EpisodePlace(index, whole("length"), path(info["data_path"], "data"), videos)
+    return EpisodePlace(whole("length"), path(info["data_path"], "data"), videos)
