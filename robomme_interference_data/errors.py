@@ -5,7 +5,6 @@ do next, with the command to type where there is one. What is said often is said
 constructor of the type.
 """
 
-from bisect import bisect
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, Self
@@ -94,14 +93,6 @@ class FormatError(InterferenceError, ValueError):
     def damaged(cls, path: object, what: object) -> Self:
         """Return the error for a file that holds what it should not: its path, and what."""
         return cls(f"{path}: {what}", "The file is damaged: download or build it again.")
-
-    @classmethod
-    def version(cls, path: object, found: object, known: object) -> Self:
-        """Return the error for a file of another format version."""
-        return cls(
-            f"{path} has format version {found!r}; this package reads {known}",
-            "Install the version of robomme-interference-data that wrote it, or make it again.",
-        )
 
 
 class HashMismatchError(InterferenceError, ValueError):
@@ -192,9 +183,7 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
         `"Did you mean 'a' or 'b'?"`, `"Known: …"`, or an empty string if there is nothing to say.
     """
     names = sorted(known)
-    # Comparing takes long: of very many names, those that begin alike are compared.
-    place = bisect(names, given)
-    folded = {name.lower(): name for name in names[max(0, place - 1000) : place + 1000]}
+    folded = {name.lower(): name for name in names}
     close = get_close_matches(given.lower(), list(folded), n=3, cutoff=0.6)
     if close:
         return "Did you mean " + " or ".join(repr(folded[name]) for name in close) + "?"

@@ -98,7 +98,10 @@ def read_header[T](path: Path, record: type[T]) -> T:
     if "format_version" in _names(record):
         version = value.get("format_version")
         if version != FORMAT_VERSION:
-            raise FormatError.version(path, version, FORMAT_VERSION)
+            raise FormatError(
+                f"{path} has format version {version!r}; this package reads {FORMAT_VERSION}",
+                "Install the version of robomme-interference-data that wrote it, or make it again.",
+            )
     return from_dict(record, value, path, strict=True)
 
 
