@@ -47,21 +47,12 @@ class UnitPool:
         families: dict[str, list[EpisodeId]] = {}
         for unit in units:
             families.setdefault(unit.family, []).append(unit)
-        for family, members in families.items():
+        for members in families.values():
             twice, times = Counter(members).most_common(1)[0]
             if times > 1:
                 raise InvalidOptionError(f"unit {twice} is in the pool {times} times")
             members.sort(key=lambda unit: self._hash("unit", str(unit)))
-            families[family] = members
         self._families = dict(sorted(families.items()))
-
-    def __len__(self) -> int:
-        return sum(len(members) for members in self._families.values())
-
-    @property
-    def families(self) -> tuple[str, ...]:
-        """Families in the pool, by name."""
-        return tuple(self._families)
 
     def draw(self, query: EpisodeId, k: int) -> list[EpisodeId]:
         """Draw `k` distinct units of other families for a query; nested in `k`.
