@@ -182,32 +182,12 @@ def test_pool_too_small_exactly_when_it_is(
         pool.draw(query, count + more)
 
 
-def test_pool_too_small_names_the_families() -> None:
-    pool = UnitPool(units_of({"MoveCube": 2, "InsertPeg": 1, "PatternLock": 9}))
-    with pytest.raises(PoolTooSmallError, match=r"the pool has 3 \(InsertPeg, MoveCube\)"):
-        pool.draw(EpisodeId("PatternLock", "test", 0), 4)
-    with pytest.raises(PoolTooSmallError, match=r"the pool has 0 \(no family\)"):
-        UnitPool([]).draw(EpisodeId("PatternLock", "test", 0), 1)
-
-
 def test_a_pool_and_a_unit_twice_in_it() -> None:
     units = units_of(SMALL)
     pool = UnitPool(units)
     assert (len(pool), pool.families) == (6, ("MoveCube", "VideoUnmask", "my-robot"))
     with pytest.raises(InvalidOptionError, match=f"{units[1]} is in the pool 3 times"):
         UnitPool([*units, units[1], units[1]])
-
-
-def test_seed_and_query_do_matter() -> None:
-    units = units_of(NOMINAL)
-    draws = {
-        tuple(map(str, UnitPool(units, seed).draw(EpisodeId(family, split, index), 7)))
-        for seed in (0, 1)
-        for family in ("MoveCube", "InsertPeg")
-        for split in ("val", "test")
-        for index in (0, 1, 2)
-    }
-    assert len(draws) == 24
 
 
 # --- balance over all queries -------------------------------------------------------------------
@@ -269,11 +249,3 @@ def test_small_families_are_used_in_proportion(k: int, seed: int) -> None:
         own = [count for unit, count in counted.items() if unit.family == family]
         # Drawn evenly by family instead, the smallest would be at 13 times the mean.
         assert 0.7 * mean < sum(own) / len(own) < 1.15 * mean
-
-
-def test_small_families_are_used_more_where_k_needs_all_families() -> None:
-    counted = uses(UNEVEN, 8)
-    for family, size in UNEVEN.items():
-        own = [count for unit, count in counted.items() if unit.family == family]
-        assert sum(own) == 400  # one unit for each query of the other families
-        assert max(own) <= 2 * 400 / size

@@ -9,8 +9,6 @@ from support import worlds
 from support.runs import run
 
 from robomme_interference_data import evaluate
-from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIABLE
-from robomme_interference_data.evaluate.policies.registry import policy_options
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS, System
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -57,16 +55,6 @@ def test_it_says_how_to_start_the_server_of_every_system_of_the_paper() -> None:
     example = re.search(r"--policy\.dir=runs/ckpts/(\S+)/79999 \\\n +--policy\.config=(\S+)", PAGE)
     assert example is not None
     assert example.groups() in [line[1:] for line in lines]
-
-
-def test_the_names_that_it_gives_are_the_codes() -> None:
-    assert API_KEY_VARIABLE in PAGE
-    section = PAGE.split("\n## Options")[1].split("\n## ")[0]
-    named = re.findall(r"`(\w+_\w+)`", section)
-    assert set(policy_options("websocket://a:1")) == set(named) - {
-        "run_evaluation",
-        "policy_options",
-    }
 
 
 def test_the_policy_of_the_page_runs(

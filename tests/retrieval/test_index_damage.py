@@ -119,13 +119,6 @@ def test_what_something_else_made(whole: Path, factor: float, columns: int, said
         look_up(whole)
 
 
-def test_frames_that_are_not_there(indexed: Path) -> None:
-    index = load_split(indexed).datasets["demonstrations"].index("thumbnail")
-    for episode, start, stop in ((0, 0, 50), (3, 0, 1), (0, -1, 2), (0, 3, 2)):
-        with pytest.raises(LookupError, match="are not in"):
-            index.span(episode, start, stop)
-
-
 def test_two_models_of_one_name_are_told_apart(own_split: Path) -> None:
     encoder = Thumbnail()
     encoder.name = "siglip:one/tiny"

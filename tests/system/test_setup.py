@@ -174,12 +174,6 @@ def test_help_lists_every_target_that_a_person_runs() -> None:
     assert all(len(line) <= 90 for line in done.stdout.splitlines())
 
 
-def test_every_target_is_declared_phony() -> None:
-    phony = re.search(r"^\.PHONY: (.+)$", MAKEFILE, re.MULTILINE)
-    assert phony is not None
-    assert set(phony[1].split()) == set(re.findall(r"^([a-z]+):", MAKEFILE, re.MULTILINE))
-
-
 @pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh", "scripts/system_packages.sh"])
 def test_shell_scripts_are_executable_and_parse(name: str) -> None:
     assert (ROOT / name).stat().st_mode & stat.S_IXUSR
