@@ -16,14 +16,11 @@ from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import Outcome, Serial
-from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.strip import session_colors
 
 pytestmark = pytest.mark.usefixtures("trouble")
 
 K1 = WorkItem("k1", EPISODE)
-INFO = EpisodeInfo("do as shown", ("do as shown",), "easy", 1, "world")
-VIEW = Observation({"front": np.full((256, 256, 3), 90, np.uint8)}, np.zeros(8, np.float32))
 
 
 @pytest.fixture

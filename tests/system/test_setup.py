@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 # Stands in for Python, for its pip, and for the uv that it installs; notes how it is called.
 FAKE_PYTHON = """#!/usr/bin/env bash
