@@ -220,18 +220,6 @@ def test_usage_of_the_nominal_pool(seed: int) -> None:
         assert Counter(seven.values()) == {1: 8, 2: 64, 3: 298, 4: 530}
 
 
-def test_every_family_comes_at_every_place() -> None:
-    pool = UnitPool(units_of(NOMINAL))
-    for family in FAMILIES:
-        own = [EpisodeId(family, "test", index) for index in range(48)]
-        places = Counter(
-            (place, unit.family) for query in own for place, unit in enumerate(pool.draw(query, 8))
-        )
-        # 48 queries are 6 blocks of 8: in each block every family stands once at each place.
-        assert len(places) == 8 * 8
-        assert set(places.values()) == {6}
-
-
 def test_consecutive_queries_draw_different_units() -> None:
     pool = UnitPool(units_of(NOMINAL))
     for family in FAMILIES:

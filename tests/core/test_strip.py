@@ -238,18 +238,6 @@ def test_the_readers_own_settings_have_no_effect(
     assert (tmp_path / "strip.svg").read_bytes() == strip.read_bytes()
 
 
-def test_no_date_or_version_is_written(buffer: Buffer, strip: Path, tmp_path: Path) -> None:
-    out = tmp_path / "strip.PNG"
-    draw_strip(buffer, out)
-    data = out.read_bytes()
-    position, kinds = 8, []
-    while position < len(data):
-        kinds.append(data[position + 4 : position + 8])
-        position += 12 + int.from_bytes(data[position : position + 4])
-    assert set(kinds) == {b"IHDR", b"pHYs", b"IDAT", b"IEND"}
-    assert "<metadata" not in strip.read_text() and "atplotlib" not in strip.read_text()
-
-
 # --- refusals ----------------------------------------------------------------------------------
 
 

@@ -185,16 +185,6 @@ def test_a_server_that_computes_for_long_is_not_dropped(
     assert server.connections == 1
 
 
-def test_pings_of_the_server_are_answered_while_the_simulator_runs() -> None:
-    server = PolicyServer()
-    server.options |= {"ping_interval": 0.05, "ping_timeout": 0.4}
-    with server.running(), client(server, response_s=0.5) as policy:
-        rollout(policy, 0, [], [])
-        time.sleep(1)  # nor does the time limit of a message that was answered end it
-        policy.observe(*section(1, 2))
-    assert server.connections == 1
-
-
 def test_an_interrupt_leaves_no_answer_behind(
     server: PolicyServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

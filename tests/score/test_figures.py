@@ -85,22 +85,6 @@ def test_a_legend_explains_hollow_and_published_points(
     assert explained(figure) == expected
 
 
-@pytest.mark.parametrize(("systems", "dashes"), [(4, 4 * 5), (5, 0)])
-def test_beside_many_systems_published_rates_are_in_the_table_alone(
-    tmp_path: Path, figure: Any, systems: int, dashes: int
-) -> None:
-    ran = [name for name, s in SYSTEMS.items() if s.paper and not s.retrieval and s.with_history]
-    rows = [
-        row
-        for name in ran[:systems]
-        for row in made.changed(WHOLE, simulator="robomme", system=name)
-    ]
-    assert draw_figure("success", figure, data(tmp_path, rows, paper=True))
-    assert ("in the table" in explained(figure)) == (not dashes)
-    (axes,) = figure.axes
-    assert sum(line.get_marker() == "_" for line in axes.lines) == dashes
-
-
 def test_a_retrieval_system_stands_beside_its_published_base(tmp_path: Path, figure: Any) -> None:
     rows = [row for row in made.rows() if row.system == RETRIEVAL]
     shown = data(tmp_path, made.changed(rows, simulator="robomme"), paper=True)

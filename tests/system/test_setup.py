@@ -162,17 +162,6 @@ def test_uv_uses_the_index_of_pip(
     assert f"index {index}" in checkout.log.read_text(encoding="utf-8").splitlines()
 
 
-def test_help_lists_every_target_that_a_person_runs() -> None:
-    done = subprocess.run(
-        ["make", "--no-print-directory"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    listed = [line.split()[1] for line in done.stdout.splitlines()]
-    assert listed == [
-        *("help", "setup", "vulkan", "demo", "test", "check", "format", "bench", "pins")
-    ]
-    assert all(len(line) <= 90 for line in done.stdout.splitlines())
-
-
 @pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh", "scripts/system_packages.sh"])
 def test_shell_scripts_are_executable_and_parse(name: str) -> None:
     assert (ROOT / name).stat().st_mode & stat.S_IXUSR
