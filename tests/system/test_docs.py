@@ -35,6 +35,7 @@ def test_command_lines_are_understood(page: str, line: str) -> None:
     parse(shlex.split(line))
 
 
+@pytest.mark.slow
 def test_the_readmes_commands_run(tmp_path: Path) -> None:
     # RoboMME's recordings are not at hand everywhere: made-up episodes take their place, and a
     # world without a renderer that of the embedded simulator, on which `make demo` runs it.
