@@ -9,16 +9,14 @@ comparison with ManiSkill's PickCube uses the same cameras, picture sizes and lo
 
 import argparse
 import gc
-import multiprocessing
-import os
 import resource
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from timing import in_fresh_process, machine, positive, table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.execution import Processes, Worker
@@ -71,17 +69,16 @@ def _rate(step: Callable[[], None], steps: int) -> float:
     return steps / (time.perf_counter() - started)
 
 
-def speed(rounds: int = 5) -> None:
+def speed(rounds: int) -> None:
     """Steps per second with front and wrist camera at 256×256, against PickCube, in turns."""
     ours, theirs = _tabletop(), _pick_cube()
     _rate(ours, 5), _rate(theirs, 2)
     pairs = [(_rate(ours, 40), _rate(theirs, 6)) for _ in range(rounds)]
     mine, stock = (statistics.median(column) for column in zip(*pairs, strict=True))
-    print("| scene | steps/s |\n| --- | --- |")
-    print(f"| tabletop | {mine:.1f} |\n| PickCube-v1, same cameras | {stock:.1f} |")
-    print(
-        f"| ratio (median of {rounds} rounds) | {statistics.median(a / b for a, b in pairs):.1f} |"
-    )
+    ratio = statistics.median(a / b for a, b in pairs)
+    rows = [["tabletop", f"{mine:.1f}"], ["PickCube-v1, same cameras", f"{stock:.1f}"]]
+    rows.append([f"ratio (median of {rounds} rounds)", f"{ratio:.1f}"])
+    print(table(_title(speed), ["<scene", ">steps/s"], rows))
 
 
 def resets() -> None:
@@ -91,7 +88,7 @@ def resets() -> None:
     """
     simulator = make_simulator("tabletop")
     simulator.reset(EPISODE)
-    print("| family | easy | medium | hard | frames |\n| --- | --- | --- | --- | --- |")
+    rows = []
     for family in FAMILIES:
         seconds, frames = [], []
         for index in range(3):
@@ -100,7 +97,9 @@ def resets() -> None:
             wall, work = time.perf_counter() - started, time.process_time() - used
             seconds.append(f"{wall:.1f} s ({work:.1f})")
             frames.append(str(len(lesson)))
-        print(f"| {family} | {' | '.join(seconds)} | {', '.join(frames)} |", flush=True)
+        rows.append([family, *seconds, ", ".join(frames)])
+    columns = ["<family", ">easy", ">medium", ">hard", ">frames"]
+    print(table(_title(resets), columns, rows))
 
 
 class _Play:
@@ -129,18 +128,19 @@ def workers(episodes: int = 24) -> None:
             if number == 0:  # the others are up at about the same time; if later, it counts
                 started = time.perf_counter()
         taken[count] += (time.perf_counter() - started) / (2 * episodes)
-    print("| workers | seconds per episode |\n| --- | --- |")
-    print(f"| 1 | {taken[1]:.2f} |\n| 2 | {taken[2]:.2f} |\n| ratio | {taken[1] / taken[2]:.2f} |")
+    rows = [[str(count), f"{seconds:.2f}"] for count, seconds in taken.items()]
+    rows.append(["ratio", f"{taken[1] / taken[2]:.2f}"])
+    print(table(_title(workers), ["<workers", ">seconds per episode"], rows))
 
 
-def leaks(episodes: int = 100) -> None:
+def leaks(episodes: int) -> None:
     """Memory and open files of a process over many episodes of all families.
 
     Demonstrations are played without drawing them, to be through in minutes; the first live
     observation and ten steps are drawn.
     """
     simulator = make_simulator("tabletop")
-    print("| episodes | resident MiB | open files |\n| --- | --- | --- |")
+    rows = []
     for number in range(episodes + 1):
         episode = f"{FAMILIES[number % len(FAMILIES)]}/train/{number // 9 % 100}"
         simulator.reset(episode, demonstration=False)
@@ -150,7 +150,14 @@ def leaks(episodes: int = 100) -> None:
             gc.collect()
             pages = int(Path("/proc/self/statm").read_text().split()[1])
             resident = pages * resource.getpagesize() / 2**20
-            print(f"| {number} | {resident:.0f} | {len(os.listdir('/proc/self/fd'))} |", flush=True)  # noqa: PTH208
+            opened = len(list(Path("/proc/self/fd").iterdir()))
+            rows.append([str(number), f"{resident:.0f}", str(opened)])
+    columns = [">episodes", ">resident MiB", ">open files"]
+    print(table(_title(leaks), columns, rows))
+
+
+def _title(part: Callable[..., None]) -> str:
+    return (part.__doc__ or "").splitlines()[0]
 
 
 PARTS: dict[str, Callable[..., None]] = {
@@ -162,20 +169,19 @@ def main() -> None:
     """Run the parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=PARTS, help="run one part")
-    parser.add_argument("--episodes", type=int, default=100, help="episodes of the leak check")
+    parser.add_argument("--rounds", type=positive, default=5, help="rounds of the speed")
+    parser.add_argument("--episodes", type=positive, default=100, help="episodes of the leak check")
     given = parser.parse_args()
+    print(machine("mani-skill", "torch"))
     for name, part in PARTS.items():
-        if given.only in (None, name):
-            print(f"\n## {name}: {(part.__doc__ or '').splitlines()[0]}", flush=True)
-            options: tuple[Any, ...] = (given.episodes,) if part is leaks else ()
-            if part is workers:  # starts processes of its own
-                part()
-                continue
-            process = multiprocessing.get_context("spawn").Process(target=part, args=options)
-            process.start()
-            process.join()
-            if process.exitcode:
-                raise SystemExit(f"{name} failed, exit code {process.exitcode}")
+        if given.only not in (None, name):
+            continue
+        print(flush=True)
+        if part is workers:  # starts processes of its own
+            part()
+        else:
+            options = {speed: [given.rounds], leaks: [given.episodes]}.get(part, [])
+            in_fresh_process(part, *options)
 
 
 if __name__ == "__main__":

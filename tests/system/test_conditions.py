@@ -1,0 +1,96 @@
+"""Conditions that nobody has foreseen go the whole way: the lesson may stand last, or nowhere."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from support import worlds
+from support.runs import run as evaluate
+
+from robomme_interference_data import load_split
+from robomme_interference_data.conditions import KINDS, Kind, Material
+from robomme_interference_data.records import SessionEntry
+
+Run = Callable[..., tuple[int, str, str]]
+QUERY = "MoveCube/test/0"
+
+
+def _units_then_lesson(material: Material, k: int) -> tuple[SessionEntry, ...]:
+    return (*material.units(k), material.lesson())
+
+
+def _units_alone(material: Material, k: int) -> tuple[SessionEntry, ...]:
+    return tuple(material.units(k))
+
+
+@pytest.fixture
+def split(own_split: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A split with buffers of two kinds of conditions that are registered here alone."""
+    monkeypatch.setitem(KINDS, "before", Kind("before", "position", _units_then_lesson))
+    monkeypatch.setitem(KINDS, "absent", Kind("absent", "false memory", _units_alone))
+    names = ("no-history", "k0", "k1", "before-k1", "before-k3", "absent-k1")
+    code, _, err = run("build", "manifests", own_split, "--conditions", *names)
+    assert code == 0, err
+    monkeypatch.setenv(worlds.SPLIT, str(own_split))
+    _forget_the_split()
+    yield own_split
+    _forget_the_split()
+
+
+def _forget_the_split() -> None:
+    worlds.split_here.cache_clear()
+    worlds.query_of.cache_clear()
+
+
+def test_buffers_of_other_kinds(split: Path, run: Run, tmp_path: Path) -> None:
+    opened = load_split(split)
+    before, plain = opened.load(QUERY, "before-k1"), opened.load(QUERY, k=1)
+    lesson, unit = plain.manifest.sessions
+    assert before.manifest.sessions == (unit, lesson)  # the very unit of k1
+    assert (before.frames()[32:] == plain.frames()[:48]).all()
+    assert opened.load(QUERY, "absent-k1").manifest.sessions == (unit,)
+    assert opened.manifest(QUERY, "absent-k1").lesson_share == 0.0
+    for command in ("verify", "audit"):
+        code, out, err = run(command, split)
+        assert code == 0, out + err
+    code, out, _ = run("list", split, "--condition", "before-k3", "--json")
+    assert [row["lesson_frames"] for row in json.loads(out)] == [48, 48, 48]
+    for condition in ("before-k3", "absent-k1"):
+        code, _, err = run("show", QUERY, condition, "--split", split, "--out", tmp_path / "a.png")
+        assert code == 0, err
+
+
+def test_retrieval_of_other_kinds(split: Path, run: Run) -> None:
+    code, _, err = run("index", split, "--encoder", "thumbnail", "--workers", "1")
+    assert code == 0, err
+    code, out, err = run("retrieve", QUERY, "before-k1", "--split", split, "--json")
+    assert code == 0, err
+    assert json.loads(out)["lesson"] == [[32, 80]]
+    code, out, err = run("retrieve", QUERY, "absent-k1", "--split", split, "--json")
+    assert code == 0, err
+    assert json.loads(out)["lesson"] == []
+    code, out, err = run("retrieval-score", split, "--json")
+    assert code == 0, err
+    graded = {row["condition"] for row in json.loads(out)["cells"]}
+    assert {"before-k1", "before-k3"} < graded
+    assert not graded & {"absent-k1", "no-history"}  # nothing of the lesson to be found
+
+
+def test_rollouts_and_scores_of_other_kinds(split: Path, run: Run, tmp_path: Path) -> None:
+    conditions = ("no-history", "k1", "before-k1", "absent-k1")
+    result = evaluate(tmp_path / "run", conditions=conditions)
+    told = {(row.family, row.condition): row for row in result.rows}
+    rows = [told["MoveCube", name] for name in conditions]
+    # Without the lesson the policy may happen on the answer: all sample episodes begin alike.
+    assert [row.status for row in rows[:3]] == ["fail", "success", "success"]
+    assert [(row.history_frames, row.lesson_frames) for row in rows] == [
+        (0, 0),
+        (80, 48),
+        (80, 48),
+        (32, 0),
+    ]
+    out = tmp_path / "score"
+    code, _, err = run("score", tmp_path / "run", "--grid", "given", "--out", out)
+    assert code == 0, err
+    assert "before-k1" in (out / "report.html").read_text()
