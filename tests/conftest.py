@@ -124,7 +124,8 @@ def bare_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}"
     command = [sys.executable, "-m", "pip", "--no-input", "install", "--quiet", "--no-deps"]
-    command += ["--only-binary", ":all:", "--target", str(site / "site-packages"), "numpy<2"]
+    command += ["--no-compile", "--only-binary", ":all:"]
+    command += ["--target", str(site / "site-packages"), "numpy<2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     if done.returncode != 0:
         pytest.skip(f"no package index gives numpy < 2: {done.stderr.strip()[-500:]}")

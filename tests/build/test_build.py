@@ -76,14 +76,6 @@ def test_the_golden_demonstrations_hold_what_the_source_gives(tmp_path: Path) ->
     assert contents(out) == contents(GOLDEN / "demonstrations")
 
 
-def test_order_of_sources_does_not_matter(tmp_path: Path) -> None:
-    one = MadeUpSource({name: TRAIN[name] for name in list(TRAIN)[:2]})
-    other = MadeUpSource({name: TRAIN[name] for name in list(TRAIN)[2:]})
-    build(tmp_path / "a", one, other)
-    build(tmp_path / "b", other, one)
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
-
-
 def test_a_build_goes_on_from_what_was_staged(tmp_path: Path) -> None:
     out = tmp_path / "out"
     source = MadeUpSource(TRAIN, {"B/train/0": {9: SourceError("broke off", "record it again")}})
@@ -131,36 +123,44 @@ def test_episodes_with_and_without_actions_mix(tmp_path: Path) -> None:
     assert contents(out) == contents(tmp_path / "at once")
 
 
-def test_episodes_of_other_sizes_do_not(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
-    with pytest.raises(SourceError, match="cannot be in one dataset"):
-        build(out, MadeUpSource({"A/train/0": (260, None)}), both)
-    build(out, MadeUpSource({"A/train/0": (260, None)}))
-    with pytest.raises(InterferenceError, match="cannot be in one dataset"):
-        build(out, both)
-    assert build(out, both, cameras=("front",)).episodes == 2
+TABLETOP = {"kind": "tabletop", "suite_version": 1}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of one episode of one camera."""
+    out = tmp_path_factory.mktemp("built") / "out"
+    build(out, MadeUpSource({"A/train/0": (260, 5)}, provenance=TABLETOP))
+    return out
 
 
 @pytest.mark.parametrize(
-    "options", [{"codec": "lerobot-default"}, {"version": "2.0.0"}, {"kind": "demonstrations"}]
+    ("source", "options", "told"),
+    [
+        ({}, {"codec": "lerobot-default"}, "was built otherwise"),
+        ({}, {"version": "2.0.0"}, "was built otherwise"),
+        ({}, {"kind": "demonstrations"}, "was built otherwise"),
+        ({"cameras": ("front", "wrist")}, {}, "cannot be in one dataset"),
+        ({"provenance": TABLETOP | {"suite_version": 2}}, {}, "suite_version"),
+    ],
 )
-def test_a_dataset_that_was_built_otherwise(tmp_path: Path, options: dict[str, Any]) -> None:
-    out = tmp_path / "out"
-    build(out, MadeUpSource({"A/train/0": (260, 5)}))
-    before = contents(out)
-    with pytest.raises(BuildError, match="was built otherwise") as caught:
-        build(out, MadeUpSource({"A/train/1": (260, 5)}), **options)
-    assert "Choose another --out" in str(caught.value.hint)
-    assert contents(out) == before
+def test_a_dataset_that_was_built_otherwise_is_left_as_it_is(
+    built: Path, source: dict[str, Any], options: dict[str, Any], told: str
+) -> None:
+    before = contents(built)
+    other = MadeUpSource({"A/train/1": (260, 5)}, **source)
+    with pytest.raises(InterferenceError, match=told) as caught:
+        build(built, other, **options)
+    assert "otherwise" not in told or "Choose another --out" in str(caught.value.hint)
+    assert contents(built) == before
 
 
-def test_another_version_of_the_simulators_suite(tmp_path: Path) -> None:
-    source = MadeUpSource(TRAIN, provenance={"kind": "tabletop", "suite_version": 1})
-    build(tmp_path / "out", source)
-    source.provenance = {"kind": "tabletop", "suite_version": 2}
-    with pytest.raises(BuildError, match="suite_version"):
-        build(tmp_path / "out", source)
+def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:
+    one = MadeUpSource({"A/train/0": (260, None)})
+    both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
+    with pytest.raises(SourceError, match="cannot be in one dataset"):
+        build(tmp_path / "out", one, both)
+    assert build(tmp_path / "out", one, both, cameras=("front",)).episodes == 2
 
 
 def test_what_else_may_be_in_the_way(tmp_path: Path) -> None:

@@ -92,16 +92,6 @@ def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
     assert [one.exact for one in planned_buffers(plan)] == [True, False]
 
 
-def test_queries_stand_in_canonical_order(tmp_path: Path) -> None:
-    names = ["Other/test/0", "RouteStick/test/10", "RouteStick/test/2", "VideoRepick/test/0"]
-    queries = [record("demonstrations", name) for name in names]
-    units = [record("distractors", "InsertPeg/train/0")]
-    plan = plan_manifests(made_up(tmp_path, queries=queries, units=units), ("k0",))
-    assert [str(one.episode_id) for one in planned_buffers(plan)] == [
-        *("VideoRepick/test/0", "RouteStick/test/2", "RouteStick/test/10", "Other/test/0")
-    ]
-
-
 def test_a_pool_too_small(tmp_path: Path) -> None:
     root = made_up(tmp_path)
     with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):

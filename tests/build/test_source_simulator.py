@@ -4,65 +4,29 @@ import pickle
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
+from support.simulator_doubles import Double
 
 from robomme_interference_data.build_dataset.cut import cut_demonstration
 from robomme_interference_data.build_dataset.sources import Recording, open_source
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Status
-from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 from robomme_interference_data.simulators.registry import SIMULATORS
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
 
-class Played:
-    """Plays a lesson of five frames, then succeeds after three steps.
-
-    A front image is filled with the episode's index, a wrist image with 99. States count the
-    frames of the lesson, and then the steps from 10 on.
-    """
-
-    def __init__(self, made: list["Played"], name: str, cameras: tuple[str, ...], **options: Any):
-        made.append(self)
-        self.name, self.cameras, self.options = name, cameras, options
-        self.steps, self.closed = 0, False
-
-    def images(self, *leading: int) -> dict[str, np.ndarray]:
-        fill = {"front": self.index, "wrist": 99}
-        return {name: np.full((*leading, 4, 4, 3), fill[name], np.uint8) for name in self.cameras}
-
-    def seen(self) -> Observation:
-        return Observation(self.images(), np.full(8, 10 + self.steps, np.float32))
-
-    def reset(self, episode_id: str) -> Any:
-        self.index, self.steps = EpisodeId.parse(episode_id).index, 0
-        told = 5 if self.name == "tabletop" else 0  # RoboMME tells no actions
-        states = np.repeat(np.arange(5, dtype=np.float32)[:, None], 8, 1)
-        lesson = Demonstration(self.images(5), states, np.ones((told, 8), np.float32))
-        info = EpisodeInfo(("goal", "other"), "easy", self.index, self.name)
-        return lesson, self.seen(), info
-
-    def act(self, policy: str) -> np.ndarray:
-        assert (self.name, policy) == ("tabletop", "oracle")
-        return np.full(8, self.steps)
-
-    def step(self, action: np.ndarray) -> tuple[Observation, Status]:
-        self.steps += 1
-        return self.seen(), Status.ONGOING if self.steps < 3 else Status.SUCCESS
-
-    def close(self) -> None:
-        self.closed = True
-
-
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[Played]:
-    """The simulators that are made."""
-    found: list[Played] = []
+def made(monkeypatch: pytest.MonkeyPatch) -> list[Double]:
+    """The simulators that are made; RoboMME's tells no actions."""
+    found: list[Double] = []
+
+    def make(name: str, **options: Any) -> Double:
+        found.append(Double(name=name, told=name == "tabletop", **options))
+        return found[-1]
+
     for name in ("tabletop", "robomme"):
-        monkeypatch.setitem(SIMULATORS, name, partial(Played, found, name))
+        monkeypatch.setitem(SIMULATORS, name, partial(make, name))
     return found
 
 
@@ -72,7 +36,7 @@ def read(source: Any, cameras: tuple[str, ...] | None = None) -> Recording:
     return source.read(episode, cameras)
 
 
-def test_an_episode_of_the_tabletop(made: list[Played]) -> None:
+def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     source = open_source("tabletop")
     assert source.provenance == {"kind": "tabletop", "suite_version": SUITE_VERSION}
     assert (source.time_limit, source.whole) == (300, True)  # seconds
@@ -90,10 +54,10 @@ def test_an_episode_of_the_tabletop(made: list[Played]) -> None:
     assert all((frame.images["wrist"] == 99).all() for frame in frames)
     lesson = list(cut_demonstration(read(source).frames))
     assert [float(frame.state[0]) for frame in lesson] == [0, 1, 2, 3, 4, 10]
-    assert made[0].steps == 0  # cut without a step
+    assert made[0].executed == 3  # cut without a step
 
 
-def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Played]) -> None:
+def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Double]) -> None:
     source = open_source("robomme", robomme_python="/opt/python")
     assert source.provenance == {"kind": "robomme"}
     assert (source.time_limit, source.whole) == (1800, False)
@@ -103,7 +67,7 @@ def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Playe
     assert made[0].options == {"python": "/opt/python"}
 
 
-def test_one_simulator_is_kept_for_the_same_cameras(made: list[Played]) -> None:
+def test_one_simulator_is_kept_for_the_same_cameras(made: list[Double]) -> None:
     source = open_source("tabletop")
     for cameras in (("front",), ("front",), None, ("wrist", "front")):
         for frame in read(source, cameras).frames:

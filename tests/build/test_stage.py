@@ -21,7 +21,7 @@ from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.stage import Staged, StageTask, read_staged
-from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.video import iter_frames
 
@@ -146,16 +146,6 @@ def test_frames_that_cannot_be_stored(tmp_path: Path, number: int, frame: Any, t
         staged(tmp_path, source)
     assert caught.value.message.startswith(f"{NAME}: ")
     assert list(tmp_path.iterdir()) == []  # nothing half-made
-
-
-def test_an_unknown_camera(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="camera 'wrist' is none of front"):
-        staged(tmp_path, MadeUpSource({NAME: (40, 20)}), cameras=("wrist",))
-
-
-def test_frames_too_small_for_a_lossy_codec(tmp_path: Path) -> None:
-    with pytest.raises(BuildError, match="24×16 pixels are too small for lerobot-default"):
-        staged(tmp_path, MadeUpSource({NAME: (40, 20)}), codec="lerobot-default")
 
 
 def test_a_video_that_decodes_to_something_else(

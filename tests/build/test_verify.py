@@ -1,7 +1,6 @@
 """Every kind of damage to a split is found, and named where it is; leaks are told apart."""
 
 import json
-import random
 import re
 import shutil
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.damage import flipped_bits
 from support.made_up import record, write_metadata
 from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
 
@@ -82,17 +82,11 @@ ONE_OF_EACH = [name for name in FILES if "file-0" not in name or "file-000" in n
 
 @pytest.mark.parametrize("path", ONE_OF_EACH)
 def test_a_flipped_bit_anywhere(own_split: Path, path: str) -> None:
-    data = bytearray((own_split / path).read_bytes())
-    chosen = random.Random(path)
-    for _ in range(3):
-        place, bit = chosen.randrange(len(data)), 1 << chosen.randrange(8)
-        data[place] ^= bit
-        (own_split / path).write_bytes(data)
+    for _ in flipped_bits(own_split / path, 3):
         if path == HEADER:
             _expect_of_header(own_split)
         else:
             expect(own_split, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
-        data[place] ^= bit
 
 
 def _expect_of_header(root: Path) -> None:

@@ -1,7 +1,6 @@
 """The cache of decoded frames: bounded, shared, and never trusted when damaged."""
 
 import os
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -145,18 +144,6 @@ def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert default_cache_folder() == tmp_path / ".cache" / "robomme-interference" / "decoded"
-
-
-@pytest.mark.parametrize("place", ["file", "missing parent is a file"])
-def test_where_nothing_can_be_written_it_is_said_once(tmp_path: Path, place: str) -> None:
-    (tmp_path / "file").write_text("")
-    cache = DecodedCache(tmp_path / "file" if place == "file" else tmp_path / "file" / "cache")
-    with pytest.warns(RuntimeWarning, match="decoded frames are not kept"):
-        cache.put(name(1), frames(1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        cache.put(name(2), frames(2))
-    assert cache.get(name(1), SHAPE) is None
 
 
 def test_a_cache_that_only_others_may_write_is_read(

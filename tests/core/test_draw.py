@@ -196,18 +196,6 @@ def test_a_unit_twice_in_a_pool() -> None:
         UnitPool([*units, units[1], units[1]])
 
 
-def test_seed_and_query_do_matter() -> None:
-    units = units_of(NOMINAL)
-    draws = {
-        tuple(map(str, UnitPool(units, seed).draw(EpisodeId(family, split, index), 7)))
-        for seed in (0, 1)
-        for family in ("MoveCube", "InsertPeg")
-        for split in ("val", "test")
-        for index in (0, 1, 2)
-    }
-    assert len(draws) == 24
-
-
 # --- balance over all queries -------------------------------------------------------------------
 
 
@@ -238,18 +226,6 @@ def test_usage_of_the_nominal_pool(seed: int) -> None:
         assert Counter(seven.values()) == {1: 8, 2: 64, 3: 298, 4: 530}
 
 
-def test_every_family_comes_at_every_place() -> None:
-    pool = UnitPool(units_of(NOMINAL))
-    for family in FAMILIES:
-        own = [EpisodeId(family, "test", index) for index in range(48)]
-        places = Counter(
-            (place, unit.family) for query in own for place, unit in enumerate(pool.draw(query, 8))
-        )
-        # 48 queries are 6 blocks of 8: in each block every family stands once at each place.
-        assert len(places) == 8 * 8
-        assert set(places.values()) == {6}
-
-
 def test_consecutive_queries_draw_different_units() -> None:
     pool = UnitPool(units_of(NOMINAL))
     for family in FAMILIES:
@@ -267,11 +243,3 @@ def test_small_families_are_used_in_proportion(k: int, seed: int) -> None:
         own = [count for unit, count in counted.items() if unit.family == family]
         # Drawn evenly by family instead, the smallest would be at 13 times the mean.
         assert 0.7 * mean < sum(own) / len(own) < 1.15 * mean
-
-
-def test_small_families_are_used_more_where_k_needs_all_families() -> None:
-    counted = uses(UNEVEN, 8)
-    for family, size in UNEVEN.items():
-        own = [count for unit, count in counted.items() if unit.family == family]
-        assert sum(own) == 400  # one unit for each query of the other families
-        assert max(own) <= 2 * 400 / size

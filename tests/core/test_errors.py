@@ -69,28 +69,3 @@ def test_nearest_of_very_many_names_is_quick() -> None:
     sentence = nearest("VideoRepick/test/1234x", known)
     assert time.perf_counter() - started < 10
     assert "'VideoRepick/test/1234'" in sentence
-
-
-def test_constructors() -> None:
-    damaged = errors.FormatError.damaged("info.json", "no features")
-    assert damaged.message == "info.json: no features"
-    assert damaged.hint is not None
-    unknown = errors.UnknownNameError.among("camera", "frnt", "S", ["front", "wrist"])
-    assert (unknown.message, unknown.hint) == (
-        "camera 'frnt' is not in S",
-        "Did you mean 'front'?",
-    )
-    one = errors.InvalidOptionError.one_of("--codec", "x", ["a", "b"])
-    assert (one.message, one.hint) == ("--codec 'x' is none of a, b", None)
-    extra = errors.MissingExtraError.needs("drawing", "matplotlib", "score")
-    assert extra.hint == 'Install it: pip install "robomme-interference-data[score]"'
-    about = unknown.about("MoveCube/test/1")
-    assert type(about) is errors.UnknownNameError
-    assert about.message == "MoveCube/test/1: camera 'frnt' is not in S"
-    assert about.hint == unknown.hint
-
-
-def test_first_line() -> None:
-    assert errors.first_line(InterferenceError("what", "hint")) == "what"
-    assert errors.first_line(ValueError("a\nb")) == "a"
-    assert errors.first_line(ValueError()) == "ValueError"

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.damage import flipped_bits
 from support.lerobot_layouts import DATA, NAMES, TABLE, edit_columns, edit_info, write_lerobot
 from support.recordings import EPISODES
 
@@ -262,11 +263,7 @@ def test_files_that_are_missing(v30: Path) -> None:
 
 @pytest.mark.parametrize("name", ["meta/info.json", TABLE, DATA])
 def test_any_flipped_bit_is_one_clear_error_or_none(v30: Path, name: str) -> None:
-    data = (v30 / name).read_bytes()
-    for number, place in enumerate(np.linspace(0, len(data) - 1, 32, dtype=int).tolist()):
-        flipped = bytearray(data)
-        flipped[place] ^= 1 << number % 8
-        (v30 / name).write_bytes(flipped)
+    for _ in flipped_bits(v30 / name, 32):
         try:
             read_all(v30)
         except InterferenceError as error:

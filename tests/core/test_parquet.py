@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.parquet import RowSpan, reading
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.parquet import RowSpan
 
 IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 
@@ -82,12 +82,3 @@ def test_no_parquet_file(tmp_path: Path) -> None:
         (tmp_path / "t").write_bytes(data)
         with pytest.raises(FormatError, match=r"t: cannot be read: .*\nThe file is damaged"):
             RowSpan(tmp_path / "t")
-
-
-def test_only_pyarrows_errors_are_turned(tmp_path: Path) -> None:
-    for error in (MissingFileError("ours"), ZeroDivisionError()):
-        with pytest.raises(type(error)), reading(tmp_path / "x"):
-            raise error
-    with pytest.raises(FormatError) as caught, reading(tmp_path / "x"):
-        raise pa.ArrowInvalid("first line\nand many more")
-    assert caught.value.message == f"{tmp_path}/x: cannot be read: first line"

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -78,25 +77,6 @@ rows = st.builds(
 def test_plain_values() -> None:
     assert to_dict(ROW) == PLAIN
     assert from_dict(Row, PLAIN, "here") == ROW
-
-
-def test_schema() -> None:
-    def required(**types: pa.DataType) -> list[pa.Field]:
-        return [pa.field(name, kind, nullable=False) for name, kind in types.items()]
-
-    text, number = pa.string(), pa.int64()
-    part = pa.struct(required(name=text, source=text, size=number))
-    digests = pa.struct(required(x=text, y=text))
-    goals, parts = (pa.list_(pa.field("item", kind, nullable=False)) for kind in (text, part))
-    assert arrow_schema(Row, ["x", "y"]) == pa.schema(
-        [
-            *required(episode_id=text, family=text, split=text, index=number),
-            *required(count=number, share=pa.float64(), fine=pa.bool_()),
-            pa.field("note", text),
-            *required(digests=digests, goals=goals, parts=parts),
-            pa.field("best", part),
-        ]
-    )
 
 
 @given(st.lists(rows, max_size=4))

@@ -80,24 +80,3 @@ def test_slips_are_told(arguments: list[str], told: str) -> None:
     result = CliRunner().invoke(app, spread_values(arguments, SEVERAL))
     assert result.exit_code == 2
     assert told in result.output
-
-
-def test_help_shows_every_option() -> None:
-    text = CliRunner().invoke(app, ["--help"]).output
-    for option in ("--out", "--families", "--source", "--episode-split", "--k", "--videos"):
-        assert option in text
-    assert "OF_THE_TEST_K" in text
-
-
-@pytest.mark.parametrize(
-    ("given", "spread"),
-    [
-        ("--families A B --out o", "--families A --families B --out o"),
-        ("--families=A B", "--families A --families B"),
-        ("x --out a b", "x --out a b"),
-        ("--families", "--families"),
-        ("--families --source s t", "--families --source s --source t"),
-    ],
-)
-def test_spread(given: str, spread: str) -> None:
-    assert spread_values(given.split(), SEVERAL) == spread.split()

@@ -3,7 +3,6 @@
 import base64
 import io
 import re
-import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,8 +17,7 @@ from support.retrieval import remade, sessions_of
 from support.splits import QUERIES
 
 from robomme_interference_data import Buffer, load_buffer, load_split
-from robomme_interference_data.drawing import ink_on, open_page
-from robomme_interference_data.errors import InvalidOptionError, MissingExtraError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.sampling import spread
 from robomme_interference_data.strip import (
     COLORS,
@@ -116,11 +114,6 @@ def test_colors_by_family_in_order_of_appearance() -> None:
     assert colors_of("MM", []) == [COLORS[0]] * 2
     colors = colors_of("ABCDEFGHIJ", [0])
     assert len(set(colors[:9])) == 9 and colors[9] == colors[1]  # a tenth starts over
-
-
-@pytest.mark.parametrize("color", [LESSON_COLOR, *COLORS])
-def test_text_on_a_color_is_black_or_white_whichever_is_read_better(color: str) -> None:
-    assert ink_on(color) == ("white" if color in ("#0072B2", "#000000") else "black")
 
 
 # --- pictures ----------------------------------------------------------------------------------
@@ -230,18 +223,6 @@ def test_odd_goals(
     assert not recwarn.list
 
 
-def test_text_that_is_too_wide_shrinks_and_then_loses_its_middle(tmp_path: Path) -> None:
-    long = "much too wide for this"
-    with open_page(tmp_path / "page.svg", 2) as page:
-        wide = page.text_width(long, 8)
-        for share in (1, 0.8, 0.4):
-            page.text(0, share, long, 8, width=share * wide)
-    *whole, shortened = labels(tmp_path / "page.svg")
-    assert whole == [long, long]
-    start, end = shortened.split("…")
-    assert start and long.startswith(start) and end and long.endswith(end)
-
-
 # --- bytes -------------------------------------------------------------------------------------
 
 
@@ -255,18 +236,6 @@ def test_the_readers_own_settings_have_no_effect(
         draw_strip(buffer, tmp_path / "strip.svg")
         assert matplotlib.rcParams["font.size"] == 31  # nor are they touched
     assert (tmp_path / "strip.svg").read_bytes() == strip.read_bytes()
-
-
-def test_no_date_or_version_is_written(buffer: Buffer, strip: Path, tmp_path: Path) -> None:
-    out = tmp_path / "strip.PNG"
-    draw_strip(buffer, out)
-    data = out.read_bytes()
-    position, kinds = 8, []
-    while position < len(data):
-        kinds.append(data[position + 4 : position + 8])
-        position += 12 + int.from_bytes(data[position : position + 4])
-    assert set(kinds) == {b"IHDR", b"pHYs", b"IDAT", b"IEND"}
-    assert "<metadata" not in strip.read_text() and "atplotlib" not in strip.read_text()
 
 
 # --- refusals ----------------------------------------------------------------------------------
@@ -283,18 +252,6 @@ def test_places_that_cannot_be_written(buffer: Buffer, tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "file"):
         with pytest.raises(InvalidOptionError, match=r"strip\.png cannot be written: "):
             draw_strip(buffer, place / "strip.png")
-
-
-def test_without_matplotlib(
-    buffer: Buffer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtraError) as caught:
-        draw_strip(buffer, tmp_path / "strip.png")
-    assert "robomme-interference-data[score]" in str(caught.value.hint)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failure_keeps_the_old_picture(buffer: Buffer, tmp_path: Path) -> None:

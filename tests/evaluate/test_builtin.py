@@ -14,7 +14,6 @@ from robomme_interference_data.evaluate.policies.builtin import (
     Privileged,
     ReplayPolicy,
     follow,
-    thumbnails,
 )
 from robomme_interference_data.simulators.base import Observation
 
@@ -133,12 +132,3 @@ def test_hold_holds_and_a_script_needs_the_simulator() -> None:
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, 1], (16, 1)))
     with pytest.raises(PolicyError, match="needs the simulator itself"):
         Privileged("oracle").act(seen(0, 0.0), "goal")
-
-
-def test_thumbnails_are_mean_colours_of_tiles() -> None:
-    frame = np.zeros((35, 32, 3), np.uint8)  # the last 3 rows fill no tile
-    frame[0, 0] = (40, 80, 120)
-    small = thumbnails(frame[None])
-    assert small.shape == (1, 16, 16, 3)
-    assert small[0, 0, 0].tolist() == [10, 20, 30]  # one of four pixels
-    assert small.sum() == 60

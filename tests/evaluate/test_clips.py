@@ -11,20 +11,16 @@ from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.encode import VideoEncoder
-from robomme_interference_data.evaluate.clips import Clip, clip_name, history_picture
+from robomme_interference_data.evaluate.clips import clip_name, history_picture
 from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import Outcome, Serial
-from robomme_interference_data.records import Status
-from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.strip import session_colors
 
 pytestmark = pytest.mark.usefixtures("trouble")
 
 K1 = WorkItem("k1", EPISODE)
-INFO = EpisodeInfo(("do as shown",), "easy", 1, "world")
-VIEW = Observation({"front": np.full((256, 256, 3), 90, np.uint8)}, np.zeros(8, np.float32))
 
 
 @pytest.fixture
@@ -82,31 +78,6 @@ def test_the_history_is_what_was_given(start: int, stop: int, buffer: Buffer) ->
             np.testing.assert_array_equal(picture[y : y + 28, x : x + 28], small)
     sessions = [0] * 48 + [1] * 32
     assert found == sessions[start:stop] + [None] * (64 - (stop - start))
-
-
-def test_names_goal_and_length_of_the_history_are_on_the_picture(
-    tmp_path: Path, buffer: Buffer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from PIL import ImageDraw
-
-    said: list[str] = []
-    write = ImageDraw.ImageDraw.text
-    monkeypatch.setattr(
-        ImageDraw.ImageDraw,
-        "text",
-        lambda self, place, text, **how: (said.append(text), write(self, place, text, **how)),
-    )
-    clip = Clip(tmp_path, K1, "my-memory")
-    clip.begin(buffer, 0, 80, VIEW, INFO)
-    assert said == [
-        *("history given: 80 frames", "front", "wrist"),
-        *("my-memory", "MoveCube/test/0", "condition k1", "", "do as shown", ""),
-        *("step 0 of 1300", "ongoing"),
-    ]
-    clip.step(VIEW, Status.ONGOING, "lift the cube")
-    assert said[-5:] == ["subgoal:", "lift the cube", "", "step 1 of 1300", "ongoing"]
-    clip.close(Status.ERROR, "it fell " * 100)
-    assert said[-2:] == ["step 1 of 1300", "error"]
 
 
 def test_a_rollout_that_breaks_leaves_its_clip_too_unless_it_had_not_begun(

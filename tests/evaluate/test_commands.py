@@ -1,7 +1,6 @@
 """The commands `evaluate` and `merge`: what is typed, what is printed, and how one goes on."""
 
 import json
-import re
 import resource
 from pathlib import Path
 from typing import Any
@@ -84,21 +83,6 @@ def test_a_full_disk_names_the_file_and_the_command_to_go_on(
     assert done.exception.filename == str(tmp_path / "run" / "rollouts.jsonl")
     told = f"Finished rollouts are in {tmp_path / 'run'}; once mended, go on with:\nrobomme-inter"
     assert told in done.stderr
-
-
-@pytest.mark.parametrize("command", ["evaluate", "merge"])
-def test_help_is_whole_at_80_columns_and_has_examples(
-    command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    text = CliRunner().invoke(APP, [command, "--help"]).stdout
-    options = text[text.index("Options") :]
-    assert "--out " in options and not re.search(r"--[a-z-]+…", options)
-    # The examples are as they can be typed: a command begins a line, and goes on in the next.
-    lines = [line.strip() for line in text.splitlines()]
-    examples = [line for line in lines if line.startswith(f"robomme-interference {command} ")]
-    assert len(examples) == {"evaluate": 6, "merge": 1}[command]
-    assert all(line.endswith("\\") or "--out" in line for line in examples)
 
 
 def test_merge_tells_what_is_missing_and_double(tmp_path: Path) -> None:

@@ -9,9 +9,7 @@ from support import worlds
 from support.runs import run
 
 from robomme_interference_data import evaluate
-from robomme_interference_data.evaluate.policies.connection import API_KEY_VARIABLE
-from robomme_interference_data.evaluate.policies.registry import policy_options
-from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS, System
+from robomme_interference_data.evaluate.systems import SYSTEMS, System
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "systems.md").read_text(encoding="utf-8")
@@ -39,34 +37,6 @@ def test_the_table_is_that_of_the_code() -> None:
     lines = [line for line in section.splitlines() if line.startswith("| `")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert cells == [row(system) for system in SYSTEMS.values()]
-
-
-def test_it_says_how_to_start_the_server_of_every_system_of_the_paper() -> None:
-    section = PAGE.split("\n## Released servers")[1].split("\n## ")[0]
-    lines = re.findall(r"^\| `(\S+)` \| `(\S+)/79999` \| `(\S+)` \|$", section, flags=re.M)
-    subgoals = {"simple_subgoal": "simple-subgoal", "grounded_subgoal": "grounded-subgoal"}
-    expected = []
-    for system in PAPER_SYSTEMS:
-        config = "mme_vla_suite" if system.with_history else "pi05_baseline"
-        folder = system.name.replace("retrieval-", "perceptual-")
-        if system.subgoals is not None:
-            folder = f"symbolic-{subgoals[system.subgoals]}"
-        expected.append((system.name, f"{config}/{folder}", config))
-    assert lines == expected
-    # The example is a line of that table.
-    example = re.search(r"--policy\.dir=runs/ckpts/(\S+)/79999 \\\n +--policy\.config=(\S+)", PAGE)
-    assert example is not None
-    assert example.groups() in [line[1:] for line in lines]
-
-
-def test_the_names_that_it_gives_are_the_codes() -> None:
-    assert API_KEY_VARIABLE in PAGE
-    section = PAGE.split("\n## Options")[1].split("\n## ")[0]
-    named = re.findall(r"`(\w+_\w+)`", section)
-    assert set(policy_options("websocket://a:1")) == set(named) - {
-        "run_evaluation",
-        "policy_options",
-    }
 
 
 def test_the_policy_of_the_page_runs(

@@ -1,7 +1,6 @@
 """A whole run in this process: rows, resume, what breaks, and when it stops."""
 
 import fcntl
-import json
 import shutil
 from collections.abc import Generator, Iterable
 from pathlib import Path
@@ -12,11 +11,9 @@ import pytest
 from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
-from robomme_interference_data.errors import FormatError, RunFolderError, SimulatorCrashError
+from robomme_interference_data.errors import RunFolderError, SimulatorCrashError
 from robomme_interference_data.evaluate.log import read_record
 from robomme_interference_data.execution import Outcome, Serial
-from robomme_interference_data.records import Rollout
-from robomme_interference_data.rows import arrow_schema, to_dict
 
 pytestmark = pytest.mark.usefixtures("trouble")
 
@@ -46,15 +43,6 @@ def test_a_run_writes_a_row_for_every_rollout(tmp_path: Path) -> None:
     assert start["policy"] == {"policy": "cheat"} and start["started"] <= start["ended"]
     assert {"numpy", "python", "robomme-interference-data"} <= set(start["versions"])
     assert start["settings"]["conditions"] == ["k7", "no-history", "k0"]
-
-
-def test_tables_are_exported_from_the_record(tmp_path: Path) -> None:
-    result = run(tmp_path / "run")
-    table = pq.read_table(tmp_path / "run" / "rollouts.parquet")
-    assert table.schema.equals(arrow_schema(Rollout))
-    assert table.to_pylist() == [to_dict(row) for row in result.rows]
-    lines = [json.loads(line) for line in (tmp_path / "run" / "rollouts.jsonl").open()]
-    assert sorted(lines, key=table.to_pylist().index) == table.to_pylist()  # as they ended
 
 
 class Backwards(Serial):
@@ -238,25 +226,6 @@ def test_folders_that_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match=r"holds other files \(thesis\.tex\)"):
         run_one(other)
     assert [path.name for path in other.iterdir()] == ["thesis.tex"]
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"format_version": 2}, "format version 2"),
-        ({"plans": None}, "plans: None"),
-        ({"plans": [{"conditions": ["k0"]}]}, "episodes is missing"),
-        ({"notes": "mine"}, "unknown notes"),
-    ],
-)
-def test_a_damaged_header_is_one_clear_error(
-    tmp_path: Path, change: dict[str, Any], words: str
-) -> None:
-    run_one(tmp_path / "run")
-    changed = json.dumps(header(tmp_path / "run") | change)
-    (tmp_path / "run" / "run.json").write_text(changed)
-    with pytest.raises(FormatError, match=r"run\.json.*" + words):
-        run_one(tmp_path / "run")
 
 
 def test_the_split_may_lie_elsewhere_and_keeps_its_label(tmp_path: Path, tiny_split: Path) -> None:

@@ -4,7 +4,6 @@ import pytest
 
 from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
 from robomme_interference_data.evaluate.systems import (
-    PAPER_SYSTEMS,
     SYSTEMS,
     base_of,
     check_history,
@@ -12,13 +11,6 @@ from robomme_interference_data.evaluate.systems import (
 )
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
-
-
-def test_names_are_unique_and_the_papers_come_first() -> None:
-    assert list(SYSTEMS)[:13] == [system.name for system in PAPER_SYSTEMS]
-    assert len(SYSTEMS) == 13 + 3 + 3 + 3
-    assert [name for name in SYSTEMS if SYSTEMS[name].paper] == list(SYSTEMS)[:13]
-    assert len({system.display for system in SYSTEMS.values()}) == len(SYSTEMS)
 
 
 @pytest.mark.parametrize("name", [*SYSTEMS, "my-memory"])

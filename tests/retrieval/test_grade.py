@@ -3,7 +3,7 @@
 import pytest
 from support.retrieval import made
 
-from robomme_interference_data.retrieval.grade import ALL, Grade, cell_table, cells, grade, verdict
+from robomme_interference_data.retrieval.grade import ALL, Grade, cells, grade, verdict
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.stats import wilson
 
@@ -112,20 +112,3 @@ def test_the_pass_mark(first: int, passed: bool) -> None:
     # and 9 of its 10 are chosen; from 2 on, 8 of 9, and 8 of 10.
     one = made(cuts={first: 0.1, 11: 0.1}, high={5: 1}, spans=((0, 10), (10, 20)))
     assert {cell.passed for cell in cells([grade(one, MAX)])} == {passed}
-
-
-def test_tables() -> None:
-    grades = [
-        grade(made(f"MoveCube/test/{n}", cuts={6: 0.1}, high={n + 4: 1}), MAX) for n in range(3)
-    ]
-    lines = cell_table(list(cells(grades)), "Title").text().splitlines()
-    # The closest frame is in the lesson twice; the third time it is in the other nine. Of three
-    # times two borders the one before 6 is found each time.
-    assert lines[0] == "Title"
-    assert lines[4].split() == [
-        *("MoveCube", "k2", "3", "66.7%", "(20.8", "to", "93.9)", "66.7%", "(0.0", "to", "100.0)"),
-        *("66.7%", "(0.0", "to", "100.0)", "0.67", "3", "of", "6", "0", "no"),
-    ]
-    last = [grade(made(cuts={}, high={1: 1}), Rule("last", 0.5))]
-    lines = cell_table(list(cells(grades + last)), "Title").text().splitlines()
-    assert [line.split()[0] for line in lines[4:6]] == ["max/0.5", "last/0.5"]

@@ -104,15 +104,6 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_split: Path) -> None:
     assert files_of(own_split) == files_of(indexed)
 
 
-def test_what_another_batch_left_is_not_gone_on_with(indexed: Path, own_split: Path) -> None:
-    other = Interrupted(after=9)
-    other.batch = 8
-    with pytest.raises(KeyboardInterrupt):
-        make_index(own_split, other)
-    assert make_index(own_split) == FRAMES
-    assert files_of(own_split) == files_of(indexed)
-
-
 @pytest.mark.parametrize(
     ("name", "again"),
     [

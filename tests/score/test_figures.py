@@ -10,7 +10,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.drawing import open_figure
-from robomme_interference_data.evaluate.score.curves import Data, Look, looks_of, spread
+from robomme_interference_data.evaluate.score.curves import Data, Look, looks_of
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
 from robomme_interference_data.records import Rollout
@@ -58,23 +58,6 @@ def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> N
     assert len(shapes(paper, colour=True)) == 13
 
 
-def test_several_systems_with_retrieval_are_stars_in_the_colours_of_their_bases() -> None:
-    memories = [f"replay-{memory}" for memory in ("full", "framesamp", "window")]
-    looks = looks_of([*memories, *(f"retrieval-{name}" for name in memories)])
-    assert len(shapes(looks.values(), colour=True)) == 6
-    for name in memories:
-        star = looks[f"retrieval-{name}"]
-        assert (star.colour, star.marker) == (looks[name].colour, "*")
-    assert looks_of(["retrieval-replay-full"])["retrieval-replay-full"].colour == "#000000"
-
-
-def test_labels_are_moved_apart_by_as_little_as_need_be() -> None:
-    assert spread([1.0, 5.0, 9.0], 2.0) == [1.0, 5.0, 9.0]
-    # Two at 5 go to 4 and 6; the one at 7 then is too close: the three lie around their mean.
-    assert spread([5.0, 5.0, 7.0], 2.0) == pytest.approx([11 / 3, 17 / 3, 23 / 3])
-    assert spread([], 1.0) == []
-
-
 # --- figures -----------------------------------------------------------------------------------
 
 WHOLE = [row for row in made.rows() if row.system == BASE]
@@ -100,22 +83,6 @@ def test_a_legend_explains_hollow_and_published_points(
 ) -> None:
     assert draw_figure("success", figure, data(tmp_path, rows, paper))
     assert explained(figure) == expected
-
-
-@pytest.mark.parametrize(("systems", "dashes"), [(4, 4 * 5), (5, 0)])
-def test_beside_many_systems_published_rates_are_in_the_table_alone(
-    tmp_path: Path, figure: Any, systems: int, dashes: int
-) -> None:
-    ran = [name for name, s in SYSTEMS.items() if s.paper and not s.retrieval and s.with_history]
-    rows = [
-        row
-        for name in ran[:systems]
-        for row in made.changed(WHOLE, simulator="robomme", system=name)
-    ]
-    assert draw_figure("success", figure, data(tmp_path, rows, paper=True))
-    assert ("in the table" in explained(figure)) == (not dashes)
-    (axes,) = figure.axes
-    assert sum(line.get_marker() == "_" for line in axes.lines) == dashes
 
 
 def test_a_retrieval_system_stands_beside_its_published_base(tmp_path: Path, figure: Any) -> None:

@@ -20,7 +20,7 @@ from robomme_interference_data.evaluate.plan import Plan
 from robomme_interference_data.evaluate.score.curves import Data
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure, draw_figures
 from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.report import flips, write_report
+from robomme_interference_data.evaluate.score.report import write_report
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.files import sha256_file
 
@@ -174,16 +174,6 @@ def test_the_report_and_figures_are_the_same_bytes_each_time(
             save_figure(figure, path := tmp_path / f"success{suffix}")
         assert path.read_bytes() == (folder / f"success-tabletop{suffix}").read_bytes()
         assert b"<dc:date>" not in path.read_bytes()
-
-
-def test_where_episodes_flip(filler: None) -> None:
-    nan = float("nan")
-    conditions = ["no-history", "k0", "k1", "k3", "k7"]
-    assert flips(conditions, [0, 1, 1, 0, 1]) == "k3 lost, k7 gained"
-    assert flips(conditions, [nan, 1, nan, 0, nan]) == "k3 lost"
-    assert flips(conditions, [1, 0, 0, 0, 0]) == flips([], []) == flips(["k0"], [nan]) == ""
-    assert flips(conditions, [nan, 0.5, 1, 1, 0.5]) == "k1 gained, k7 lost"
-    assert flips(["k7", "filler-k0", "filler-k1"], [1, 0, 1]) == "filler-k1 gained"
 
 
 def test_episodes_show_every_outcome(tmp_path: Path) -> None:

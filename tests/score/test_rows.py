@@ -1,10 +1,7 @@
 """Rows are read from CSV, parquet and records of runs alike; bad ones are named and refused."""
 
 import json
-import os
 import random
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,16 +121,6 @@ def test_the_released_layout(tmp_path: Path) -> None:
     assert told(read_rows([path])) == expected
 
 
-def test_simulators_have_revisions_scenes_and_names_of_their_own(tmp_path: Path) -> None:
-    names = ("my_package.kitchen:make_simulator", "_doubles:make", "sim-2.1", "x" * 128)
-    rows = made.rows()[:2]
-    for number, name in enumerate(names):
-        rows += made.changed(rows[:2], simulator=name, revision=f"{number}" * 64, seed=number)
-    found = read_rows([made.write_csv(tmp_path / "a.csv", rows)])
-    assert found.names("simulator") == sorted((*names, "tabletop"))
-    assert len(found.revisions) == 5
-
-
 @pytest.mark.parametrize("kind", [pa.float32(), pa.float64(), pa.uint8(), pa.string()])
 def test_numbers_of_any_type_are_read_alike(tmp_path: Path, kind: Any) -> None:
     episodes = pa.array([row.episode for row in made.rows()]).cast(kind)
@@ -248,13 +235,6 @@ def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
         *("2: family ", "5: the lin", "6: the sam", "9: family ")
     ]
     assert f"as {path}, line 4" in found.refusals[2]
-
-
-def test_rows_of_parquet_are_counted_from_one(tmp_path: Path) -> None:
-    names = [row.family for row in made.rows()]
-    names[17] = "Unknown"
-    with pytest.raises(BadRowsError, match=r"x\.parquet, row 18: family 'Unknown'"):
-        read_rows([write(tmp_path / "x.parquet", family=pa.array(names))])
 
 
 def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
@@ -377,27 +357,3 @@ def test_rows_of_one_system_with_and_without_a_revision_do_not_mix(tmp_path: Pat
     for paths in ([half, other], [other, half]):
         with pytest.raises(InvalidOptionError, match="name no revision"):
             read_rows(paths, lenient=True)
-
-
-def test_reading_never_imports_pandas(tmp_path: Path) -> None:
-    """It would take seconds, and a Ctrl-C meanwhile would be lost."""
-    mark = tmp_path / "imported"
-    (tmp_path / "pandas.py").write_text(f"open({str(mark)!r}, 'w').close()")
-    rows = made.rows()
-    rows[0] = replace(rows[0], seed=None, video="videos/0.mp4")
-    paths = [
-        made.write_parquet(tmp_path / "a.parquet", rows),
-        made.write_csv(tmp_path / "b.csv", made.changed(rows, model_seed=1)),
-        write(tmp_path / "c.parquet", model_seed=pa.array([2.0] * 107), seed=pa.nulls(107)),
-        made.write_run(tmp_path / "run", made.changed(rows, model_seed=3)),
-    ]
-    code = (
-        "import sys; from pathlib import Path; "
-        "from robomme_interference_data.evaluate.score import Grid, Settings; "
-        "from robomme_interference_data.evaluate.score.scoring import score; "
-        "score(Settings(tuple(map(Path, sys.argv[1:])), grid=Grid.GIVEN), draws=10)"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-c", code, *map(str, paths)]
-    subprocess.run(command, env=environment, timeout=120, check=True)
-    assert not mark.exists()

@@ -10,12 +10,11 @@ import textwrap
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from support.worker_calls import wait_until_gone
-from typer.testing import CliRunner
 
 from robomme_interference_data.errors import (
     InvalidOptionError,
@@ -24,7 +23,6 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.simulators import Status, make_simulator
-from robomme_interference_data.simulators.commands import simulate
 from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.simulators.robomme import EPISODES, RoboMMESimulator, find_python
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
@@ -131,18 +129,16 @@ def test_images_are_left_out_where_not_wanted(robomme_python: Path) -> None:
 
 
 def test_simulate_plays_the_demonstration(
-    robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Any, robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     local = Path("python")  # there is another one on the path
     local.write_text(f'#!/bin/sh\nexec "{robomme_python}" "$@"\n')
     local.chmod(0o755)
-    app = typer.Typer()
-    app.command()(simulate)
-    words = ["--family", "MoveCube", "--episode", "3", "--json", "--simulator", "robomme"]
-    done = CliRunner().invoke(app, [*words, "--robomme-python", "./python"])
-    assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
+    words = "simulate --family MoveCube --episode 3 --json --simulator robomme"
+    code, out, err = run(*words.split(), "--robomme-python", "./python")
+    assert code == 0, err
+    found = json.loads(out)
     assert (found["seed"], found["policy"], found["lesson_frames"]) == (640_003, "none", 5)
 
 

@@ -29,7 +29,7 @@ from robomme_interference_data.simulators.tabletop.episodes import (
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.families.video_place_button import RADIUS
 from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE
-from robomme_interference_data.simulators.tabletop.stage import Spot, exchanges, lanes
+from robomme_interference_data.simulators.tabletop.stage import Spot, lanes
 
 PAGE = Path(__file__).parents[2] / "docs" / "simulators.md"
 
@@ -180,23 +180,6 @@ def test_containers_that_change_places_do_not_change_back() -> None:
     assert abs(stays - 34 / 3) < 2 * math.sqrt(34 * 2) / 3
 
 
-def test_every_thing_can_be_any_of_an_exchange() -> None:
-    """Two and two of four; two, and three in a ring, of five."""
-    assert exchanges(RandomState(1), 3) == [(0, 2)]
-    assert exchanges(RandomState(1), 4) == [(3, 2), (0, 1)]
-    assert exchanges(RandomState(1), 5) == [(2, 1), (4, 0), (4, 3)]
-
-
-def test_a_way_leads_along_its_lane() -> None:
-    """Two things 0.2 m apart, a third one 0.01 m further from the arm, lanes 0.1 m off."""
-    to, back = lanes([(0.0, -0.1), (0.0, 0.1), (0.01, 0.0)], (0, 1), 0.1)
-    assert len(to) == len(back) == 30
-    assert (to[-1], back[-1]) == ((0.0, 0.1), (0.0, -0.1))
-    # Half the time, half the way: 0.11 out of 0.42 m, or 0.1 of 0.4, then along to the middle.
-    assert to[14] == pytest.approx((0.11, 0.0))
-    assert back[14] == pytest.approx((-0.1, 0.0))
-
-
 def apart(one: Spot, other: Spot) -> float:
     return max(abs(one[0] - other[0]), abs(one[1] - other[1]))
 
@@ -234,11 +217,6 @@ def seen_at(points: Any) -> NDArray[np.float64]:
     scale = 128 / math.tan(FRONT_VIEW / 2) / (to @ ahead)
     up = np.cross(right, ahead)
     return np.stack([128 + scale * (to @ right), 128 - scale * (to @ up), scale])
-
-
-def test_the_camera_looks_at_its_target() -> None:
-    """The middle of the image, and k / distance = 128 / tan 23° / |(1.1, 0, 0.43)| = 255.3."""
-    assert seen_at(FRONT_TARGET)[:, 0] == pytest.approx((128, 128, 255.3), abs=0.1)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

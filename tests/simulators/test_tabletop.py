@@ -230,16 +230,6 @@ def test_no_two_families_could_be_mistaken_for_one_another(scene: TabletopEnv) -
 # --- the arm -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("family", ["MoveCube", "PatternLock"])
-def test_the_arm_is_drawn_in_every_row_before_the_wall(scene: TabletopEnv, family: str) -> None:
-    """With fingers, and with the stick."""
-    reset(scene, family, 0)
-    front = scene.observe(("front",)).images["front"].astype(int)
-    arm = np.abs(front[:90] - front[0, 0]).max(axis=2) > 20
-    assert arm.any(axis=1).all()
-    assert arm.sum() > 2500
-
-
 @pytest.mark.slow
 def test_the_cube_is_in_sight_all_through_a_lesson_in_pushing(tabletop: TabletopSimulator) -> None:
     tabletop.env.demonstrated = ("front", "wrist")

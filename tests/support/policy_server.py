@@ -5,13 +5,9 @@ reset, `exec_start_idx` above 0 sets the length of the history, actions are refu
 memory is empty, an error goes out as a traceback in a text frame and then close code 1011, and
 while it works it answers nothing else, pings included. Beyond them it holds clients to the order
 of calls. It answers with actions that hold the arm where it is.
-
-As a script: python tests/support/policy_server.py --port 0
 """
 
-import argparse
 import asyncio
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -223,20 +219,3 @@ class PolicyServer:
             return {"add_buffer_finished": True, "add_buffer_time_ms": np.float64(0.5)}
         self.memory.calls.append({"call": "infer", "prompt": message.get("prompt")})
         return self.memory.infer(message)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Serve a policy that holds still.")
-    parser.add_argument("--port", type=int, default=0, help="0: any free one; it is printed")
-    options = parser.parse_args()
-    server = PolicyServer(Memory(keep=False), port=options.port)
-
-    def tell() -> None:
-        sys.stdout.write(f"{server.url}\n")
-        sys.stdout.flush()
-
-    asyncio.run(server.serve(tell))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,5 +1,7 @@
 """A simulator without physics."""
 
+from typing import Any
+
 import numpy as np
 
 from robomme_interference_data.errors import UnknownNameError
@@ -22,32 +24,49 @@ UNKNOWN, ENDLESS = 3, 4
 class Double(Simulator):
     """A simulator of 4×4 pictures, with a lesson of five frames in every episode.
 
+    States count the frames of the lesson, and then the steps from 10 on; actions count the steps.
+
     Args:
         cameras: What it draws: the front camera all in the episode's index, others in 99.
+        name: What it says it is.
+        told: Whether it tells the lesson's actions.
+        options: Kept to be looked at.
     """
 
-    def __init__(self, cameras: tuple[str, ...] = ("front", "wrist")):
-        self.cameras = cameras
+    def __init__(
+        self,
+        cameras: tuple[str, ...] = ("front", "wrist"),
+        name: str = "double",
+        told: bool = True,
+        **options: Any,
+    ):
+        self.cameras, self.name, self.told, self.options = cameras, name, told, options
+        self.executed, self.closed = 0, False
 
     def act(self, policy: str) -> np.ndarray:
-        return np.zeros(8, np.float32)
+        return np.full(8, self._steps, np.float32)
+
+    def close(self) -> None:
+        super().close()
+        self.closed = True
 
     def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
         if episode.index == UNKNOWN:
             raise UnknownNameError("no such episode", "Take another.")
         lesson = Demonstration(
             {name: np.stack([image] * 5) for name, image in self._images(episode).items()},
-            np.zeros((5, 8), np.float32),
-            np.ones((5, 8), np.float32),
+            np.arange(5, dtype=np.float32)[:, None].repeat(8, 1),
+            np.ones((5 * self.told, 8), np.float32),
         )
-        info = EpisodeInfo(("goal",), "easy", episode.index, "double")
-        return lesson, Observation(self._images(episode), np.zeros(8, np.float32)), info
+        info = EpisodeInfo(("goal", "other"), "easy", episode.index, self.name)
+        return lesson, Observation(self._images(episode), np.full(8, 10, np.float32)), info
 
     def _execute(
         self, episode: EpisodeId, action: np.ndarray, observe: bool
     ) -> tuple[Observation, Status]:
+        self.executed += 1
         goes_on = episode.index == ENDLESS or self._steps < STEPS
-        seen = Observation(self._images(episode), np.full(8, self._steps, np.float32))
+        seen = Observation(self._images(episode), np.full(8, 10 + self._steps, np.float32))
         return seen, Status.ONGOING if goes_on else Status.SUCCESS
 
     def _images(self, episode: EpisodeId) -> dict[str, np.ndarray]:

@@ -108,13 +108,6 @@ def test_requirements_of_the_core_and_of_an_extra(
         assert (row.ok, row.detail, fix) == expected
 
 
-def test_a_package_that_is_not_installed_itself(installed: Installed) -> None:
-    installed({})
-    row = doctor.check_packages("Core")
-    assert (row.ok, row.detail) == (False, "robomme-interference-data itself is not installed")
-    assert doctor.check_packages("Simulator", "sim").ok is None
-
-
 def test_a_missing_codec_fails_by_name_and_libraries_for_torchcodec_are_optional() -> None:
     row = doctor.check_video((("libdav1d", "r"), ("libnothing", "w")))
     assert (row.ok, row.fix is None) == (False, False)

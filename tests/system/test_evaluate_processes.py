@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import policy_server, runs, worlds
+from support import runs, worlds
+from support.policy_server import Memory, PolicyServer
+from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import WorkerRetiredError
 from robomme_interference_data.evaluate.log import read_record
@@ -65,15 +67,6 @@ def children(pid: int) -> list[int]:
     return found
 
 
-def gone(pids: list[int]) -> bool:
-    end = time.monotonic() + 30
-    while any(Path(f"/proc/{pid}").exists() for pid in pids):
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.1)
-    return True
-
-
 def ended(out: Path) -> list[dict[str, Any]]:
     """What came out, in canonical order, without what differs from run to run."""
     rows = read_record(out)
@@ -113,7 +106,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
         else:
             os.killpg(running.pid, number)
         _, err = running.communicate(timeout=60)
-        assert gone(workers), "workers end with their parent"
+        wait_until_gone(workers)  # they end with their parent
         header, rows = json.loads((out / "run.json").read_text()), read_record(out)
         # `read_record` refuses a second row of a finished rollout: none is lost, none is double.
         assert all(rows[item] == row for item, row in before.items())
@@ -167,43 +160,37 @@ def test_policies_are_closed_and_what_they_print_is_not_among_the_rows(
 
 
 @contextmanager
-def servers(count: int) -> Iterator[tuple[list[subprocess.Popen[str]], str]]:
-    """Servers in processes of their own, and their addresses with commas between."""
+def servers(count: int) -> Iterator[tuple[list[ExitStack], str]]:
+    """Servers, each with what stops it, and their addresses with commas between."""
     with ExitStack() as stack:
-        started = []
-        for _ in range(count):
-            command = [sys.executable, str(Path(policy_server.__file__)), "--port", "0"]
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-            stack.callback(process.wait)
-            stack.callback(process.kill)
-            started.append(process)
-        urls = [process.stdout.readline().strip() for process in started if process.stdout]
-        yield started, ",".join(url.removeprefix("websocket://") for url in urls)
+        stops = [stack.enter_context(ExitStack()) for _ in range(count)]
+        started = [stop.enter_context(PolicyServer(Memory(keep=False)).running()) for stop in stops]
+        yield stops, ",".join(server.url.removeprefix("websocket://") for server in started)
 
 
-class Killer:
-    """Kills servers as soon as a row is written."""
+class Stopper:
+    """Stops servers as soon as a row is written."""
 
-    def __init__(self, processes: list[subprocess.Popen[str]]):
-        self.processes = processes
+    def __init__(self, stops: list[ExitStack]):
+        self.stops = stops
 
     def start(self, items: Any, done: Any) -> None: ...
 
     def row(self, row: Any) -> None:
-        while self.processes:
-            self.processes.pop().kill()
+        while self.stops:
+            self.stops.pop().close()
 
 
 def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) -> None:
     """The policy holds still: all rollouts fail. Another server does the rest, or a later run."""
     served: dict[str, Any] = {"policy": "python:support.own_policies:Served", "workers": 2}
     served |= {"conditions": CONDITIONS}
-    with servers(2) as (processes, urls):
+    with servers(2) as (stops, urls):
         monkeypatch.setenv("SERVERS", urls)
-        result = runs.run(tmp_path / "one", Processes(2), listener=Killer(processes[1:]), **served)
+        result = runs.run(tmp_path / "one", Processes(2), listener=Stopper(stops[1:]), **served)
         assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * ROLLOUTS
         with pytest.raises(WorkerRetiredError, match="cannot be reached"):
-            runs.run(tmp_path / "two", Processes(1), listener=Killer(processes[:1]), **served)
+            runs.run(tmp_path / "two", Processes(1), listener=Stopper(stops[:1]), **served)
     rows = read_record(tmp_path / "two")
     assert 1 <= len(rows) < ROLLOUTS and {row.status for row in rows.values()} == {"fail"}
     header = json.loads((tmp_path / "two" / "run.json").read_text())
@@ -218,16 +205,15 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
 # --- scripts -----------------------------------------------------------------------------------
 
 
-def script(tmp_path: Path, call: str, policy: str = runs.CHEAT) -> Any:
+def script(tmp_path: Path, call: str) -> Any:
     path = tmp_path / "script.py"
     path.write_text(f"""
 from pathlib import Path
-from support.worlds import make_cheat
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 
 options = {{"simulator": {runs.WORLD!r}, "conditions": ("k0",), "families": ("MoveCube",)}}
 split, out = Path({os.environ[worlds.SPLIT]!r}), Path("run")
-config = RunConfig({policy!r}, split, out, system="mine", **options)
+config = RunConfig({runs.CHEAT!r}, split, out, system="mine", **options)
 {call}
 """)
     return subprocess.run(
@@ -240,7 +226,7 @@ config = RunConfig({policy!r}, split, out, system="mine", **options)
     )
 
 
-def test_a_script_needs_its_guard_and_a_module_for_its_policy(tmp_path: Path) -> None:
+def test_a_script_needs_its_guard(tmp_path: Path) -> None:
     call = "run_evaluation(config)"
     done = script(tmp_path, call)
     assert done.returncode == 1 and done.stderr.count("Traceback") == 1
@@ -251,5 +237,3 @@ def test_a_script_needs_its_guard_and_a_module_for_its_policy(tmp_path: Path) ->
     done = script(tmp_path, f"{GUARD}\n    print({call}.counts)")
     assert done.stderr == ""
     assert done.stdout == "{'success': 1, 'fail': 0, 'timeout': 0, 'error': 0}\n"
-    done = script(tmp_path, f"{GUARD}\n    {call}", "python:__main__:make_cheat")
-    assert done.stderr.splitlines()[-1].endswith("and write python:MODULE:FUNCTION.")

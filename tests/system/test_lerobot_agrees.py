@@ -123,12 +123,3 @@ def test_lerobot_reads_what_we_do(lerobot: Any, name: str) -> None:
             np.testing.assert_array_equal(item["observation.state"].numpy(), states[number])
             assert item["task"] == record.goal
             assert item["frame_index"] == number
-
-
-def test_episodes_can_be_selected_by_our_columns(lerobot: Any) -> None:
-    meta = lerobot.LeRobotDatasetMetadata("tests/distractors", root=GOLDEN / "distractors")
-    chosen = meta.filter_episodes(lambda episode: episode["family"] == "PatternLock")
-    assert [meta.episodes[index]["episode_id"] for index in chosen] == [
-        "PatternLock/train/0",
-        "PatternLock/train/1",
-    ]

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 # Stands in for Python, for its pip, and for the uv that it installs; notes how it is called.
 FAKE_PYTHON = """#!/usr/bin/env bash
@@ -161,23 +160,6 @@ def test_uv_uses_the_index_of_pip(
     checkout.add_python("python3.12")
     checkout.set_up(**environment)
     assert f"index {index}" in checkout.log.read_text(encoding="utf-8").splitlines()
-
-
-def test_help_lists_every_target_that_a_person_runs() -> None:
-    done = subprocess.run(
-        ["make", "--no-print-directory"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    listed = [line.split()[1] for line in done.stdout.splitlines()]
-    assert listed == [
-        *("help", "setup", "vulkan", "demo", "test", "check", "format", "bench", "pins")
-    ]
-    assert all(len(line) <= 90 for line in done.stdout.splitlines())
-
-
-def test_every_target_is_declared_phony() -> None:
-    phony = re.search(r"^\.PHONY: (.+)$", MAKEFILE, re.MULTILINE)
-    assert phony is not None
-    assert set(phony[1].split()) == set(re.findall(r"^([a-z]+):", MAKEFILE, re.MULTILINE))
 
 
 @pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh", "scripts/system_packages.sh"])

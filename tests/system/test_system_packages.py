@@ -1,6 +1,5 @@
 """Vulkan driver and Chromium come from the machine's own package sources, or it is said why not."""
 
-import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -184,13 +183,3 @@ def test_what_to_do_without_apt_and_without_root(machine: Machine) -> None:
         "install the driver of your GPU, or Mesa's software driver, 24.3 or newer"
     )
     assert chromium.endswith("install Chromium or Chrome")
-
-
-@pytest.mark.skipif(not os.access("/var/lib/apt/lists", os.R_OK), reason="no apt here")
-def test_apt_tells_where_its_entries_stand() -> None:
-    """What the script asks of apt, which the stand-in above only repeats."""
-    command = ["apt-get", "indextargets", "--format", "$(SOURCESENTRY)", "Created-By: Packages"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    for entry in done.stdout.splitlines():
-        path, _, number = entry.rpartition(":")
-        assert Path(path).is_file() and number.isdigit()
