@@ -70,7 +70,7 @@ class Other(World):
     [
         ({"seed": -1}, "in the dataset, -1 in the simulator"),
         ({"difficulty": "other"}, "difficulty is 'easy' in the dataset, 'other' in the simulator"),
-        ({"goal": "sing", "goals": ("sing",)}, "'sing' in the simulator"),
+        ({"goals": ("sing",)}, "'sing' in the simulator"),
         ({"missing": 1}, "demonstration is 48 in the dataset, 47 in the simulator"),
         ({"off": 0.011}, "is 0.0110 away from the recorded one"),
         ({"off": np.nan}, "is nan away"),

@@ -27,8 +27,8 @@ def _units_alone(material: Material, k: int) -> tuple[SessionEntry, ...]:
 @pytest.fixture
 def split(own_split: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A split with buffers of two kinds of conditions that are registered here alone."""
-    monkeypatch.setitem(KINDS, "before", Kind("before", "position", _units_then_lesson))
-    monkeypatch.setitem(KINDS, "absent", Kind("absent", "false memory", _units_alone))
+    monkeypatch.setitem(KINDS, "before", Kind("before", _units_then_lesson))
+    monkeypatch.setitem(KINDS, "absent", Kind("absent", _units_alone))
     names = ("no-history", "k0", "k1", "before-k1", "before-k3", "absent-k1")
     code, _, err = run("build", "manifests", own_split, "--conditions", *names)
     assert code == 0, err
