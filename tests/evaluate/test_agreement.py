@@ -86,5 +86,5 @@ def test_another_version_of_the_simulator_is_noticed(changes: dict[str, Any], me
 
 def test_what_another_machine_or_source_changes_is_let_pass() -> None:
     goals = "in other words", query_of(str(EPISODE))[0].goal
-    near = Other(off=0.009, goal=goals[0], goals=goals)
+    near = Other(off=0.009, goals=goals)
     assert roll("k0", Cheat(), simulator=near).status == "success"
