@@ -31,12 +31,12 @@ from robomme_interference_data.build_dataset.sources import (
     open_source,
 )
 from robomme_interference_data.build_dataset.stage import StageTask
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
 from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.execution import Executor, Processes, Serial, Worker
+from robomme_interference_data.work_progress import WorkProgress
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 FAMILIES = ("VideoUnmask", "VideoUnmaskSwap", "PatternLock")

@@ -27,7 +27,6 @@ from timing import Times, interleave, machine, positive, table
 
 from robomme_interference_data import Dataset, load_split
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -40,6 +39,7 @@ from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.select import Rule, choose, measure
+from robomme_interference_data.work_progress import WorkProgress
 
 QUIET = WorkProgress(quiet=True)
 RULE = Rule("max")

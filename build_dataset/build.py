@@ -23,7 +23,6 @@ from robomme_interference_data.build_dataset.lerobot_writer import (
     write_lerobot,
 )
 from robomme_interference_data.build_dataset.stage import Staged, StageTask, Task, read_staged
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH
 from robomme_interference_data.encode import get_codec
 from robomme_interference_data.errors import (
@@ -37,6 +36,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.execution import Executor, Outcome
 from robomme_interference_data.files import canonical_json, working
 from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.work_progress import WorkProgress
 
 _ADVICE = "Choose another --out, or remove the folder first."
 

@@ -14,11 +14,11 @@ from robomme_interference_data.build_dataset.config import (
     position_limit,
 )
 from robomme_interference_data.console import (
-    MESSAGES,
     AsJson,
+    Group,
     SplitFolder,
-    WorkProgress,
     print_json,
+    say,
     stoppable,
 )
 from robomme_interference_data.constants import (
@@ -30,8 +30,9 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.settings import with_settings
 
 app = typer.Typer(
+    cls=Group,
     no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
     help="Build datasets of demonstrations and distractor units, and manifests of buffers.",
     epilog="""Flow: record or download episodes, build both datasets and the manifests, verify.
 
@@ -123,21 +124,22 @@ def build_all(config: BuildConfig, plan: PlanConfig, as_json: AsJson = False) ->
     for kind, step in plan_all(config, plan).items():
         _build(step, config.out / kind, config.workers, as_json=False)
     _plan(config.out, plan, as_json=as_json)
-    MESSAGES.print(f"Next: robomme-interference verify {config.out}")
+    say(f"Next: robomme-interference verify {config.out}")
 
 
 def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
     from robomme_interference_data.build_dataset.build import build_dataset
     from robomme_interference_data.execution import Processes
+    from robomme_interference_data.work_progress import WorkProgress
 
     with stoppable("Finished episodes are kept"), WorkProgress(unit="episodes") as progress:
         result = build_dataset(plan, out, Processes(workers), progress)
     done = f"{result.added} added" if result.added else "was built before"
-    MESSAGES.print(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
+    say(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
     for name, why in sorted(result.skipped.items())[:_TOLD]:
-        MESSAGES.print(f"  left out {name}: {why}")
+        say(f"  left out {name}: {why}")
     if len(result.skipped) > _TOLD:
-        MESSAGES.print(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
+        say(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
     if as_json:
         print_json({**vars(result), "out": str(result.out)})
 
@@ -145,6 +147,7 @@ def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
 def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
     from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
     from robomme_interference_data.split import load_split
+    from robomme_interference_data.work_progress import WorkProgress
 
     plan = plan_manifests(split, config.conditions, config.seed, position_limit(config))
     with WorkProgress(unit="buffers") as progress:
@@ -156,9 +159,7 @@ def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
     if as_json:
         print_json({"out": str(split / MANIFESTS), **counts})
     else:
-        MESSAGES.print(
-            f"{split / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries"
-        )
+        say(f"{split / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
 
 
 def verify(
@@ -176,6 +177,7 @@ def verify(
     ```
     """
     from robomme_interference_data.build_dataset.verify import verify_split
+    from robomme_interference_data.work_progress import WorkProgress
 
     progress = WorkProgress()
     checks = verify_split(split, decode=decode, progress=progress)
@@ -187,9 +189,7 @@ def verify(
         for violation in violations:
             typer.echo(f"{violation.where}: {violation.what}")
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
-        MESSAGES.print(
-            f"{len(violations)} violations" if violations else f"All {what} of {split} hold."
-        )
+        say(f"{len(violations)} violations" if violations else f"All {what} of {split} hold.")
     if violations:
         raise typer.Exit(1)
 
@@ -216,6 +216,6 @@ def audit(
             typer.echo(table.text() + "\n")
         for leak in report.leaks:
             typer.echo(f"LEAK, {leak.kind}: {leak.where}")
-        MESSAGES.print(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
+        say(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
     if report.leaks:
         raise typer.Exit(1)

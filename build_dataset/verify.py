@@ -8,7 +8,6 @@ from typing import Any
 from robomme_interference_data.build_dataset.identity import identity_of, listed_files
 from robomme_interference_data.build_dataset.lerobot_meaning import lerobot_violations
 from robomme_interference_data.build_dataset.manifests import plan_manifests, planned_buffers
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -29,6 +28,7 @@ from robomme_interference_data.files import LocalFiles, sha256_file
 from robomme_interference_data.records import EpisodeRecord, ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.split import load_split
+from robomme_interference_data.work_progress import WorkProgress
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 
 from robomme_interference_data.console import (
-    MESSAGES,
     AsJson,
     command_line,
     print_json,
+    say,
     stoppable,
 )
 from robomme_interference_data.evaluate.config import RunConfig
@@ -59,9 +59,9 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
         typer.echo(rate_table(result.rows).text())
         typer.echo(f"{len(result.rows)} of {result.planned} rollouts in {config.out}")
     if result.stopped is not None:
-        MESSAGES.print(f"Stopped: {result.stopped}", style="red")
+        say(f"Stopped: {result.stopped}", fg="red")
     if broken := result.counts["error"]:
-        MESSAGES.print(
+        say(
             f"{broken} rollouts broke (see {config.out}/errors.log); the same command runs them "
             f"again:\n{command_line()}"
         )
@@ -100,7 +100,7 @@ def merge(
         if items:
             more = f" and {len(items) - 5:,} more" if len(items) > 5 else ""
             shown = ", ".join(map(str, items[:5]))
-            MESSAGES.print(f"{len(items):,} {_TOLD[name]}: {shown}{more}")
+            say(f"{len(items):,} {_TOLD[name]}: {shown}{more}")
     typer.echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
 
 

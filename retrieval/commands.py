@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robomme_interference_data.console import (
-    MESSAGES,
     AsJson,
     ConditionName,
     Picture,
     QueryName,
     SplitFolder,
     SplitOption,
-    WorkProgress,
     print_json,
+    say,
     stoppable,
 )
 from robomme_interference_data.constants import IDENTITY_PATH
@@ -69,6 +68,7 @@ def index(
     from robomme_interference_data.retrieval.encoders import make_encoder
     from robomme_interference_data.retrieval.index import build_index
     from robomme_interference_data.rows import to_dict
+    from robomme_interference_data.work_progress import WorkProgress
 
     places = [split / IDENTITY_PATH, *sorted(split.glob(f"*/{IDENTITY_PATH}"))]
     roots = [path.parent.parent for path in places if path.is_file()]
@@ -96,7 +96,7 @@ def index(
         frames, found = report.header.frames, report.header.computed
         typer.echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
         if found != wanted:
-            MESSAGES.print(
+            say(
                 f"{report.folder} is kept, computed with {found['in']}, {found['batch']} images at "
                 f"a time; --force makes it again with {wanted['in']}, {wanted['batch']} at a time"
             )
@@ -134,7 +134,7 @@ def retrieve(
     found = reasons.reasons(buffer, measured, choice, parsed, name, camera)
     if out is not None:
         drawing.draw_retrieval(buffer, measured, choice, found, out)
-        MESSAGES.print(f"{out} written")
+        say(f"{out} written")
     if as_json:
         print_json(to_dict(found))
     else:
@@ -185,7 +185,7 @@ def retrieval_score(
         write_text(out / "cells.csv", Table.of(grade.Cell, cells, "cells", title).csv())
         write_text(out / "rows.csv", Table.of(grade.Grade, grades, "rows", title).csv())
         charts.draw_cells(cells, title, out / "retrieval.png")
-        MESSAGES.print(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
+        say(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
     if as_json:
         about |= {"rules": list(map(str, wanted)), "pass_mark": grade.PASS_MARK}
         print_json(about | {"cells": [to_dict(cell) for cell in cells]})
@@ -227,7 +227,7 @@ def calibrate(
     title = f"Threshold of {name}, camera {camera}, on {about['split']}"
     if out is not None:
         charts.draw_calibration(found, title, out)
-        MESSAGES.print(f"{out} written")
+        say(f"{out} written")
     if as_json:
         print_json(about | to_dict(found))
     else:
@@ -240,6 +240,7 @@ def _measured(
     """Measure all buffers of a split that hold frames of the lesson; tell what they are of."""
     from robomme_interference_data.retrieval.select import measure
     from robomme_interference_data.split import load_split
+    from robomme_interference_data.work_progress import WorkProgress
 
     opened = load_split(split)
     measured = []
@@ -256,6 +257,6 @@ def _measured(
             f"Type: robomme-interference build manifests {split} --conditions k0 k3",
         )
     if left_out and not quiet:
-        MESSAGES.print(f"{left_out} of {len(opened)} buffers hold no lesson and are left out")
+        say(f"{left_out} of {len(opened)} buffers hold no lesson and are left out")
     about = {"split": opened.name, "revision": opened.revision, "encoder": encoder}
     return about | {"camera": camera, "buffers": len(measured), "left_out": left_out}, measured

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
@@ -59,6 +58,7 @@ from robomme_interference_data.files import (
 from robomme_interference_data.retrieval.encoders import Encoder, encoder_digest
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.rows import to_dict
+from robomme_interference_data.work_progress import WorkProgress
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,10 @@ import sys
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
 
 from robomme_interference_data import commands
 from robomme_interference_data.build_dataset import commands as building
-from robomme_interference_data.console import MESSAGES
+from robomme_interference_data.console import Group, say
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
@@ -21,11 +20,12 @@ from robomme_interference_data.settings import spread_values
 from robomme_interference_data.simulators import commands as simulating
 
 
-class _Root(TyperGroup):
+class _Root(Group):
     """Keeps the order of `_GROUPS`, and lets options take several values: `--conditions k0 k7`."""
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        return [name for group in _GROUPS.values() for name, _ in group]
+    @property
+    def sections(self) -> dict[str, list[str]]:
+        return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         command: Any = self
@@ -42,7 +42,7 @@ app = typer.Typer(
     cls=_Root,
     name="robomme-interference",
     no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,  # rich would take longer to load than all else
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
     epilog="""A split is a folder with demonstrations, distractor units and manifests of buffers.
@@ -80,18 +80,30 @@ _GROUPS = {
 }
 """Commands in the order in which one uses them."""
 
-for _panel, _commands in _GROUPS.items():
+for _commands in _GROUPS.values():
     for _name, _command in _commands:
         if isinstance(_command, typer.Typer):
-            app.add_typer(_command, name=_name, rich_help_panel=_panel)
+            app.add_typer(_command, name=_name)
         else:
-            app.command(name=_name, rich_help_panel=_panel)(_command)
+            app.command(name=_name)(_command)
+
+
+def _keep_lines(command: Any) -> Any:
+    """Keep the lines of fenced blocks in the help of a command and of those under it."""
+    for name in ("help", "epilog"):
+        prose, *blocks = (getattr(command, name) or "").split("```\n")
+        for number, text in enumerate(blocks):
+            prose += text if number % 2 else "\n\b\n" + text.replace("\n\n", "\n\n\b\n") + "\n"
+        setattr(command, name, prose.replace("```", "").replace("`", ""))
+    for inner in getattr(command, "commands", {}).values():
+        _keep_lines(inner)
+    return command
 
 
 def main() -> None:
     """Run the command line; known errors are shown without a traceback."""
     try:
-        app()
+        _keep_lines(typer.main.get_command(app))(prog_name="robomme-interference")
     except InterferenceError as error:
         _fail(error.message, error.hint)
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
@@ -108,7 +120,7 @@ def main() -> None:
 def _fail(message: str, hint: str | None) -> None:
     typer.secho(f"Error: {message}", fg=typer.colors.RED, err=True)
     if hint:
-        MESSAGES.print(hint)
+        say(hint)
     sys.exit(1)
 
 

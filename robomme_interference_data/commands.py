@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from robomme_interference_data.console import (
-    MESSAGES,
     AsJson,
     ConditionName,
     Picture,
@@ -16,6 +15,7 @@ from robomme_interference_data.console import (
     SplitFolder,
     SplitOption,
     print_json,
+    say,
 )
 
 
@@ -81,7 +81,7 @@ def show(
         from robomme_interference_data.strip import draw_strip
 
         draw_strip(buffer, out, camera=camera)
-        MESSAGES.print(f"{out} written")
+        say(f"{out} written")
     manifest = buffer.manifest
     if as_json:
         print_json(to_dict(manifest))

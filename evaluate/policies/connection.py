@@ -12,7 +12,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from robomme_interference_data.console import MESSAGES
+from robomme_interference_data.console import say
 from robomme_interference_data.errors import PolicyServerError, WireError
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
 
@@ -76,7 +76,7 @@ class ServerConnection:
         """
         self.close()
         told = f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"
-        with _after(_QUIET_S, lambda: MESSAGES.print(told)):
+        with _after(_QUIET_S, lambda: say(told)):
             self._connect()
 
     def _connect(self) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.console import MESSAGES
+from robomme_interference_data.console import say
 from robomme_interference_data.errors import PolicyError, PolicyServerError
 from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.registry import (
@@ -63,7 +63,7 @@ def describe_policy(
     if policy.privileged:
         metadata["privileged"] = True
         if spec.kind not in BUILTINS:
-            MESSAGES.print(
+            say(
                 f"The policy {text} is privileged: it gets the simulator itself, under every "
                 f"condition, {NO_HISTORY} too; run.json says so."
             )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.console import MESSAGES, AsJson, command_line, print_json
+from robomme_interference_data.console import AsJson, command_line, print_json, say
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.settings import with_settings
 
@@ -38,13 +38,14 @@ def score(
     from robomme_interference_data.evaluate.score.headline import headline
     from robomme_interference_data.evaluate.score.scoring import score as compute
     from robomme_interference_data.evaluate.score.scoring import write_score
+    from robomme_interference_data.work_progress import WorkProgress
 
     found = compute(settings)
     _tell([found.rows], found.notes)
-    with MESSAGES.status("Drawing the figures"):
+    with WorkProgress() as progress, progress.status("Drawing the figures"):
         exported = write_score(found, out, export_to, command_line())
     for path in exported:
-        MESSAGES.print(f"{path} written")
+        say(f"{path} written")
     if as_json:
         print_json(
             {
@@ -59,7 +60,7 @@ def score(
     else:
         for grid in found.grids:
             typer.echo(f"{grid.text()}\n")
-    MESSAGES.print(f"Report: {out / 'report.html'}")
+    say(f"Report: {out / 'report.html'}")
 
 
 def compare(
@@ -98,8 +99,8 @@ def compare(
 def _tell(found: "Sequence[Rows]", notes: Sequence[str]) -> None:
     for rows in found:
         for refusal in rows.refusals:
-            MESSAGES.print(f"left out: {refusal}")
+            say(f"left out: {refusal}")
         if rows.refused:
-            MESSAGES.print(f"{rows.refused:,} bad rows left out")
+            say(f"{rows.refused:,} bad rows left out")
     for note in notes:
-        MESSAGES.print(note)
+        say(note)

@@ -18,7 +18,6 @@ from robomme_interference_data.build_dataset.config import (
 )
 from robomme_interference_data.build_dataset.sources import Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
@@ -30,6 +29,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.execution import Serial
 from robomme_interference_data.files import LocalFiles, hold, work_folder
+from robomme_interference_data.work_progress import WorkProgress
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
 

@@ -7,8 +7,8 @@ from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.execution import Serial
+from robomme_interference_data.work_progress import WorkProgress
 
 FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 

@@ -10,13 +10,13 @@ import numpy as np
 from support.splits import QUERIES, with_sessions
 
 from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_split
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.records import place_sessions
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
 from robomme_interference_data.retrieval.select import Measured
+from robomme_interference_data.work_progress import WorkProgress
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]

@@ -46,8 +46,7 @@ ALL = dict(commands())
 def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) -> None:
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    # What is written, without the frames that are drawn around it.
-    words = [line.strip("│╭╰─╮╯ ").split("  ")[0].strip() for line in out.splitlines()]
+    words = [line.strip().split("  ")[0].removesuffix(":") for line in out.splitlines()]
     listed = [word for word in words if (word,) in ALL or word in GROUPS]
     assert listed == [
         *("Data", "doctor", "build", "verify", "audit"),

@@ -18,8 +18,8 @@ from robomme_interference_data.build_dataset.config import BuildPlan, list_episo
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.execution import Serial
+from robomme_interference_data.work_progress import WorkProgress
 
 h5py = pytest.importorskip("h5py")
 

@@ -10,13 +10,13 @@ import pytest
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
 from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.execution import Executor, Processes, Serial
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.simulators.robomme import EPISODES
+from robomme_interference_data.work_progress import WorkProgress
 
 
 def build(kind: str, config: BuildConfig) -> int:

@@ -1,0 +1,84 @@
+"""A progress bar for long work, on stderr."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Self
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+
+class _Speed(ProgressColumn):
+    def __init__(self, unit: str):
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:,.0f} {self._unit}/s" if speed else "", style="progress.data.speed")
+
+
+class WorkProgress:
+    """A progress bar on stderr; use as a context manager.
+
+    Args:
+        unit: What is counted.
+        quiet: Show nothing.
+    """
+
+    def __init__(self, *, unit: str = "frames", quiet: bool = False):
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn(unit),
+            _Speed(unit),
+            TimeRemainingColumn(),
+            console=Console(stderr=True, quiet=quiet),
+        )
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._progress.stop()
+
+    def start(self, description: str, frames: int) -> None:
+        """Begin a new bar of so many frames."""
+        self._task = self._progress.add_task(description, total=frames)
+
+    def advance(self, frames: int, *, before: bool = False) -> None:
+        """Count frames as done.
+
+        Args:
+            frames: How many.
+            before: They were done by an earlier run, and do not count for the speed.
+        """
+        if self._task is None:
+            return
+        if before:
+            task = next(task for task in self._progress.tasks if task.id == self._task)
+            self._progress.reset(self._task, completed=int(task.completed) + frames)
+        else:
+            self._progress.advance(self._task, frames)
+
+    @contextmanager
+    def status(self, description: str) -> Iterator[None]:
+        """Show a line while work of unknown length goes on."""
+        task = self._progress.add_task(description, total=None)
+        try:
+            yield
+        finally:
+            self._progress.remove_task(task)
