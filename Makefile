@@ -27,7 +27,7 @@ demo: install  ## Set up, then go the whole way on real or recorded episodes.
 	@$(BIN)/python scripts/demo.py
 
 test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.
-	@$(BIN)/pytest -n 2 --dist loadfile $(ARGS)
+	@$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: setup types  ## Lint, check the format and the types.
 	@$(BIN)/ruff check .

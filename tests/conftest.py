@@ -52,6 +52,11 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("repository")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files whose few tests take long, so that no worker is left alone with one."""
+    items.sort(key=lambda item: item.path.parent.name != "system")
+
+
 def pytest_unconfigure() -> None:
     """Remove the caches."""
     shutil.rmtree(_SCRATCH, ignore_errors=True)

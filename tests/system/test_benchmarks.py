@@ -58,11 +58,13 @@ def test_build() -> None:
     assert (rows[0]["step"], rows[0]["of bare"]) == ("bare encoder (PyAV)", "1.00")
 
 
+@pytest.mark.slow
 def test_manifests() -> None:
     (rows,) = printed("manifests", "--units", "90", "--queries", "9", "18")
     assert [(row["queries"], row["buffers"]) for row in rows] == [("9", "90"), ("18", "180")]
 
 
+@pytest.mark.slow
 def test_policies(tiny_split: Path) -> None:
     split = ("--split", tiny_split, "--episode", "MoveCube/test/0")
     feeding, decoding = printed("policies", "--lesson", "10", *split)
@@ -78,6 +80,7 @@ def test_score() -> None:
     assert {row["rows"] for row in repeats} == {"50,400"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["evaluate", "retrieval", "simulators"])
 def test_those_that_need_more_show_their_help(name: str) -> None:
     shown = run(name, "--help")

@@ -92,12 +92,19 @@ def undisturbed(tmp_path: Path) -> list[dict[str, Any]]:
     return ended(tmp_path / "undisturbed")
 
 
+@pytest.mark.parametrize(
+    "sent",
+    [
+        (signal.SIGKILL, signal.SIGTERM),
+        pytest.param((signal.SIGKILL, signal.SIGINT, signal.SIGTERM), marks=pytest.mark.slow),
+    ],
+)
 def test_the_command_may_be_killed_or_stopped_at_any_moment(
-    tmp_path: Path, undisturbed: list[dict[str, Any]]
+    tmp_path: Path, undisturbed: list[dict[str, Any]], sent: tuple[signal.Signals, ...]
 ) -> None:
     out = tmp_path / "run"
     before: dict[Any, Any] = {}
-    for already, number in ((1, signal.SIGKILL), (3, signal.SIGINT), (5, signal.SIGTERM)):
+    for already, number in zip((1, 3, 5), sent, strict=False):
         running = start(out, 0.02)
         wait_for_rows(out, already, running)
         workers = children(running.pid)
@@ -122,7 +129,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
         assert len((out / "rollouts.csv").read_text().splitlines()) == len(rows) + 1
     finish(out)
     starts = json.loads((out / "run.json").read_text())["starts"]
-    assert [one["ended"] is None for one in starts] == [True, False, False, False]
+    assert [one["ended"] is None for one in starts] == [one == signal.SIGKILL for one in (*sent, None)]
     assert ended(out) == undisturbed
 
 
