@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from robomme_interference_data.errors import (
     BuildError,
@@ -18,6 +18,9 @@ from robomme_interference_data.errors import (
     InterferenceError,
     MissingFileError,
 )
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class Files(Protocol):
@@ -130,6 +133,23 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text, lines ending alike on every system, atomically."""
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_array(path: Path, array: "NDArray[Any]") -> None:
+    """Write an array as `np.save` does, in C order.
+
+    Raises:
+        OSError: As the system says it; from `np.save`, a full disk is an error without a number.
+    """
+    import numpy as np
+
+    with path.open("wb") as file:
+        array = np.asarray(array, order="C")
+        np.lib.format.write_array_header_1_0(  # type: ignore[no-untyped-call]
+            file,
+            np.lib.format.header_data_from_array_1_0(array),  # type: ignore[no-untyped-call]
+        )
+        file.write(array.data)
 
 
 @contextmanager

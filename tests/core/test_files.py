@@ -1,10 +1,12 @@
 """Files reached through one place, written whole or not at all."""
 
+import errno
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,6 +20,7 @@ from robomme_interference_data.files import (
     hold,
     parse_sums,
     read_json,
+    write_array,
     write_json,
 )
 
@@ -142,6 +145,22 @@ def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
     for damaged in ("abc  a\n", "no sums\n", text.replace("  a", " a")):
         with pytest.raises(FormatError, match="no line of SHA-256"):
             parse_sums(damaged, "here")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("shape", [(), (0, 3), (5,), (2, 3, 4, 3)])
+def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: Any, shape: Any) -> None:
+    for dtype in (np.uint8, np.float16, np.float32):
+        array = np.ones(shape, dtype, order)
+        write_array(tmp_path / "a.npy", array)
+        np.save(tmp_path / "b.npy", np.asarray(array, order="C"))
+        assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
+
+
+def test_a_full_disk_is_told_as_the_system_does() -> None:
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_array(Path("/dev/full"), np.zeros(10**6, np.uint8))
+    assert caught.value.errno == errno.ENOSPC
 
 
 def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
