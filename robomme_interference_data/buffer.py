@@ -78,6 +78,7 @@ class Buffer:
         self._datasets = datasets
         self._cache = cache
         self._threads = threads or os.cpu_count() or 1
+        self._verified = False
 
     def __repr__(self) -> str:
         return (
@@ -250,9 +251,12 @@ class Buffer:
     def verify(self) -> None:
         """Decode everything and compare it with the manifest's SHA-256.
 
+        From then on, what a cache holds is compared too, whenever it is read.
+
         Raises:
             HashMismatchError: A session's data is not what the manifest names.
         """
+        self._verified = True
         for entry in self.manifest.sessions:
             dataset = self._datasets[entry.dataset]
             [found] = dataset.digests(entry.episode_index, entry.start, [entry.stop])
@@ -290,7 +294,7 @@ class Buffer:
             return None, None
         name = recorded[camera_feature(camera)]
         shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
-        return name, self._cache.get(name, shape)
+        return name, self._cache.get(name, shape, verify=self._verified)
 
     def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
         if self._cache is not None and name is not None:

@@ -280,7 +280,8 @@ def load_buffer(
         condition: Name of the condition, such as `k3`, one that the split has planned.
         split: A folder, or what `load_split` returned (then `cache` and `threads` are its own).
         k: Short for the condition `k<k>`, instead of `condition`.
-        verify: Decode everything now and compare it with the recorded SHA-256.
+        verify: Decode everything now and compare it with the recorded SHA-256; and later what
+            comes out of the cache.
         cache: As for `load_split`.
         threads: As for `load_split`.
 

@@ -246,6 +246,17 @@ def test_what_is_cached_is_not_decoded(tmp_path: Path, own_split: Path) -> None:
     np.testing.assert_array_equal(held_buffer.frames("front"), np.repeat(before[LESSON:], 2, 0))
 
 
+def test_what_was_verified_never_takes_other_frames_from_the_cache(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path)
+    expected = buffer("k1", cache=cache).frames()
+    made = load_split(GOLDEN, cache=cache).load(QUERIES[1], "k1", verify=True)
+    for read in (made.frames, lambda: np.concatenate([c.frames["front"] for c in made.stream(9)])):
+        for path in tmp_path.iterdir():
+            data = path.read_bytes()
+            path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        np.testing.assert_array_equal(read(), expected)
+
+
 def test_a_full_disk_does_not_stop_loading(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     made = buffer("k1", cache=DecodedCache(tmp_path / "file"))
