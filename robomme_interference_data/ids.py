@@ -11,6 +11,7 @@ from robomme_interference_data.errors import InvalidIdError, InvalidOptionError,
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
+_MOST_NUMBERS = 1_000_000
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 
 
@@ -88,7 +89,7 @@ def parse_numbers(text: str) -> tuple[int, ...]:
         The numbers, ascending, each once.
 
     Raises:
-        InvalidOptionError: The text is something else.
+        InvalidOptionError: The text is something else, or names over a million numbers.
     """
     numbers: set[int] = set()
     for part in text.split(","):
@@ -98,7 +99,13 @@ def parse_numbers(text: str) -> tuple[int, ...]:
                 f"{text!r} is not a list of episode numbers: {part.strip()!r}",
                 "Expected numbers and spans with commas between them, such as 0-49 or 0,3,10-12.",
             )
-        numbers.update(range(int(match[1]), int(match[2] or match[1]) + 1))
+        span = range(int(match[1]), int(match[2] or match[1]) + 1)
+        if len(numbers) + len(span) > _MOST_NUMBERS:
+            raise InvalidOptionError(
+                f"{text!r} is not a list of episode numbers: over {_MOST_NUMBERS:,} of them",
+                "Give the episodes that there are, such as 0-49.",
+            )
+        numbers.update(span)
     return tuple(sorted(numbers))
 
 
