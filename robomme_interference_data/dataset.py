@@ -14,6 +14,7 @@ from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
     IDENTITY_PATH,
+    INFO_PATH,
     STATE,
     SUMS_PATH,
 )
@@ -77,12 +78,21 @@ class Dataset:
 
     @cached_property
     def features(self) -> dict[str, tuple[int, ...]]:
-        """Shape of one value by feature name: cameras `(H, W, 3)`, vectors `(D,)`."""
-        return {
+        """Shape of one value by feature name: cameras `(H, W, 3)`, vectors `(D,)`.
+
+        Raises:
+            FormatError: `info.json` tells other shapes, or no states.
+        """
+        found = {
             name: self.lerobot.shape(name)
             for name, feature in self.lerobot.features.items()
             if feature["dtype"] == "video" or name in (STATE, ACTION)
         }
+        for name in (STATE, *({ACTION} & found.keys())):
+            if len(found.get(name, ())) != 1:
+                what = f"{INFO_PATH} tells no vectors {name}, but {found.get(name)}"
+                raise FormatError.damaged(self.files.describe(), what)
+        return found
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """Reach the files of a dataset, and write files so that none is ever seen half-written."""
 
+import errno
 import fcntl
 import hashlib
 import json
@@ -67,7 +68,13 @@ class LocalFiles:
                 f"{relative} in {self.root} is a link that leads out of the folder",
                 "Put the file itself there.",
             )
-        if not real.is_file():
+        try:
+            there = real.is_file()
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            raise FormatError.damaged(self.root, f"{relative[:80]!r}… is too long") from None
+        if not there:
             raise MissingFileError(
                 f"{relative} is missing in {self.root}",
                 "The folder is not a complete dataset: build it again, or point to the folder "
@@ -93,9 +100,13 @@ def check_relative(relative: str, where: str) -> str:
     """Return a relative path that stays in its folder.
 
     Raises:
-        FormatError: It is absolute or has a `..`.
+        FormatError: It is absolute or has a `..`, or no file can have such a name.
     """
     path = PurePosixPath(relative)
+    try:
+        os.fsencode(relative)
+    except UnicodeEncodeError:
+        raise FormatError.damaged(where, f"{relative!r} is no path") from None
     if path.is_absolute() or ".." in path.parts or "\0" in relative:
         raise FormatError.damaged(where, f"the path {relative!r} leads out of it")
     return relative

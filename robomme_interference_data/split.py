@@ -1,6 +1,7 @@
 """A split: datasets and the manifests that name buffers of them. Opened and loaded here."""
 
 import os
+import re
 from collections.abc import Iterator
 from functools import cached_property
 from hashlib import sha256
@@ -34,6 +35,7 @@ from robomme_interference_data.query import Query
 from robomme_interference_data.records import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import from_table, read_header
 
+_FOLDER = re.compile(r"\w[\w.-]*")
 _BATCH = 1024
 """Rows that are read at a time."""
 
@@ -54,6 +56,10 @@ class Split:
         self.header = read_header(self._manifests.path(MANIFEST_HEADER), ManifestHeader)
         if DEMONSTRATIONS not in self.header.datasets:
             raise FormatError.damaged(root / MANIFESTS / MANIFEST_HEADER, "no demonstrations")
+        for dataset in self.header.datasets:
+            if not _FOLDER.fullmatch(dataset):
+                what = f"dataset {dataset!r} is not the name of a folder"
+                raise FormatError.damaged(root / MANIFESTS / MANIFEST_HEADER, what)
 
     def __repr__(self) -> str:
         return f"Split({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
@@ -191,6 +197,10 @@ class Split:
         return map(self._buffer, self.manifests(**wanted))
 
     def _buffer(self, manifest: BufferManifest) -> Buffer:
+        for entry in manifest.sessions:
+            if entry.dataset not in self.datasets:
+                what = f"a session of {manifest} is of {entry.dataset!r}, no dataset of the split"
+                raise FormatError.damaged(self._rows.path, what)
         return Buffer(
             manifest,
             self.query(manifest.episode_id),
@@ -221,6 +231,9 @@ class Split:
         """The columns by which buffers are found; kept, as many may be asked for."""
         columns = ["episode_id", "condition", "family", "difficulty"]
         keys: dict[str, list[str | None]] = self._rows.table(columns).to_pydict()
+        for column, values in keys.items():
+            if not all(value is None or isinstance(value, str) for value in values):
+                raise FormatError.damaged(self._rows.path, f"column {column} is not text")
         return keys
 
     @cached_property

@@ -103,6 +103,12 @@ def test_a_path_never_leads_out(tmp_path: Path, relative: str) -> None:
         LocalFiles(tmp_path / "data").path(relative)
 
 
+@pytest.mark.parametrize("relative", ["a/\ud800.mp4", "x" * 5000, "x/" * 3000])
+def test_names_that_no_file_can_have(tmp_path: Path, relative: str) -> None:
+    with pytest.raises(FormatError, match="is no path|is too long"):
+        LocalFiles(tmp_path).path(relative)
+
+
 def test_links_are_followed_inside_only(tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("secret")
     root = tmp_path / "data"
