@@ -1,9 +1,10 @@
 """Episode ids, and lists of episode numbers: parse and format are inverses of each other."""
 
+import operator
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, nearest
@@ -80,6 +81,25 @@ class EpisodeId:
 
     def __lt__(self, other: "EpisodeId") -> bool:
         return self.sort_key < other.sort_key
+
+
+def whole_number(option: str, given: Any, expected: str) -> int:
+    """Return an argument that is to be a whole number, Python's or numpy's, and no boolean.
+
+    Args:
+        option: Name of the argument.
+        given: The argument.
+        expected: What it is to be, for the message.
+
+    Raises:
+        InvalidOptionError: It is none.
+    """
+    try:
+        if not isinstance(given, bool):
+            return operator.index(given)
+    except TypeError:
+        pass
+    raise InvalidOptionError.expected(option, given, expected)
 
 
 def parse_numbers(text: str) -> tuple[int, ...]:

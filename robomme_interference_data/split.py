@@ -29,7 +29,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.files import Files, LocalFiles
-from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import BufferManifest, ManifestHeader
@@ -260,17 +260,20 @@ def load_split(
     Raises:
         MissingFileError: The folder is not a split.
         FormatError: Its files are damaged, or of another format version.
-        InvalidOptionError: `cache` or `threads` is not what it may be.
+        InvalidOptionError: An argument is not what it may be.
     """
-    root = Path(split)
+    root = _folder("split", split, "a folder")
     if not (root / MANIFESTS / MANIFEST_HEADER).is_file():
         raise MissingFileError(
             f"{root} is not a split: {MANIFESTS}/{MANIFEST_HEADER} is missing",
             "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
             f"one: robomme-interference build all --source KIND:PATH --out {root}",
         )
-    if threads is not None and (type(threads) is not int or threads < 1):
-        raise InvalidOptionError.expected("threads", threads, "a number from 1, or None")
+    if threads is not None:
+        expected = "a number from 1, or None"
+        threads = whole_number("threads", threads, expected)
+        if threads < 1:
+            raise InvalidOptionError.expected("threads", threads, expected)
     return Split(root, _cache(cache), threads)
 
 
@@ -303,7 +306,8 @@ def load_buffer(
 
     Raises:
         InvalidIdError: `episode_id` or `condition` does not read as one.
-        InvalidOptionError: Neither or both of `condition` and `k` are given, or `k` is no number.
+        InvalidOptionError: Neither or both of `condition` and `k` are given, or an argument is
+            not what it may be.
         UnknownNameError: The split does not have this episode or condition; offers the nearest.
         MissingFileError: The folder is not a split, or a file of it is missing.
         FormatError: A file is damaged or of another format version.
@@ -322,14 +326,16 @@ def _condition(condition: Condition | str | None, k: int | None) -> Condition:
         )
     if k is None:
         return parse_condition(condition or "")
-    if not isinstance(k, int | np.integer) or isinstance(k, bool):
-        raise InvalidOptionError.expected("k", k, "a whole number from 0, such as 3")
-    return parse_condition(f"k{k}")
+    return parse_condition(f"k{whole_number('k', k, 'a whole number from 0, such as 3')}")
 
 
 def _cache(cache: bool | str | os.PathLike[str] | DecodedCache) -> DecodedCache | None:
     if isinstance(cache, bool | DecodedCache | None):
         return DecodedCache(default_cache_folder()) if cache is True else cache or None
-    if isinstance(cache, str | os.PathLike):
-        return DecodedCache(Path(cache))
-    raise InvalidOptionError.expected("cache", cache, "True, False, a folder or a DecodedCache")
+    return DecodedCache(_folder("cache", cache, "True, False, a folder or a DecodedCache"))
+
+
+def _folder(option: str, given: object, expected: str) -> Path:
+    if not isinstance(given, str | os.PathLike) or not str(given) or "\0" in str(given):
+        raise InvalidOptionError.expected(option, given, expected)
+    return Path(given)

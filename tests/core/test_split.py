@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from support.lerobot_layouts import edit_info
@@ -142,14 +143,21 @@ def test_episodes_that_cannot_be_loaded(
 @pytest.mark.parametrize(
     ("option", "values", "told"),
     [
-        ("cache", (3, ["x"], b"x"), "expected True, False, a folder"),
-        ("threads", (0, -3, True, "2"), "expected a number from 1"),
+        ("cache", (3, ["x"], b"x", "", "a\0b"), "expected True, False, a folder"),
+        ("threads", (0, -3, True, "2", 1.5), "expected a number from 1"),
+        ("split", (None, 3, b"g", "", "a\0b"), "expected a folder"),
     ],
 )
 def test_no_such_option(option: str, values: tuple[Any, ...], told: str) -> None:
     for value in values:
         with pytest.raises(InvalidOptionError, match=told):
-            load_split(GOLDEN, **{option: value})
+            load_split(**{"split": GOLDEN, option: value})
+
+
+def test_numbers_may_be_numpys() -> None:
+    split = load_split(GOLDEN, threads=np.int64(2))  # type: ignore[arg-type]
+    made = split.load("MoveCube/test/0", k=np.int64(1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(made.frame(np.uint8(60)), made.frames()[60])
 
 
 def test_caches_by_folder_or_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
