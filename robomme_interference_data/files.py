@@ -141,9 +141,12 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text, lines ending alike on every system, atomically."""
+    r"""Write UTF-8 text, lines ending alike on every system, atomically.
+
+    Of a file's name that is not UTF-8, its bytes are written as JSON would: `\udcff`.
+    """
     with atomic_path(path) as partial:
-        partial.write_text(text, encoding="utf-8", newline="\n")
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
 def write_array(path: Path, array: "NDArray[Any]") -> None:

@@ -71,6 +71,13 @@ def test_canonical_json(value: dict[str, Any]) -> None:
         canonical_json({"x": math.inf})
 
 
+def test_names_of_files_that_are_not_utf_8_are_written_and_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "caf\udce9.json"
+    write_json(path, {"out": str(path)})
+    assert rb"caf\udce9.json" in path.read_bytes()
+    assert read_json(path) == {"out": str(path)}
+
+
 def test_written_json_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "new" / "info.json"
     write_json(path, {"b": [1], "a": "ä"})
