@@ -81,6 +81,12 @@ def build_dataset(
     require_lerobot()
     get_codec(plan.codec)
     out = out.resolve()  # a folder cannot be given the name of a link, or "."
+    try:
+        str(out).encode()
+    except UnicodeEncodeError:
+        raise InvalidOptionError.expected(
+            "--out", str(out), "a path in UTF-8: LeRobot's writer can use no other"
+        ) from None
     with working(out) as work:
         earlier = _earlier(out, plan)
         stored = list(earlier.episodes) if earlier else []

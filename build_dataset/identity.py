@@ -39,6 +39,7 @@ from robomme_interference_data.files import (
     write_json,
     write_text,
 )
+from robomme_interference_data.parquet import open_parquet, writing
 from robomme_interference_data.records import Counts, DatasetIdentity, EpisodeRecord
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
@@ -119,7 +120,7 @@ def complete_dataset(
 def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
     """Rewrite meta/episodes as one file with our columns after LeRobot's."""
     paths = sorted((root / EPISODES_DIR).rglob("*.parquet"))
-    table = pa.concat_tables([pq.read_table(path) for path in paths]).combine_chunks()
+    table = pa.concat_tables([open_parquet(path).read() for path in paths]).combine_chunks()
     table = table.sort_by("episode_index")
     for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
         place = table.schema.get_field_index(name)
@@ -132,14 +133,15 @@ def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
     for path in paths:
         path.unlink()
     # The file is read whole: of over a hundred columns, what helps to skip rows is a burden.
-    pq.write_table(
-        table.replace_schema_metadata(None),
-        paths[0],
-        row_group_size=len(table),
-        compression="zstd",
-        write_statistics=False,
-        store_schema=False,
-    )
+    with writing(paths[0]) as file:
+        pq.write_table(
+            table.replace_schema_metadata(None),
+            file,
+            row_group_size=len(table),
+            compression="zstd",
+            write_statistics=False,
+            store_schema=False,
+        )
 
 
 def _sort_statistics(path: Path) -> None:

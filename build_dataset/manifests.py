@@ -39,12 +39,12 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.files import (
     LocalFiles,
-    atomic_path,
     sha256_file,
     working,
     write_json,
 )
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.parquet import writing
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
     BufferManifest,
@@ -255,8 +255,8 @@ def _write_rows(plan: ManifestPlan, path: Path) -> Generator[int, None, dict[str
     schema = arrow_schema(BufferManifest)
     buffers = sessions = 0
     with (
-        atomic_path(path) as partial,
-        pq.ParquetWriter(partial, schema, compression="zstd") as writer,
+        writing(path) as file,
+        pq.ParquetWriter(file, schema, compression="zstd") as writer,
     ):
         for batch in batched(planned_buffers(plan), _BATCH):
             writer.write_table(to_table(batch, schema), row_group_size=_BATCH)

@@ -25,7 +25,7 @@ from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.execution import Worker
-from robomme_interference_data.files import canonical_json, write_json
+from robomme_interference_data.files import canonical_json, write_array, write_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import read_header, to_dict
@@ -225,7 +225,7 @@ class _Writer:
         for encoder in self._encoders.values():
             encoder.close()
         for name, values in self._vectors.items():
-            np.save(self._folder / f"{name}.npy", np.stack(values))
+            write_array(self._folder / f"{name}.npy", np.stack(values))
 
     def decode(self, start: int | None) -> tuple[dict[str, str], dict[str, str]]:
         """Decode the videos; return digests over all frames, and over those before `start`."""

@@ -23,6 +23,7 @@ from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_
 from robomme_interference_data.errors import FormatError, RunFolderError, first_line
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.files import atomic_path, canonical_json, hold, write_json
+from robomme_interference_data.parquet import writing
 from robomme_interference_data.records import FINAL, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
@@ -137,10 +138,10 @@ class RunLog:
         self.rows = dict(sorted(read_record(self.folder).items()))
         table = to_table(self.rows.values(), arrow_schema(Rollout))
         parquet, text = (self.folder / name for name in RUN_TABLES)
-        with atomic_path(parquet) as partial:
-            pq.write_table(table, partial, compression="zstd")
-        with atomic_path(text) as partial:
-            pa_csv.write_csv(table, partial)
+        with writing(parquet) as file:
+            pq.write_table(table, file, compression="zstd")
+        with writing(text) as file:
+            pa_csv.write_csv(table, file)
         self._write_header(header.standing(self.rows))
 
     def _write_header(self, header: RunHeader) -> None:

@@ -52,6 +52,7 @@ from robomme_interference_data.files import (
     sha256_file,
     work_folder,
     working,
+    write_array,
     write_json,
     write_text,
 )
@@ -223,8 +224,8 @@ class _Work:
                     f"encoder {self.encoder.name!r} gave values that are not finite for {about}",
                     "Its weights may be damaged, or its precision too low: try --device cpu",
                 )
-            with atomic_path(self.features[outcome.task]) as partial, partial.open("wb") as file:
-                np.save(file, outcome.value)
+            with atomic_path(self.features[outcome.task]) as partial:
+                write_array(partial, outcome.value)
             progress.advance(len(outcome.value))
         return sum(self.lengths[episode] for episode in missing)
 
@@ -239,14 +240,14 @@ class _Work:
         for name, path in zip(names, self.features, strict=True):
             (made / name).parent.mkdir(parents=True, exist_ok=True)
             embeddings = normalised(np.load(path), centre)
-            np.save(made / name, embeddings)
+            write_array(made / name, embeddings)
         if pool:
             typical = pool.header.typical_cosine
         else:
             typical = typical_cosine(len(names), lambda episode: np.load(made / names[episode]))
         if centre is not None:
             names.append(CENTRE_FILE)
-            np.save(made / CENTRE_FILE, centre)
+            write_array(made / CENTRE_FILE, centre)
         write_text(made / INDEX_SUMS, format_sums(made, names))
         digest = encoder_digest(encoder, centre)
         header = IndexHeader(

@@ -2,7 +2,7 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +21,7 @@ from robomme_interference_data.errors import (
     StaleIndexError,
     UnknownNameError,
 )
-from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
     BufferManifest,
@@ -78,6 +78,7 @@ class Buffer:
         self._datasets = datasets
         self._cache = cache
         self._threads = threads or os.cpu_count() or 1
+        self._verified = False
 
     def __repr__(self) -> str:
         return (
@@ -160,10 +161,12 @@ class Buffer:
             camera: As for `frames`.
 
         Raises:
+            InvalidOptionError: `index` is no whole number.
             UnknownNameError: There is no such frame or camera.
             MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
         """
-        self._check_span(index, index + 1)
+        index = whole_number("index", index, "a whole number from 0, such as 3")
+        self._check_inside(f"frame {index} is", index, index + 1)
         session = self.sessions[bisect_right(self.sessions, index, key=lambda s: s.start) - 1]
         entry = session.entry
         stored = entry.start + (index - session.start) // entry.repeat
@@ -174,7 +177,7 @@ class Buffer:
     def stream(
         self,
         chunk: int = 64,
-        cameras: tuple[str, ...] | None = None,
+        cameras: Sequence[str] | None = None,
         start: int = 0,
         stop: int | None = None,
     ) -> Generator[Chunk]:
@@ -189,15 +192,20 @@ class Buffer:
             stop: Frame after its last one; None for the buffer's end.
 
         Raises:
-            InvalidOptionError: `chunk` is not positive.
+            InvalidOptionError: `chunk` is not positive, or an argument of another type.
             UnknownNameError: The span is not inside the buffer, or there is no such camera.
             MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
         """
+        expected = "a whole number from 1"
+        chunk = whole_number("chunk", chunk, expected)
         if chunk < 1:
-            raise InvalidOptionError.expected("chunk", chunk, "1 or more")
-        end = len(self) if stop is None else stop
-        self._check_span(start, end)
-        wanted = self.cameras if cameras is None else cameras
+            raise InvalidOptionError.expected("chunk", chunk, expected)
+        start = whole_number("start", start, "a whole number from 0")
+        end = whole_number("stop", len(self) if stop is None else stop, "a whole number, or None")
+        self._check_inside(f"start {start} and stop {end} are", start, end)
+        if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
+            raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
+        wanted = self.cameras if cameras is None else tuple(cameras)
         shapes = {name: self.query.dataset.shape(name) for name in wanted}
         decoders = {name: self._iter_frames(name, start, end) for name in wanted}
         session_index = self.session_index
@@ -250,9 +258,12 @@ class Buffer:
     def verify(self) -> None:
         """Decode everything and compare it with the manifest's SHA-256.
 
+        From then on, what a cache holds is compared too, whenever it is read.
+
         Raises:
             HashMismatchError: A session's data is not what the manifest names.
         """
+        self._verified = True
         for entry in self.manifest.sessions:
             dataset = self._datasets[entry.dataset]
             [found] = dataset.digests(entry.episode_index, entry.start, [entry.stop])
@@ -269,11 +280,11 @@ class Buffer:
                 "then run robomme-interference verify SPLIT",
             )
 
-    def _check_span(self, start: int, stop: int) -> None:
+    def _check_inside(self, given: str, start: int, stop: int) -> None:
         if not 0 <= start <= stop <= len(self):
             raise UnknownNameError(
-                f"frames {start} to {stop - 1} are not in the buffer of {self.manifest}, which has "
-                f"{len(self)} history frames, numbered from 0"
+                f"{given} not in the buffer of {self.manifest}, which has {len(self)} history "
+                "frames, numbered from 0"
             )
 
     def _recorded(self, entry: SessionEntry) -> dict[str, str] | None:
@@ -290,7 +301,7 @@ class Buffer:
             return None, None
         name = recorded[camera_feature(camera)]
         shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
-        return name, self._cache.get(name, shape)
+        return name, self._cache.get(name, shape, verify=self._verified)
 
     def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
         if self._cache is not None and name is not None:

@@ -1,6 +1,7 @@
 """A cache of decoded frames: memory-mappable arrays by content hash, bounded in size."""
 
 import os
+import re
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,9 +11,11 @@ from tokenize import TokenError
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.files import atomic_path
+from robomme_interference_data.files import atomic_path, write_array
 
+_OWN = re.compile(r"[0-9a-f]{64}\.npy")
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
 
 _told: set[Path] = set()
@@ -29,13 +32,14 @@ def default_cache_folder() -> Path:
 class DecodedCache:
     """Decoded frames of sessions, one `.npy` file each, named by the SHA-256 of the frames.
 
-    Files that were not used for longest are removed when the folder outgrows its bound. Several
+    Files that were not used for longest are removed when they outgrow the bound; files of other
+    names are left alone. Several
     processes may share a folder: files appear whole, and one that vanishes is decoded again. Where
     nothing can be written, as on a full disk, it says so once, and keeps nothing.
 
     Args:
         folder: Where the arrays lie; made when first written to.
-        max_bytes: Bound on the folder's size, in bytes.
+        max_bytes: Bound on the size of all arrays, in bytes.
 
     Raises:
         InvalidOptionError: The bound is not positive.
@@ -48,12 +52,16 @@ class DecodedCache:
         if self.max_bytes <= 0:
             raise InvalidOptionError(f"cache bound of {self.max_bytes} bytes is not positive")
 
-    def get(self, sha256: str, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+    def get(
+        self, sha256: str, shape: tuple[int, ...], *, verify: bool = False
+    ) -> NDArray[np.uint8] | None:
         """Return cached frames as a read-only memory map, or None.
 
         Args:
             sha256: Digest of the frames.
             shape: Expected shape, `(T, H, W, 3)`; a file of another one counts as absent.
+            verify: Compare the frames with the digest; others count as absent. Not the default:
+                it takes longer than reading them.
         """
         path = self._path(sha256)
         try:
@@ -62,15 +70,17 @@ class DecodedCache:
             return None
         with suppress(OSError):  # a folder that only others may write
             os.utime(path)
-        return frames if frames.shape == shape and frames.dtype == np.uint8 else None
+        if frames.shape != shape or frames.dtype != np.uint8:
+            return None
+        return None if verify and _sha256(frames) != sha256 else frames
 
     def put(self, sha256: str, frames: NDArray[np.uint8]) -> None:
         """Store frames, unless they alone exceed the bound, and remove the least used ones."""
         if frames.nbytes + _HEADER > self.max_bytes:
             return
         try:
-            with atomic_path(self._path(sha256)) as partial, partial.open("wb") as file:
-                np.save(file, frames)
+            with atomic_path(self._path(sha256)) as partial:
+                write_array(partial, frames)
             self._shrink()
         except OSError as error:
             if self.folder not in _told:
@@ -86,12 +96,19 @@ class DecodedCache:
 
     def _shrink(self) -> None:
         files = []
-        for path in self.folder.glob("*.npy"):
-            with suppress(FileNotFoundError):  # removed by another process
-                files.append((path, path.stat()))
+        for path in self.folder.iterdir():
+            if _OWN.fullmatch(path.name):
+                with suppress(FileNotFoundError):  # removed by another process
+                    files.append((path, path.stat()))
         size = sum(stat.st_size for _, stat in files)
         for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
             if size <= self.max_bytes:
                 return
             path.unlink(missing_ok=True)
             size -= stat.st_size
+
+
+def _sha256(frames: NDArray[np.uint8]) -> str:
+    digests = FeatureDigests()
+    digests.update("frames", frames)
+    return digests.current()["frames"]

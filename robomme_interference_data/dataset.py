@@ -14,12 +14,18 @@ from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
     IDENTITY_PATH,
+    INFO_PATH,
     STATE,
     SUMS_PATH,
 )
 from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.embeddings import EmbeddingIndex
-from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidOptionError,
+    MissingFileError,
+    UnknownNameError,
+)
 from robomme_interference_data.files import Files, parse_sums, sha256_file
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
@@ -28,7 +34,13 @@ from robomme_interference_data.rows import from_dict, read_header
 
 
 def camera_feature(camera: str) -> str:
-    """Return the feature name of a camera, whether `observation.images.` is given or not."""
+    """Return the feature name of a camera, whether `observation.images.` is given or not.
+
+    Raises:
+        InvalidOptionError: What is given is no text.
+    """
+    if not isinstance(camera, str):
+        raise InvalidOptionError.expected("camera", camera, "the name of one, such as 'front'")
     return CAMERA_PREFIX + camera.removeprefix(CAMERA_PREFIX)
 
 
@@ -77,12 +89,21 @@ class Dataset:
 
     @cached_property
     def features(self) -> dict[str, tuple[int, ...]]:
-        """Shape of one value by feature name: cameras `(H, W, 3)`, vectors `(D,)`."""
-        return {
+        """Shape of one value by feature name: cameras `(H, W, 3)`, vectors `(D,)`.
+
+        Raises:
+            FormatError: `info.json` tells other shapes, or no states.
+        """
+        found = {
             name: self.lerobot.shape(name)
             for name, feature in self.lerobot.features.items()
             if feature["dtype"] == "video" or name in (STATE, ACTION)
         }
+        for name in (STATE, *({ACTION} & found.keys())):
+            if len(found.get(name, ())) != 1:
+                what = f"{INFO_PATH} tells no vectors {name}, but {found.get(name)}"
+                raise FormatError.damaged(self.files.describe(), what)
+        return found
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
@@ -150,7 +171,9 @@ class Dataset:
             StaleIndexError: They were made of other data, or with another encoder.
             FormatError: They are of an unknown version, or damaged.
         """
-        key = encoder, camera
+        if not isinstance(encoder, str):
+            raise InvalidOptionError.expected("encoder", encoder, "its name, such as 'thumbnail'")
+        key = encoder, camera_feature(camera)
         if key not in self._indexes:
             self._indexes[key] = EmbeddingIndex(self.files, self.revision, encoder, camera)
         return self._indexes[key]

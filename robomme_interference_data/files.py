@@ -1,5 +1,6 @@
 """Reach the files of a dataset, and write files so that none is ever seen half-written."""
 
+import errno
 import fcntl
 import hashlib
 import json
@@ -10,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from robomme_interference_data.errors import (
     BuildError,
@@ -18,6 +19,9 @@ from robomme_interference_data.errors import (
     InterferenceError,
     MissingFileError,
 )
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class Files(Protocol):
@@ -64,7 +68,13 @@ class LocalFiles:
                 f"{relative} in {self.root} is a link that leads out of the folder",
                 "Put the file itself there.",
             )
-        if not real.is_file():
+        try:
+            there = real.is_file()
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            raise FormatError.damaged(self.root, f"{relative[:80]!r}… is too long") from None
+        if not there:
             raise MissingFileError(
                 f"{relative} is missing in {self.root}",
                 "The folder is not a complete dataset: build it again, or point to the folder "
@@ -90,9 +100,13 @@ def check_relative(relative: str, where: str) -> str:
     """Return a relative path that stays in its folder.
 
     Raises:
-        FormatError: It is absolute or has a `..`.
+        FormatError: It is absolute or has a `..`, or no file can have such a name.
     """
     path = PurePosixPath(relative)
+    try:
+        os.fsencode(relative)
+    except UnicodeEncodeError:
+        raise FormatError.damaged(where, f"{relative!r} is no path") from None
     if path.is_absolute() or ".." in path.parts or "\0" in relative:
         raise FormatError.damaged(where, f"the path {relative!r} leads out of it")
     return relative
@@ -127,9 +141,29 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text, lines ending alike on every system, atomically."""
+    r"""Write UTF-8 text, lines ending alike on every system, atomically.
+
+    Of a file's name that is not UTF-8, its bytes are written as JSON would: `\udcff`.
+    """
     with atomic_path(path) as partial:
-        partial.write_text(text, encoding="utf-8", newline="\n")
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
+
+
+def write_array(path: Path, array: "NDArray[Any]") -> None:
+    """Write an array as `np.save` does, in C order.
+
+    Raises:
+        OSError: As the system says it; from `np.save`, a full disk is an error without a number.
+    """
+    import numpy as np
+
+    with path.open("wb") as file:
+        array = np.asarray(array, order="C")
+        np.lib.format.write_array_header_1_0(  # type: ignore[no-untyped-call]
+            file,
+            np.lib.format.header_data_from_array_1_0(array),  # type: ignore[no-untyped-call]
+        )
+        file.write(array.data)
 
 
 @contextmanager

@@ -1,9 +1,10 @@
 """Episode ids, and lists of episode numbers: parse and format are inverses of each other."""
 
+import operator
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, nearest
@@ -11,6 +12,7 @@ from robomme_interference_data.errors import InvalidIdError, InvalidOptionError,
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 _INDEX = re.compile(r"0|[1-9][0-9]{0,17}")  # fits the int64 of the tables
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
+_MOST_NUMBERS = 1_000_000
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 
 
@@ -81,6 +83,25 @@ class EpisodeId:
         return self.sort_key < other.sort_key
 
 
+def whole_number(option: str, given: Any, expected: str) -> int:
+    """Return an argument that is to be a whole number, Python's or numpy's, and no boolean.
+
+    Args:
+        option: Name of the argument.
+        given: The argument.
+        expected: What it is to be, for the message.
+
+    Raises:
+        InvalidOptionError: It is none.
+    """
+    try:
+        if not isinstance(given, bool):
+            return operator.index(given)
+    except TypeError:
+        pass
+    raise InvalidOptionError.expected(option, given, expected)
+
+
 def parse_numbers(text: str) -> tuple[int, ...]:
     """Read episode numbers such as `0-49` or `0,3,10-12`; both ends are included.
 
@@ -88,7 +109,7 @@ def parse_numbers(text: str) -> tuple[int, ...]:
         The numbers, ascending, each once.
 
     Raises:
-        InvalidOptionError: The text is something else.
+        InvalidOptionError: The text is something else, or names over a million numbers.
     """
     numbers: set[int] = set()
     for part in text.split(","):
@@ -98,7 +119,13 @@ def parse_numbers(text: str) -> tuple[int, ...]:
                 f"{text!r} is not a list of episode numbers: {part.strip()!r}",
                 "Expected numbers and spans with commas between them, such as 0-49 or 0,3,10-12.",
             )
-        numbers.update(range(int(match[1]), int(match[2] or match[1]) + 1))
+        span = range(int(match[1]), int(match[2] or match[1]) + 1)
+        if len(numbers) + len(span) > _MOST_NUMBERS:
+            raise InvalidOptionError(
+                f"{text!r} is not a list of episode numbers: over {_MOST_NUMBERS:,} of them",
+                "Give the episodes that there are, such as 0-49.",
+            )
+        numbers.update(span)
     return tuple(sorted(numbers))
 
 

@@ -77,11 +77,19 @@ class LeRobotFiles:
         return dict(self.info["features"])
 
     def shape(self, column: str) -> tuple[int, ...]:
-        """Return the shape of a column's values; of a camera `(H, W, 3)`, however it is told."""
+        """Return the shape of a column's values; of a camera `(H, W, 3)`, however it is told.
+
+        Raises:
+            FormatError: That of a camera is neither `(H, W, 3)` nor `(3, H, W)`.
+        """
         feature = self.info["features"][column]
         shape = tuple(feature["shape"])
-        if feature["dtype"] in ("video", "image") and len(shape) == 3 and shape[2] != 3:
-            shape = (*shape[1:], shape[0])
+        if feature["dtype"] in ("video", "image"):
+            if len(shape) == 3 and shape[2] != 3:
+                shape = (*shape[1:], shape[0])
+            if len(shape) != 3 or shape[2] != 3:
+                what = f"{INFO_PATH} says that {column} has shape {feature['shape']}"
+                raise FormatError.damaged(self.files.describe(), what)
         return shape
 
     def __len__(self) -> int:

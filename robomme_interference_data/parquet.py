@@ -1,4 +1,4 @@
-"""Read parquet files: spans of rows, values out of columns, and one clear error for damage.
+"""Read parquet files: spans of rows, values out of columns, and one clear error for damage; write.
 
 `pyarrow.parquet.read_table` with filters is left aside: its scanner takes seconds to load, and
 can wait forever on a damaged file.
@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, InterferenceError
+from robomme_interference_data.files import atomic_path
 
 _IMAGES_AT_ONCE = 8
 
@@ -45,6 +47,13 @@ def open_parquet(path: Path) -> pq.ParquetFile:
     with reading(path):
         # Bytes, as pyarrow cannot encode names that are not UTF-8.
         return pq.ParquetFile(pa.OSFile(os.fsencode(path)), buffer_size=1 << 20)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for pyarrow to write, whole or not at all: it cannot encode every name itself."""
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        yield file
 
 
 def is_listed(kind: pa.DataType) -> bool:

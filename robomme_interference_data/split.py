@@ -1,6 +1,7 @@
 """A split: datasets and the manifests that name buffers of them. Opened and loaded here."""
 
 import os
+import re
 from collections.abc import Iterator
 from functools import cached_property
 from hashlib import sha256
@@ -28,12 +29,13 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.files import Files, LocalFiles
-from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import from_table, read_header
 
+_FOLDER = re.compile(r"\w[\w.-]*")
 _BATCH = 1024
 """Rows that are read at a time."""
 
@@ -54,6 +56,10 @@ class Split:
         self.header = read_header(self._manifests.path(MANIFEST_HEADER), ManifestHeader)
         if DEMONSTRATIONS not in self.header.datasets:
             raise FormatError.damaged(root / MANIFESTS / MANIFEST_HEADER, "no demonstrations")
+        for dataset in self.header.datasets:
+            if not _FOLDER.fullmatch(dataset):
+                what = f"dataset {dataset!r} is not the name of a folder"
+                raise FormatError.damaged(root / MANIFESTS / MANIFEST_HEADER, what)
 
     def __repr__(self) -> str:
         return f"Split({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
@@ -191,6 +197,10 @@ class Split:
         return map(self._buffer, self.manifests(**wanted))
 
     def _buffer(self, manifest: BufferManifest) -> Buffer:
+        for entry in manifest.sessions:
+            if entry.dataset not in self.datasets:
+                what = f"a session of {manifest} is of {entry.dataset!r}, no dataset of the split"
+                raise FormatError.damaged(self._rows.path, what)
         return Buffer(
             manifest,
             self.query(manifest.episode_id),
@@ -221,6 +231,9 @@ class Split:
         """The columns by which buffers are found; kept, as many may be asked for."""
         columns = ["episode_id", "condition", "family", "difficulty"]
         keys: dict[str, list[str | None]] = self._rows.table(columns).to_pydict()
+        for column, values in keys.items():
+            if not all(value is None or isinstance(value, str) for value in values):
+                raise FormatError.damaged(self._rows.path, f"column {column} is not text")
         return keys
 
     @cached_property
@@ -247,17 +260,20 @@ def load_split(
     Raises:
         MissingFileError: The folder is not a split.
         FormatError: Its files are damaged, or of another format version.
-        InvalidOptionError: `cache` or `threads` is not what it may be.
+        InvalidOptionError: An argument is not what it may be.
     """
-    root = Path(split)
+    root = _folder("split", split, "a folder")
     if not (root / MANIFESTS / MANIFEST_HEADER).is_file():
         raise MissingFileError(
             f"{root} is not a split: {MANIFESTS}/{MANIFEST_HEADER} is missing",
             "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
             f"one: robomme-interference build all --source KIND:PATH --out {root}",
         )
-    if threads is not None and (type(threads) is not int or threads < 1):
-        raise InvalidOptionError.expected("threads", threads, "a number from 1, or None")
+    if threads is not None:
+        expected = "a number from 1, or None"
+        threads = whole_number("threads", threads, expected)
+        if threads < 1:
+            raise InvalidOptionError.expected("threads", threads, expected)
     return Split(root, _cache(cache), threads)
 
 
@@ -280,7 +296,8 @@ def load_buffer(
         condition: Name of the condition, such as `k3`, one that the split has planned.
         split: A folder, or what `load_split` returned (then `cache` and `threads` are its own).
         k: Short for the condition `k<k>`, instead of `condition`.
-        verify: Decode everything now and compare it with the recorded SHA-256.
+        verify: Decode everything now and compare it with the recorded SHA-256; and later what
+            comes out of the cache.
         cache: As for `load_split`.
         threads: As for `load_split`.
 
@@ -289,7 +306,8 @@ def load_buffer(
 
     Raises:
         InvalidIdError: `episode_id` or `condition` does not read as one.
-        InvalidOptionError: Neither or both of `condition` and `k` are given, or `k` is no number.
+        InvalidOptionError: Neither or both of `condition` and `k` are given, or an argument is
+            not what it may be.
         UnknownNameError: The split does not have this episode or condition; offers the nearest.
         MissingFileError: The folder is not a split, or a file of it is missing.
         FormatError: A file is damaged or of another format version.
@@ -308,14 +326,16 @@ def _condition(condition: Condition | str | None, k: int | None) -> Condition:
         )
     if k is None:
         return parse_condition(condition or "")
-    if not isinstance(k, int | np.integer) or isinstance(k, bool):
-        raise InvalidOptionError.expected("k", k, "a whole number from 0, such as 3")
-    return parse_condition(f"k{k}")
+    return parse_condition(f"k{whole_number('k', k, 'a whole number from 0, such as 3')}")
 
 
 def _cache(cache: bool | str | os.PathLike[str] | DecodedCache) -> DecodedCache | None:
     if isinstance(cache, bool | DecodedCache | None):
         return DecodedCache(default_cache_folder()) if cache is True else cache or None
-    if isinstance(cache, str | os.PathLike):
-        return DecodedCache(Path(cache))
-    raise InvalidOptionError.expected("cache", cache, "True, False, a folder or a DecodedCache")
+    return DecodedCache(_folder("cache", cache, "True, False, a folder or a DecodedCache"))
+
+
+def _folder(option: str, given: object, expected: str) -> Path:
+    if not isinstance(given, str | os.PathLike) or not str(given) or "\0" in str(given):
+        raise InvalidOptionError.expected(option, given, expected)
+    return Path(given)

@@ -59,7 +59,7 @@ def export(rows: Rows, folder: Path) -> list[Path]:
             written.append(folder / f"{system}-{simulator}_rollouts.csv")
             with (
                 atomic_path(written[-1]) as partial,
-                partial.open("w", newline="", encoding="utf-8") as file,
+                partial.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
             ):
                 writer = csv.writer(file)  # with CRLF, as released
                 writer.writerow(names)

@@ -123,7 +123,7 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
 
 
 def _address(video: Path, folder: Path) -> str:
-    return quote(Path(os.path.relpath(video, folder)).as_posix())
+    return quote(os.fsencode(os.path.relpath(video, folder)))  # not all names are UTF-8
 
 
 def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:

@@ -179,6 +179,12 @@ def test_what_else_may_be_in_the_way(tmp_path: Path) -> None:
         build(tmp_path / "out", source)
 
 
+def test_no_dataset_under_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptionError, match="a path in UTF-8"):
+        build(tmp_path / "caf\udce9" / "out", MadeUpSource(TRAIN))
+    assert not any(tmp_path.iterdir())
+
+
 def test_nothing_to_store(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no episode yields distractors: 2 unusable"):
         build(tmp_path / "out", MadeUpSource({"A/train/0": (9, None), "B/train/0": (8, None)}))

@@ -44,8 +44,9 @@ def made_up(root: Path, *, queries: Any = None, units: Any = None) -> Path:
     return root
 
 
-def test_the_golden_manifests_come_out_again(tmp_path: Path) -> None:
-    root = copy_split(tmp_path / "split")
+@pytest.mark.parametrize("name", ["split", "not-utf-8-\udcff"])
+def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
+    root = copy_split(tmp_path / name)
     assert sum(write_manifests(plan_manifests(root, tuple(reversed(CONDITIONS))), root)) == 15
     assert contents(root) == contents(GOLDEN)
 

@@ -108,6 +108,21 @@ def test_missing_and_cut_files(own_split: Path, path: str) -> None:
     expect(own_split, "missing", decode=path == VIDEO)
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('"observation.state": {', '"state": {'),
+        ("/chunk-{chunk_index:03d}", "x" * 5000),
+        ("/chunk-{chunk_index:03d}", "\\ud800"),
+    ],
+)
+def test_info_that_is_wrong(own_split: Path, before: str, after: str) -> None:
+    info = own_split / "distractors" / "meta" / "info.json"
+    assert before in info.read_text()
+    info.write_text(info.read_text().replace(before, after))
+    expect(own_split, "info.json: does not have", "observation.state|is too long|is no path")
+
+
 @pytest.mark.parametrize("path", ["data/x.parquet", "videos/extra.mp4", "meta/more.json"])
 def test_a_file_too_many(own_split: Path, path: str) -> None:
     (own_split / "distractors" / path).write_text("?")

@@ -1,8 +1,10 @@
 """Buffers: the very frames of their sessions in order, however they are asked for."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,13 +150,49 @@ def test_spans_and_single_frames_are_inside(span: tuple[int, int]) -> None:
     with pytest.raises(UnknownNameError, match="has 144 history frames"):
         next(buffer().stream(8, None, *span))
     for index in (-1, 144):
-        with pytest.raises(UnknownNameError, match="not in the buffer of MoveCube/test/0 under k3"):
+        told = f"frame {index} is not in the buffer of MoveCube/test/0 under k3"
+        with pytest.raises(UnknownNameError, match=told):
             buffer().frame(index)
+
+
+@pytest.mark.parametrize(
+    ("use", "told"),
+    [
+        (lambda made, wrong: made.frame(wrong), "index {}; expected a whole number"),
+        (lambda made, wrong: next(made.stream(wrong)), "chunk {}; expected a whole number"),
+        (lambda made, wrong: next(made.stream(8, None, wrong)), "start {}; expected a whole"),
+        (lambda made, wrong: next(made.stream(8, None, 0, wrong)), "stop {}; expected a whole"),
+    ],
+)
+@pytest.mark.parametrize("wrong", [1.5, True, "1", [1]])
+def test_numbers_are_whole(use: Callable[[Buffer, Any], object], told: str, wrong: object) -> None:
+    with pytest.raises(InvalidOptionError, match=re.escape(told.format(repr(wrong)))):
+        use(buffer(), wrong)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda made: made.frames(None),
+        lambda made: made.frames(3),
+        lambda made: made.frame(0, ["front"]),
+        lambda made: next(made.stream(8, "front")),
+        lambda made: next(made.stream(8, 3)),
+        lambda made: next(made.stream(8, [3])),
+        lambda made: made.query.frame(b"front"),
+        lambda made: made.embeddings(3),
+        lambda made: made.embeddings(["thumbnail"]),
+        lambda made: made.query.embedding("thumbnail", None),
+    ],
+)
+def test_cameras_and_encoders_are_names(use: Callable[[Any], object]) -> None:
+    with pytest.raises(InvalidOptionError, match="^(camera|cameras|encoder) .*; expected"):
+        use(buffer())
 
 
 @pytest.mark.parametrize("chunk", [0, -1])
 def test_chunk_must_be_positive(chunk: int) -> None:
-    with pytest.raises(InvalidOptionError, match=f"chunk {chunk}; expected 1 or more"):
+    with pytest.raises(InvalidOptionError, match=f"chunk {chunk}; expected a whole number from 1"):
         next(buffer().stream(chunk))
 
 
@@ -244,6 +282,17 @@ def test_what_is_cached_is_not_decoded(tmp_path: Path, own_split: Path) -> None:
         cache=DecodedCache(tmp_path / "cache"),
     )
     np.testing.assert_array_equal(held_buffer.frames("front"), np.repeat(before[LESSON:], 2, 0))
+
+
+def test_what_was_verified_never_takes_other_frames_from_the_cache(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path)
+    expected = buffer("k1", cache=cache).frames()
+    made = load_split(GOLDEN, cache=cache).load(QUERIES[1], "k1", verify=True)
+    for read in (made.frames, lambda: np.concatenate([c.frames["front"] for c in made.stream(9)])):
+        for path in tmp_path.iterdir():
+            data = path.read_bytes()
+            path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        np.testing.assert_array_equal(read(), expected)
 
 
 def test_a_full_disk_does_not_stop_loading(tmp_path: Path) -> None:

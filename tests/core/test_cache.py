@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,24 @@ def test_the_bound_holds_after_every_put(tmp_path: Path, bound: int) -> None:
         assert sizes == [FILE_BYTES] * min(seed + 1, bound // FILE_BYTES)
     DecodedCache(tmp_path / "smaller", FILE_BYTES - 1).put(name(1), frames(1))
     assert not (tmp_path / "smaller").exists()
+
+
+def test_files_of_others_stay(tmp_path: Path) -> None:
+    cache = DecodedCache(tmp_path, max_bytes=FILE_BYTES)
+    own = [tmp_path / "mine.npy", tmp_path / f"{name(1)}.npz", tmp_path / f"{name(1)[:-1]}.npy"]
+    for path in own:
+        path.write_bytes(bytes(2 * FILE_BYTES))
+        os.utime(path, (0, 0))
+    cache.put(name(1), frames(1))
+    assert sorted(tmp_path.iterdir()) == sorted([*own, tmp_path / f"{name(1)}.npy"])
+
+
+def test_with_verify_other_frames_count_as_absent(tmp_path: Path) -> None:
+    cache, right = DecodedCache(tmp_path), sha256(frames(1).tobytes()).hexdigest()
+    for seed, found in ((1, True), (2, False), (1, True)):
+        cache.put(right, frames(seed))
+        assert cache.get(right, SHAPE) is not None
+        assert (cache.get(right, SHAPE, verify=True) is not None) == found
 
 
 @pytest.mark.parametrize("bound", [0, -1])

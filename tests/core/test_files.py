@@ -1,10 +1,12 @@
 """Files reached through one place, written whole or not at all."""
 
+import errno
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,6 +20,7 @@ from robomme_interference_data.files import (
     hold,
     parse_sums,
     read_json,
+    write_array,
     write_json,
 )
 
@@ -68,6 +71,13 @@ def test_canonical_json(value: dict[str, Any]) -> None:
         canonical_json({"x": math.inf})
 
 
+def test_names_of_files_that_are_not_utf_8_are_written_and_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "caf\udce9.json"
+    write_json(path, {"out": str(path)})
+    assert rb"caf\udce9.json" in path.read_bytes()
+    assert read_json(path) == {"out": str(path)}
+
+
 def test_written_json_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "new" / "info.json"
     write_json(path, {"b": [1], "a": "ä"})
@@ -98,6 +108,12 @@ def test_a_path_never_leads_out(tmp_path: Path, relative: str) -> None:
     (tmp_path / "data").mkdir()
     with pytest.raises(FormatError, match="leads out of it"):
         LocalFiles(tmp_path / "data").path(relative)
+
+
+@pytest.mark.parametrize("relative", ["a/\ud800.mp4", "x" * 5000, "x/" * 3000])
+def test_names_that_no_file_can_have(tmp_path: Path, relative: str) -> None:
+    with pytest.raises(FormatError, match="is no path|is too long"):
+        LocalFiles(tmp_path).path(relative)
 
 
 def test_links_are_followed_inside_only(tmp_path: Path) -> None:
@@ -142,6 +158,22 @@ def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
     for damaged in ("abc  a\n", "no sums\n", text.replace("  a", " a")):
         with pytest.raises(FormatError, match="no line of SHA-256"):
             parse_sums(damaged, "here")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("shape", [(), (0, 3), (5,), (2, 3, 4, 3)])
+def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: Any, shape: Any) -> None:
+    for dtype in (np.uint8, np.float16, np.float32):
+        array = np.ones(shape, dtype, order)
+        write_array(tmp_path / "a.npy", array)
+        np.save(tmp_path / "b.npy", np.asarray(array, order="C"))
+        assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
+
+
+def test_a_full_disk_is_told_as_the_system_does() -> None:
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_array(Path("/dev/full"), np.zeros(10**6, np.uint8))
+    assert caught.value.errno == errno.ENOSPC
 
 
 def test_a_lock_is_held_by_one(tmp_path: Path) -> None:

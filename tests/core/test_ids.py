@@ -74,7 +74,9 @@ def test_numbers(text: str, numbers: tuple[int, ...]) -> None:
     assert parse_numbers(text) == numbers
 
 
-@pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1,,2", "1 2", "1.5", "1-2-3"])
+@pytest.mark.parametrize(
+    "text", ["", "a", "3-1", "1-", "-1", "1,,2", "1 2", "1.5", "1-2-3", "0-99999999", "0-1000000"]
+)
 def test_what_is_no_list_of_numbers(text: str) -> None:
     with pytest.raises(InvalidOptionError, match="not a list of episode numbers"):
         parse_numbers(text)

@@ -125,6 +125,8 @@ def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
         ("../../etc/passwd", "leads out of it"),
         ("/etc/passwd", "leads out of it"),
         ("videos/../../outside.mkv", "leads out of it"),
+        ("videos/\ud800.mkv", "is no path"),
+        ("x" * 5000, "is too long"),
         ("linked.mkv", "is a link that leads out of the folder"),
     ],
 )
@@ -160,7 +162,7 @@ INFO = {
 }
 FEATURE = {
     "dtype": (None,),
-    "shape": (None, [100_000, 100_000, 3], [-16, 24, 3], [32, 24, 3]),
+    "shape": (None, [100_000, 100_000, 3], [-16, 24, 3], [32, 24, 3], [256], [32, 24, 1]),
     "info": ("ffv1",),
 }
 

@@ -1,5 +1,6 @@
 """Splits: list, filter and load; what is missing, damaged or of other types is told."""
 
+import json
 import pickle
 import shutil
 import subprocess
@@ -8,8 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.lerobot_layouts import edit_info
 from support.splits import CONDITIONS, GOLDEN, QUERIES
 
 from robomme_interference_data import (
@@ -140,14 +143,21 @@ def test_episodes_that_cannot_be_loaded(
 @pytest.mark.parametrize(
     ("option", "values", "told"),
     [
-        ("cache", (3, ["x"], b"x"), "expected True, False, a folder"),
-        ("threads", (0, -3, True, "2"), "expected a number from 1"),
+        ("cache", (3, ["x"], b"x", "", "a\0b"), "expected True, False, a folder"),
+        ("threads", (0, -3, True, "2", 1.5), "expected a number from 1"),
+        ("split", (None, 3, b"g", "", "a\0b"), "expected a folder"),
     ],
 )
 def test_no_such_option(option: str, values: tuple[Any, ...], told: str) -> None:
     for value in values:
         with pytest.raises(InvalidOptionError, match=told):
-            load_split(GOLDEN, **{option: value})
+            load_split(**{"split": GOLDEN, option: value})
+
+
+def test_numbers_may_be_numpys() -> None:
+    split = load_split(GOLDEN, threads=np.int64(2))  # type: ignore[arg-type]
+    made = split.load("MoveCube/test/0", k=np.int64(1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(made.frame(np.uint8(60)), made.frames()[60])
 
 
 def test_caches_by_folder_or_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,6 +227,11 @@ def test_another_dataset_than_the_manifests_name(own_split: Path) -> None:
         ('"seed": 0', '"seed": null'),
         ('"seed": 0', '"seed": "0"'),
         ('"demonstrations"', '"demonstration"'),
+        ('"distractors": {', '"../distractors": {'),
+        ('"distractors": {', '"/distractors": {'),
+        ('"distractors": {', '"": {'),
+        ('"distractors": {', '"a\\u0000b": {'),
+        ('"distractors": {', '"\\ud800": {'),
         ("{", "["),
         ("{", "{" * 5000),
     ],
@@ -246,6 +261,12 @@ def truncated(keep: int) -> Callable[[Path], object]:
         lambda path: rewritten(path, lambda t: t.set_column(5, "k", t["condition"])),
         lambda path: rewritten(
             path,
+            lambda t: t.set_column(
+                t.column_names.index("condition"), "condition", [[[c] for c in t["condition"]]]
+            ),
+        ),
+        lambda path: rewritten(
+            path,
             lambda t: t.set_column(t.column_names.index("sessions"), "sessions", [[None] * len(t)]),
         ),
         *map(truncated, (0, 3, 100, 2000)),
@@ -255,6 +276,39 @@ def test_damaged_rows(own_split: Path, damage: Callable[[Path], object]) -> None
     damage(own_split / ROWS)
     with pytest.raises(FormatError, match=r"buffers\.parquet"):
         load_split(own_split).load("MoveCube/test/0", "k3")
+
+
+def test_a_session_of_no_dataset(own_split: Path) -> None:
+    header = own_split / HEADER
+    told = json.loads(header.read_text())
+    del told["datasets"]["distractors"]
+    header.write_text(json.dumps(told))
+    assert load_split(own_split).load("MoveCube/test/0", "k0").frames().any()
+    with pytest.raises(FormatError, match=r"buffers\.parquet: .* 'distractors', no dataset"):
+        load_split(own_split).load("MoveCube/test/0", "k3")
+
+
+@pytest.mark.parametrize(
+    ("feature", "shape"),
+    [("observation.state", None), ("observation.state", [4, 2]), ("observation.images.front", [3])],
+)
+@pytest.mark.parametrize("condition", ["no-history", "k1"])
+def test_features_that_are_not_as_they_must_be(
+    own_split: Path, feature: str, shape: list[int] | None, condition: str
+) -> None:
+    def change(info: dict[str, Any]) -> None:
+        told = info["features"].pop(feature)
+        if shape is not None:
+            info["features"][feature] = told | {"shape": shape}
+
+    edit_info(own_split / "demonstrations", change)
+    for use in (
+        lambda made: made.frames(),
+        lambda made: made.states,
+        lambda made: made.query.frame(),
+    ):
+        with pytest.raises(FormatError, match=feature):
+            use(load_split(own_split).load("MoveCube/test/0", condition))
 
 
 def test_a_row_that_is_missing(own_split: Path) -> None:

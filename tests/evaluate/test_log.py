@@ -3,13 +3,13 @@
 import json
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.log import open_log, read_record, read_run
+from robomme_interference_data.parquet import open_parquet
 from robomme_interference_data.rows import to_dict
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "run"
@@ -19,15 +19,17 @@ ROWS = list(KNOWN.values())
 """One of the lesson behind seven units, one with a retrieval step, and one that broke."""
 
 
-def test_golden_files(tmp_path: Path) -> None:
-    with open_log(tmp_path / "run", HEADER.identity, HEADER.split) as log:
+@pytest.mark.parametrize("name", ["run", "not-utf-8-\udcff"])
+def test_golden_files(tmp_path: Path, name: str) -> None:
+    out = tmp_path / name
+    with open_log(out, HEADER.identity, HEADER.split) as log:
         log.begin(HEADER.starts[0])
         for row in ROWS:
             log.append(row, trace="Traceback\n…" if row.error else None)
         log.end(log.header)
-    for name in ("rollouts.jsonl", "rollouts.csv", "run.json", "errors.log"):
-        assert (tmp_path / "run" / name).read_text() == (GOLDEN / name).read_text(), name
-    table = pq.read_table(tmp_path / "run" / "rollouts.parquet")
+    for file in ("rollouts.jsonl", "rollouts.csv", "run.json", "errors.log"):
+        assert (out / file).read_text() == (GOLDEN / file).read_text(), file
+    table = open_parquet(out / "rollouts.parquet").read()
     assert table.to_pylist() == [to_dict(row) for row in ROWS[::-1]]  # in canonical order
 
 

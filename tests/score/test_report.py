@@ -196,7 +196,7 @@ def test_episodes_show_every_outcome(tmp_path: Path) -> None:
 def test_each_rollout_has_its_video_whatever_seeds_others_have(tmp_path: Path) -> None:
     given = {  # run to rows of (episode, model seed, video)
         "a": [(0, 0, "a0.mp4")],
-        "b": [(1, 5, "b1.mp4"), (2, 5, "gone.mp4"), (2, 7, "b2.mp4"), (2, 9, "b9.mp4")],
+        "caf\udce9": [(1, 5, "b1.mp4"), (2, 5, "gone.mp4"), (2, 7, "b2.mp4"), (2, 9, "b9.mp4")],
     }
     (first,) = cells({(OWN, "k0"): "s"})
     for name, rollouts in given.items():
@@ -208,8 +208,8 @@ def test_each_rollout_has_its_video_whatever_seeds_others_have(tmp_path: Path) -
         for _, _, video in rollouts:
             if video != "gone.mp4":
                 (tmp_path / name / video).touch()
-    found = episodes(made.score(tmp_path / "a", tmp_path / "b"), tmp_path)
-    assert [row[-1] for row in found] == [["a/a0.mp4"], ["b/b1.mp4"], ["b/b2.mp4"]]
+    found = episodes(made.score(*(tmp_path / name for name in given)), tmp_path)
+    assert [row[-1] for row in found] == [["a/a0.mp4"], ["caf%E9/b1.mp4"], ["caf%E9/b2.mp4"]]
     # Of a file by itself nobody knows where its videos lie.
     alone = made.write_csv(tmp_path / "a.csv", [replace(first, video="a0.mp4")])
     assert episodes(made.score(alone), tmp_path)[0][-1] == [""]
