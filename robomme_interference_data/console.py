@@ -23,6 +23,9 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
+from robomme_interference_data.errors import InvalidOptionError
+
 MESSAGES = Console(stderr=True, soft_wrap=True, markup=False, emoji=False, highlight=False)
 """What commands say beside their output: lines are never wrapped, so that paths can be copied."""
 
@@ -35,6 +38,22 @@ SplitOption = Annotated[
 QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
 ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]
 Picture = Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")]
+
+
+def check_output(*paths: Path | None) -> None:
+    """Refuse to write into a dataset or the manifests of a split, every file of which is hashed.
+
+    Raises:
+        InvalidOptionError: A path lies in one.
+    """
+    for path in filter(None, paths):
+        for folder in (path.resolve(), *path.resolve().parents):
+            manifests = (folder / name for name in (MANIFEST_HEADER, MANIFEST_ROWS))
+            if (folder / IDENTITY_PATH).is_file() or all(path.is_file() for path in manifests):
+                raise InvalidOptionError(
+                    f"{path} lies inside {folder}, whose files are a split's",
+                    "Give a place outside the split.",
+                )
 
 
 def print_json(value: Any) -> None:
@@ -52,12 +71,16 @@ class _Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def stoppable(kept: str) -> Iterator[None]:
+def stoppable(kept: str, place: Path | None = None) -> Iterator[None]:
     """Let Ctrl-C, and SIGTERM as schedulers send it, end a command in peace; tell how to go on.
 
     Args:
         kept: What an interrupted command leaves behind, such as `Finished episodes are kept`.
+        place: Where that is, if it may not have been made yet.
     """
+
+    def told() -> str:
+        return kept if place is None or place.exists() else "Nothing was written yet"
 
     def stop(*_: object) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short
@@ -67,11 +90,11 @@ def stoppable(kept: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        MESSAGES.print(f"\nStopped. {kept}; go on with:\n{command_line()}")
+        MESSAGES.print(f"\nStopped. {told()}; go on with:\n{command_line()}")
         raise typer.Exit(143 if isinstance(interrupt, _Terminated) else 130) from None
     except OSError as error:
         if error.errno is not None:  # the system's word on a file, such as that the disk is full
-            MESSAGES.print(f"Stopped. {kept}; once mended, go on with:\n{command_line()}")
+            MESSAGES.print(f"Stopped. {told()}; once mended, go on with:\n{command_line()}")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.console import MESSAGES, AsJson, command_line, print_json
+from robomme_interference_data.console import (
+    MESSAGES,
+    AsJson,
+    check_output,
+    command_line,
+    print_json,
+)
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.settings import with_settings
 
@@ -39,6 +45,7 @@ def score(
     from robomme_interference_data.evaluate.score.scoring import score as compute
     from robomme_interference_data.evaluate.score.scoring import write_score
 
+    check_output(out, export_to)
     found = compute(settings)
     _tell([found.rows], found.notes)
     with MESSAGES.status("Drawing the figures"):
