@@ -17,7 +17,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate.clips import check_drawing
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
 from robomme_interference_data.evaluate.systems import (
     SYSTEMS,

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import InvalidOptionError, PolicyServerError
-from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
 from robomme_interference_data.evaluate.policies.connection import ServerConnection
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.simulators.base import Observation
 
 

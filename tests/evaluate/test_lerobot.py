@@ -28,11 +28,11 @@ from robomme_interference_data.errors import (  # noqa: E402
     MissingFileError,
     PolicyError,
 )
-from robomme_interference_data.evaluate.policies.base import RolloutInfo  # noqa: E402
 from robomme_interference_data.evaluate.policies.lerobot import (  # noqa: E402
     LeRobotPolicy,
     find_policy,
 )
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo  # noqa: E402
 from robomme_interference_data.evaluate.policies.registry import make_policy, pin_policy  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT")
