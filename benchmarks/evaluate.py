@@ -23,7 +23,7 @@ from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Rollout, Status

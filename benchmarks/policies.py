@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from robomme_interference_data import load_split
 from robomme_interference_data.buffer import Buffer, Chunk
 from robomme_interference_data.constants import UNIT_FRAMES
-from robomme_interference_data.evaluate.policies.base import RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
 from robomme_interference_data.evaluate.rollout import read_ahead

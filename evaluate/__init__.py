@@ -18,7 +18,7 @@ from robomme_interference_data.lazy import lazily
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.config import RunConfig
     from robomme_interference_data.evaluate.merge import Merged, merge_runs
-    from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
+    from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
     from robomme_interference_data.evaluate.run import RunResult, run_evaluation
 
 __all__ = [
@@ -31,4 +31,4 @@ __all__ = [
     "run_evaluation",
 ]
 
-__getattr__ = lazily(__name__, ".config", ".policies.base", ".merge", ".run")
+__getattr__ = lazily(__name__, ".config", ".policies.policy", ".merge", ".run")

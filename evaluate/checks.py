@@ -17,7 +17,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.evaluate.clips import check_drawing
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
-from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
 from robomme_interference_data.evaluate.systems import (
     SYSTEMS,
@@ -155,9 +155,11 @@ def check_plan(
         recorded = split.query(episode).simulator
         if not own and recorded not in (None, config.simulator):
             raise InvalidOptionError(
-                f"{episode} was recorded on the simulator {recorded!r}, the run is on "
-                f"{config.simulator!r}",
-                f"Give --simulator {recorded}, or a split of {config.simulator}.",
+                f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
+                f"Give --simulator {recorded}, or a split of {config.simulator}."
+                if recorded in SIMULATORS
+                else "No simulator plays the episodes of this split: give one whose demonstrations "
+                f"are of {' or '.join(SIMULATORS)}, or a simulator of your own that plays them.",
             )
     if system.position_limit is not None and config.retrieval is None:
         planned, longest = set(items), dict.fromkeys(plan.conditions, 0)

@@ -16,6 +16,7 @@ from robomme_interference_data.constants import FPS, MAX_STEPS
 from robomme_interference_data.drawing import Hue
 from robomme_interference_data.encode import CLIP, VideoEncoder
 from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.files import atomic_path
 from robomme_interference_data.records import Status
@@ -45,11 +46,6 @@ _LETTERS = 34
 
 _LINES = 14
 """Lines of the facts."""
-
-
-def clip_name(item: WorkItem) -> str:
-    """Return the path of a rollout's clip inside the run's folder."""
-    return f"videos/{str(item.episode).replace('/', '_')}_{item.condition}.mp4"
 
 
 def check_drawing() -> None:

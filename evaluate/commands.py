@@ -7,6 +7,7 @@ import typer
 
 from robomme_interference_data.console import (
     AsJson,
+    check_output,
     command_line,
     print_json,
     say,
@@ -51,7 +52,9 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     from robomme_interference_data.evaluate.run import run_evaluation
     from robomme_interference_data.rows import to_dict
 
-    with stoppable(f"Finished rollouts are in {config.out}"), RunProgress(quiet=as_json) as shown:
+    check_output(config.out)
+    kept = f"Finished rollouts are in {config.out}"
+    with stoppable(kept, config.out), RunProgress(quiet=as_json) as shown:
         result = run_evaluation(config, listener=shown, command=[command_line()])
     if as_json:
         print_json([to_dict(row) for row in result.rows])
@@ -86,6 +89,7 @@ def merge(
     from robomme_interference_data.evaluate.merge import merge_runs
     from robomme_interference_data.evaluate.progress import rate_table
 
+    check_output(out)
     merged = merge_runs(runs, out)
     lists = {name: getattr(merged, name) for name in _TOLD}
     if as_json:

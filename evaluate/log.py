@@ -30,6 +30,11 @@ from robomme_interference_data.rows import arrow_schema, from_dict, read_header,
 ERRORS_LOG = "errors.log"
 
 
+def clip_name(item: WorkItem) -> str:
+    """Return the path of a rollout's clip inside the run's folder."""
+    return f"videos/{str(item.episode).replace('/', '_')}_{item.condition}.mp4"
+
+
 @dataclass(frozen=True)
 class Start:
     """One start of the command: its settings, what was asked for, and where it ran.
@@ -225,6 +230,8 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
             item = WorkItem.of(row)
             if item in rows and is_done(rows[item]):
                 raise ValueError(f"it is a second one of {item}")
+            if row.video not in (None, clip_name(item)):  # which would be read and written there
+                raise ValueError(f"video {row.video!r}; expected {clip_name(item)} or null")
         except (ValueError, RecursionError) as error:
             raise FormatError(
                 f"{path}, line {number} is no row of a rollout: {first_line(error)}",

@@ -123,7 +123,10 @@ def plan_work(
             raise UnknownNameError(
                 f"the split has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"It has {format_numbers(numbers) or 'none'} of {group}: see --episode-split.",
+                f"It has episodes {format_numbers(numbers)} of {group}; --episode-split asks for "
+                "others."
+                if numbers
+                else f"It has none of {group}: see --episode-split.",
             )
         if numbers:
             chosen[group] = format_numbers(asked or numbers)

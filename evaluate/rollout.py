@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.agreement import check_episode, check_le
 from robomme_interference_data.evaluate.clips import Clip
 from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.policies.base import Policy, RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status

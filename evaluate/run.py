@@ -19,11 +19,11 @@ from robomme_interference_data.evaluate.checks import (
     check_simulator,
     default_system,
 )
-from robomme_interference_data.evaluate.clips import clip_name
 from robomme_interference_data.evaluate.config import Run, RunConfig
 from robomme_interference_data.evaluate.log import (
     RunLog,
     Start,
+    clip_name,
     count_statuses,
     is_done,
     open_log,

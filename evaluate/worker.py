@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.errors import PolicyServerError, WorkerRetiredError, first_line
-from robomme_interference_data.evaluate.clips import Clip, clip_name
+from robomme_interference_data.evaluate.clips import Clip
 from robomme_interference_data.evaluate.config import Run, RunConfig
+from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.execution import Worker

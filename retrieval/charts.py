@@ -107,7 +107,10 @@ def draw_calibration(found: Calibration, title: str, out: Path) -> None:
                     label = f"{name}: {value:.3f}"
                     axes.axvline(value, color=colour, linewidth=1.1, linestyle="-.", label=label)
             axes.legend(
-                frameon=False, fontsize=7, loc="upper left" if axes is left else "lower left"
+                framealpha=1,  # it hides the vertical lines behind it
+                edgecolor="none",
+                fontsize=7,
+                loc="upper left" if axes is left else "lower left",
             )
         figure.suptitle(title, x=0.01, ha="left", size=10, color=INK)
         figure.tight_layout(rect=(0, 0, 1, 0.98))

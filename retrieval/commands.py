@@ -13,6 +13,7 @@ from robomme_interference_data.console import (
     QueryName,
     SplitFolder,
     SplitOption,
+    check_output,
     print_json,
     say,
     stoppable,
@@ -126,6 +127,7 @@ def retrieve(
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.split import load_buffer
 
+    check_output(out)
     name = encoders.encoder_name(encoder)
     parsed = select.Rule.parse(rule, encoders.published_threshold(name))
     buffer = load_buffer(episode, condition, split=split)
@@ -173,6 +175,7 @@ def retrieval_score(
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.tables import Table
 
+    check_output(out)
     name = encoders.encoder_name(encoder)
     wanted = select.parse_rules(rules, encoders.published_threshold(name))
     about, measured = _measured(split, name, camera, quiet=as_json)
@@ -219,6 +222,7 @@ def calibrate(
     from robomme_interference_data.retrieval import charts, encoders, select
     from robomme_interference_data.rows import to_dict
 
+    check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
     about, measured = _measured(split, name, camera, quiet=as_json)

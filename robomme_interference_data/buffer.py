@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.cache import DecodedCache
-from robomme_interference_data.constants import STATE
+from robomme_interference_data.constants import KEY_FRAMES, STATE
 from robomme_interference_data.dataset import Dataset, camera_feature
 from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import (
@@ -30,8 +30,8 @@ from robomme_interference_data.records import (
     place_sessions,
 )
 
-_PIECE = 128
-"""Frames that one thread decodes at a time: a multiple of the key frame distance (16)."""
+_PIECE = 8 * KEY_FRAMES
+"""Frames that one thread decodes at a time."""
 
 
 @dataclass(frozen=True)

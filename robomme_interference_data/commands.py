@@ -14,6 +14,7 @@ from robomme_interference_data.console import (
     QueryName,
     SplitFolder,
     SplitOption,
+    check_output,
     print_json,
     say,
 )
@@ -76,7 +77,9 @@ def show(
     from robomme_interference_data.split import load_buffer
     from robomme_interference_data.tables import Table
 
+    check_output(out)
     buffer = load_buffer(episode, condition, split=split)
+    buffer.query.dataset.shape(camera)  # refuses an unknown one
     if out is not None:
         from robomme_interference_data.strip import draw_strip
 

@@ -12,6 +12,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
+from robomme_interference_data.errors import InvalidOptionError
+
 # Parameters that several commands have.
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
 SplitFolder = Annotated[Path, typer.Argument(help="Folder of the split.")]
@@ -44,6 +47,22 @@ def say(text: str, **style: Any) -> None:
     typer.secho(text, err=True, **style)
 
 
+def check_output(*paths: Path | None) -> None:
+    """Refuse to write into a dataset or the manifests of a split, every file of which is hashed.
+
+    Raises:
+        InvalidOptionError: A path lies in one.
+    """
+    for path in filter(None, paths):
+        for folder in (path.resolve(), *path.resolve().parents):
+            manifests = (folder / name for name in (MANIFEST_HEADER, MANIFEST_ROWS))
+            if (folder / IDENTITY_PATH).is_file() or all(path.is_file() for path in manifests):
+                raise InvalidOptionError(
+                    f"{path} lies inside {folder}, whose files are a split's",
+                    "Give a place outside the split.",
+                )
+
+
 def print_json(value: Any) -> None:
     """Print one JSON value to stdout."""
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
@@ -59,12 +78,16 @@ class _Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def stoppable(kept: str) -> Iterator[None]:
+def stoppable(kept: str, place: Path | None = None) -> Iterator[None]:
     """Let Ctrl-C, and SIGTERM as schedulers send it, end a command in peace; tell how to go on.
 
     Args:
         kept: What an interrupted command leaves behind, such as `Finished episodes are kept`.
+        place: Where that is, if it may not have been made yet.
     """
+
+    def told() -> str:
+        return kept if place is None or place.exists() else "Nothing was written yet"
 
     def stop(*_: object) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short
@@ -74,11 +97,11 @@ def stoppable(kept: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        say(f"\nStopped. {kept}; go on with:\n{command_line()}")
+        say(f"\nStopped. {told()}; go on with:\n{command_line()}")
         raise typer.Exit(143 if isinstance(interrupt, _Terminated) else 130) from None
     except OSError as error:
         if error.errno is not None:  # the system's word on a file, such as that the disk is full
-            say(f"Stopped. {kept}; once mended, go on with:\n{command_line()}")
+            say(f"Stopped. {told()}; once mended, go on with:\n{command_line()}")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

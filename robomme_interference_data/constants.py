@@ -55,6 +55,9 @@ SAMPLE_FRAMES = 32
 FPS = 10
 """Recorded frames per second."""
 
+KEY_FRAMES = 16
+"""Frames from one key frame of an exact video to the next; threads decode whole such spans."""
+
 # --- features of a dataset -------------------------------------------------------------------
 
 FRONT = "observation.images.front"

@@ -23,6 +23,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import (
     FormatError,
+    InvalidOptionError,
     MissingFileError,
     MissingIndexError,
     StaleIndexError,
@@ -94,8 +95,13 @@ def encoder_id(encoder: str) -> str:
     Returns:
         `thumbnail`; `siglip` for the paper's model; `siglip:google/siglip2-base-patch16-224`;
         `siglip:NAME` for a folder of that name.
+
+    Raises:
+        InvalidOptionError: It names none.
     """
     kind, _, model = encoder.partition(":")
+    if not kind:
+        raise InvalidOptionError.expected("encoder", encoder, "thumbnail, siglip or siglip:ID")
     if not model:
         return kind
     if Path(model).is_dir():

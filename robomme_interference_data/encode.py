@@ -13,6 +13,7 @@ import numpy as np
 from av.codec.codec import UnknownCodecError
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, InvalidOptionError
 
 
@@ -44,14 +45,15 @@ _AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless
 CODECS = {
     codec.name: codec
     for codec in (
-        # Exact in PyAV, torchcodec and browsers; a key frame every 16 frames and no reordering,
-        # so that seeking is safe.
+        # Exact in PyAV, torchcodec and browsers; key frames are near and nothing is reordered, so
+        # that seeking is safe.
         Codec(
             name="av1-lossless",
             vcodec="libaom-av1",
             pix_fmt="gbrp",
-            settings={"g": 16, "crf": None, "extra_options": _AOM_LOSSLESS},
-            options={"g": "16"} | {name: str(value) for name, value in _AOM_LOSSLESS.items()},
+            settings={"g": KEY_FRAMES, "crf": None, "extra_options": _AOM_LOSSLESS},
+            options={"g": str(KEY_FRAMES)}
+            | {name: str(value) for name, value in _AOM_LOSSLESS.items()},
             exact=True,
         ),
         Codec(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK, SAMPLE_FRAMES
 from robomme_interference_data.errors import PolicyError, UnknownNameError
-from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.sampling import even_sample
 from robomme_interference_data.simulators.base import Observation, Simulator
 

@@ -13,7 +13,7 @@ import numpy as np
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.console import say
 from robomme_interference_data.errors import PolicyError, PolicyServerError
-from robomme_interference_data.evaluate.policies.base import Policy
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     BUILTINS,
     check_workers,

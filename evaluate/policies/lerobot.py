@@ -32,7 +32,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     PolicyError,
 )
-from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.files import format_sums
 from robomme_interference_data.hub import locate
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation

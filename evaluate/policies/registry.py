@@ -14,8 +14,8 @@ from robomme_interference_data.errors import (
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.options import bind_options, signature_of
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.simulators.base import CAMERAS
 
 BUILTINS = ("replay", "oracle", "guess", "hold")
@@ -210,5 +210,5 @@ def _check_members(text: str, policy: Any) -> None:
     if wrong:
         raise PolicyError(
             f"policy {text!r}: {type(policy).__name__} has {'; '.join(wrong)}",
-            "evaluate/policies/base.py says what a policy must have; docs/systems.md has one.",
+            "evaluate/policies/policy.py says what a policy must have; docs/systems.md has one.",
         )

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import InvalidOptionError, PolicyServerError
-from robomme_interference_data.evaluate.policies.base import Frames, Policy, RolloutInfo
 from robomme_interference_data.evaluate.policies.connection import ServerConnection
+from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.simulators.base import Observation
 
 
@@ -27,8 +28,8 @@ class WebsocketPolicy(Policy):
     Args:
         host: Name or address of the server.
         port: Its port.
-        chunk_frames: Most frames in a message. 16 is what a live message carries too: a server
-            that compiles for each length (JAX) then compiles no further ones for the history.
+        chunk_frames: Most frames in a message. Its default is what a live message carries too: a
+            server that compiles for each length (JAX) compiles no further ones for the history.
         connect_s: Most seconds to wait until the server can be used, such as while it loads.
         response_s: Most seconds from a message to its answer. The first of a kind takes long, as
             servers compile then.
@@ -43,7 +44,7 @@ class WebsocketPolicy(Policy):
         host: str,
         port: int,
         *,
-        chunk_frames: int = 16,
+        chunk_frames: int = ACTION_CHUNK,
         connect_s: float = 60.0,
         response_s: float = 600.0,
     ):

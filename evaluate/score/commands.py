@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.console import AsJson, command_line, print_json, say
+from robomme_interference_data.console import (
+    AsJson,
+    check_output,
+    command_line,
+    print_json,
+    say,
+)
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.settings import with_settings
 
@@ -40,6 +46,7 @@ def score(
     from robomme_interference_data.evaluate.score.scoring import write_score
     from robomme_interference_data.work_progress import WorkProgress
 
+    check_output(out, export_to)
     found = compute(settings)
     _tell([found.rows], found.notes)
     with WorkProgress() as progress, progress.status("Drawing the figures"):

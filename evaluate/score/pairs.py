@@ -26,7 +26,7 @@ class Pairs:
         first: Mean success over them on the first side.
         second: The same on the second side.
         change: `second` − `first` with its interval.
-        interval: Kind of that interval (see `stats.paired_interval`).
+        interval: Kind of that interval (see `bootstrap.paired_interval`).
         pairs: Pairs of rollouts that are tested, one an episode: of the lowest model seed that
             counts on both sides.
         gained: Pairs that succeed on the second side alone.

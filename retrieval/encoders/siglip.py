@@ -43,12 +43,13 @@ class Siglip:
         MissingExtraError: torch, transformers or Pillow is not installed.
         HubError: The model is neither on this machine nor can it be downloaded.
         FormatError: It is no SigLIP model, or not a whole one.
-        InvalidOptionError: There is no such device.
+        InvalidOptionError: There is no such device or folder.
     """
 
     centred = False
 
     def __init__(self, model: str, device: str | None = None, batch: int | None = None):
+        files = locate(model, "model")  # a folder that is missing is told before seconds of imports
         try:
             import PIL  # noqa: F401 - the image processor needs it
             import torch
@@ -59,7 +60,6 @@ class Siglip:
         self._given = model, device, batch
         self._torch = torch
         self.name = encoder_name(f"siglip:{model}")
-        files = locate(model, "model")
         origin: dict[str, str | None] = {"model": None, "revision": None}
         folder = files.snapshot(*_FILES)
         if isinstance(files, HubFiles):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import InvalidOptionError
 
 CELLS = 8
@@ -25,7 +26,7 @@ class Thumbnail:
 
     name = "thumbnail"
     centred = True
-    batch = 16  # the distance of key frames, from which threads decode
+    batch = KEY_FRAMES  # from which threads decode
     computed_in = "numpy"
 
     def __init__(self) -> None:

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import PolicyError, UnknownNameError
-from robomme_interference_data.evaluate.policies.base import RolloutInfo
 from robomme_interference_data.evaluate.policies.builtin import (
     MEMORIES,
     Hold,
@@ -15,6 +14,7 @@ from robomme_interference_data.evaluate.policies.builtin import (
     ReplayPolicy,
     follow,
 )
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.simulators.base import Observation
 
 Vector = NDArray[np.float32]

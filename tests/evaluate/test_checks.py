@@ -43,7 +43,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"policy": "python:__main__:make"}, InvalidOptionError, "run another program"),
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
         ({"simulator": "nosuch:thing"}, UnknownNameError, "no simulator 'nosuch:thing'"),
-        ({"simulator": "tabletop"}, InvalidOptionError, "recorded on the simulator 'sample'"),
+        ({"simulator": "tabletop"}, InvalidOptionError, "recorded on 'sample', the run is on"),
         ({"episodes": "0-9"}, UnknownNameError, "no query episode"),
         ({"episode_split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
@@ -74,6 +74,19 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
         run(tmp_path / "run", **changes)
     assert words in raised.value.message
     assert not (tmp_path / "run").exists()
+
+
+def test_only_simulators_that_exist_are_offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def hint() -> str:
+        with pytest.raises(InvalidOptionError) as raised:
+            run(tmp_path / "run", simulator="tabletop")
+        return str(raised.value.hint)
+
+    assert "--simulator" not in hint() and "tabletop or robomme" in hint()
+    monkeypatch.setitem(SIMULATORS, "sample", SIMULATORS["tabletop"])
+    assert "Give --simulator sample" in hint()
 
 
 def test_a_missing_split_is_refused(tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.encode import VideoEncoder
-from robomme_interference_data.evaluate.clips import clip_name, history_picture
+from robomme_interference_data.evaluate.clips import history_picture
 from robomme_interference_data.evaluate.config import Run
+from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import Outcome, Serial

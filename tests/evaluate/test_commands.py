@@ -85,6 +85,20 @@ def test_a_full_disk_names_the_file_and_the_command_to_go_on(
     assert told in done.stderr
 
 
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_stop_tells_of_rollouts_only_where_there_are_some(
+    begun: bool, tmp_path: Path, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_module, "_roll_out" if begun else "check_plan", stop)
+    line = f"evaluate --policy hold {USUAL} --families MoveCube --split {tiny_split}"
+    done = type_in(f"{line} --out {tmp_path / 'run'}")
+    assert done.exit_code == 130 and "go on with:\nrobomme-interference" in done.stderr
+    assert (f"Finished rollouts are in {tmp_path / 'run'}" in done.stderr) == begun
+
+
 def test_merge_tells_what_is_missing_and_double(tmp_path: Path) -> None:
     run_one(tmp_path / "a", shard="1/1", conditions=("no-history", "k0"))
     log = tmp_path / "a" / "rollouts.jsonl"

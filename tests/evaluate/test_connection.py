@@ -9,6 +9,7 @@ from http import HTTPStatus
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 from support.policy_calls import client, info, observation, rollout, section
 from support.policy_server import PolicyServer
@@ -148,6 +149,27 @@ def test_a_server_that_hangs_is_given_up(server: PolicyServer, call: str) -> Non
         with pytest.raises(PolicyServerError, match=r"did not answer within 0\.3 s"):
             rollout(policy, 0, [], [])
         go_on.set()
+
+
+def test_a_server_that_does_not_even_read_is_given_up() -> None:
+    """A message larger than the socket's buffers: it is the sending that hangs."""
+    gone = threading.Event()
+
+    def handle(connection: Any) -> None:
+        connection.send(msgpack.packb({}))
+        connection.recv()
+        connection.send(msgpack.packb({"reset_finished": True}))
+        gone.wait(30)
+
+    with handling(handle, max_queue=1, max_size=None) as port:
+        policy = WebsocketPolicy("127.0.0.1", port, response_s=0.5, chunk_frames=4000)
+        policy.reset(info(2000))
+        frames = {"front": np.zeros((2000, 64, 64, 3), np.uint8)}
+        policy.add_history(frames, np.zeros((2000, 8), np.float32), 2000)
+        with pytest.raises(PolicyServerError, match=r"did not answer within 0\.5 s"):
+            policy.observe({"front": frames["front"][:1]}, np.zeros((1, 8), np.float32))
+        gone.set()
+        policy.close()
 
 
 def speaks_never(connection: Any) -> None:

@@ -1,5 +1,6 @@
 """What makes a run the one that it is, and what may differ from start to start."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,29 @@ from support.policy_server import PolicyServer
 from support.runs import header, run, run_one
 
 from robomme_interference_data.errors import RunFolderError
-from robomme_interference_data.evaluate import merge_runs
+from robomme_interference_data.evaluate import RunConfig, merge_runs
 from robomme_interference_data.evaluate.policies.identity import policy_identity
 from robomme_interference_data.evaluate.policies.registry import pin_policy
 
 pytestmark = pytest.mark.usefixtures("world")
 
 STILL = "python:support.own_policies:Still"
+
+
+def test_every_setting_is_classed() -> None:
+    """A new setting either makes another run of it, or does not: somebody has to say which."""
+    makes_the_run = {
+        *("policy", "policy_options"),  # by policy_identity
+        *("retrieval", "retrieval_rule", "retrieval_camera"),  # by Selector.identity
+        *("system", "simulator", "split", "episode_split", "model_seed"),
+    }
+    plan = {"families", "episodes", "conditions", "shard"}
+    may_differ = {
+        *("out", "no_resume", "robomme_python", "workers", "videos", "check_lesson", "cache"),
+        *("rollout_timeout", "simulator_timeout", "history_chunk", "max_errors"),
+    }
+    fields = {field.name for field in dataclasses.fields(RunConfig)}
+    assert makes_the_run | plan | may_differ == fields
 
 
 @pytest.mark.parametrize(

@@ -28,11 +28,11 @@ from robomme_interference_data.errors import (  # noqa: E402
     MissingFileError,
     PolicyError,
 )
-from robomme_interference_data.evaluate.policies.base import RolloutInfo  # noqa: E402
 from robomme_interference_data.evaluate.policies.lerobot import (  # noqa: E402
     LeRobotPolicy,
     find_policy,
 )
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo  # noqa: E402
 from robomme_interference_data.evaluate.policies.registry import make_policy, pin_policy  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT")
@@ -94,6 +94,18 @@ def test_act_gives_what_lerobots_own_loop_gives(act: Path, tmp_path: Path) -> No
     edit(folder, lambda config: config.update(n_action_steps=3))
     np.testing.assert_array_equal(play(made(folder), 0, [1])[0], found[0][:3])
     policy.close()
+
+
+def test_temporal_ensembling_gives_one_averaged_action(act: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(act, tmp_path / "ensemble")
+    edit(folder, lambda config: config.update(n_action_steps=1, temporal_ensemble_coeff=0.01))
+    chunk, found = play(made(act), 0, [1, 1]), play(made(folder), 0, [1, 1])
+    assert [part.shape for part in found] == [(1, 8), (1, 8)]
+    np.testing.assert_allclose(found[0][0], chunk[0][0], rtol=1e-5, atol=1e-6)
+    # Second step: weights 1 for the older chunk and exp(-0.01) for the newer.
+    weight = np.exp(-0.01)
+    mean = (chunk[0][1] + weight * chunk[1][0]) / (1 + weight)
+    np.testing.assert_allclose(found[1][0], mean, rtol=1e-4, atol=1e-5)
 
 
 def test_a_queue_is_filled_with_the_end_of_the_history(vqbet: Path) -> None:

@@ -71,6 +71,11 @@ def test_a_line_that_was_cut_short_is_dropped_and_only_that_one(
         (json.dumps(to_dict(ROWS[0]) | {"steps": "many"}).encode(), "steps: 'many'"),
         (json.dumps(to_dict(ROWS[0]) | {"condition": "k"}).encode(), "'k' is not a condition"),
         (json.dumps(to_dict(ROWS[0]) | {"status": "fail"}).encode(), "contradicts status"),
+        (
+            json.dumps(to_dict(ROWS[1]) | {"video": "../x"}).encode(),
+            "video '../x'; expected videos",
+        ),
+        (json.dumps(to_dict(ROWS[1]) | {"video": "run.json"}).encode(), "video 'run.json'"),
         (json.dumps(to_dict(ROWS[0])).encode(), "a second one of MoveCube/test/3 under k7"),
     ],
 )

@@ -46,8 +46,12 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"episodes": "0,3-4"}, UnknownNameError, "MoveCube/test/3 and 1 more\nIt has 0-2,5 of"),
-        ({"episodes": "6"}, UnknownNameError, "MoveCube/test/6\nIt has 0-2,5"),
+        (
+            {"episodes": "0,3-4"},
+            UnknownNameError,
+            "MoveCube/test/3 and 1 more\nIt has episodes 0-2,5 of",
+        ),
+        ({"episodes": "6"}, UnknownNameError, "MoveCube/test/6\nIt has episodes 0-2,5"),
         (
             {"episode_split": "val", "families": ["MoveCube"]},
             UnknownNameError,

@@ -14,8 +14,8 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.policies.base import Policy
 from robomme_interference_data.evaluate.policies.options import bind_options
+from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     PolicySpec,
     make_policy,

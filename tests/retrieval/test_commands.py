@@ -134,6 +134,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
         ("index {bare} --encoder thumbnail:x", "siglip:ID"),
         ("index {bare} --encoder siglip:", "siglip:ID"),
+        ("index {bare} --encoder siglip:/nonexistent", "'/nonexistent' is neither a folder"),
         ("index {bare} --camera side", "camera 'side'"),
         ("index {bare} --batch 0", "batch 0"),
         ("index {bare} --threads 0", "threads 0"),

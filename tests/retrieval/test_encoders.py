@@ -69,6 +69,8 @@ def test_a_model_in_a_folder_is_called_by_its_name(
         assert encoder_id(f"siglip:{model}") == "siglip:tiny"
         assert index_folder(f"siglip:{model}") == "index/siglip-tiny"
     assert index_folder("siglip:/") == "index/siglip-"  # not the paper's model
+    with pytest.raises(InvalidOptionError, match="encoder ''; expected thumbnail"):
+        encoder_id("")
 
 
 def test_names_of_encoders() -> None:

@@ -1,5 +1,6 @@
 """`score` and `compare` as commands: what they print, write, export and leave alone."""
 
+import csv
 import html
 import json
 import re
@@ -11,7 +12,7 @@ from typing import Any
 
 import pytest
 from support import scoring as made
-from support.scoring import OWN, RETRIEVAL, run
+from support.scoring import BASE, OWN, RETRIEVAL, run
 
 from robomme_interference_data.errors import (
     BadRowsError,
@@ -165,6 +166,22 @@ def test_without_a_library_nothing_is_written(
 
 
 # --- exported rows -----------------------------------------------------------------------------
+
+
+def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
+    rows = read_rows([made.write_parquet(tmp_path / "a.parquet", made.rows())])
+    exported = export(rows, tmp_path / "export")
+    assert [path.name for path in exported] == [
+        f"{system}-tabletop_rollouts.csv" for system in (OWN, BASE, RETRIEVAL)
+    ]
+    with exported[0].open(newline="") as lines:
+        assert [row["status"] for row in csv.DictReader(lines)].count("error") == 1
+    found = made.score(exported[1], system=BASE)
+    cells = [cell for cell in found.cells if not cell.part]
+    assert [cell.counts[0] for cell in cells] == [1, 7, 5, 3, 2]
+    assert cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
+    # Their simulator comes back, too: they never stand beside the paper's rates.
+    assert list(found.cubes) == ["tabletop"]
 
 
 def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path) -> None:

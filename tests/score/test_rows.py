@@ -121,6 +121,16 @@ def test_the_released_layout(tmp_path: Path) -> None:
     assert told(read_rows([path])) == expected
 
 
+def test_simulators_have_revisions_scenes_and_names_of_their_own(tmp_path: Path) -> None:
+    names = ("my_package.kitchen:make_simulator", "_doubles:make", "sim-2.1", "x" * 128)
+    rows = made.rows()[:2]
+    for number, name in enumerate(names):
+        rows += made.changed(rows[:2], simulator=name, revision=f"{number}" * 64, seed=number)
+    found = read_rows([made.write_csv(tmp_path / "a.csv", rows)])
+    assert found.names("simulator") == sorted((*names, "tabletop"))
+    assert len(found.revisions) == 5
+
+
 @pytest.mark.parametrize("kind", [pa.float32(), pa.float64(), pa.uint8(), pa.string()])
 def test_numbers_of_any_type_are_read_alike(tmp_path: Path, kind: Any) -> None:
     episodes = pa.array([row.episode for row in made.rows()]).cast(kind)

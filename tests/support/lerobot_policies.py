@@ -16,7 +16,7 @@ from lerobot.policies.factory import (
 )
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
-from robomme_interference_data.evaluate.policies.base import RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.simulators.base import Observation
 
 SIZE = 256

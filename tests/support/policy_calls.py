@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from support.policy_server import PolicyServer
 
-from robomme_interference_data.evaluate.policies.base import RolloutInfo
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 from robomme_interference_data.simulators.base import Observation
 

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import typer
-from support.splits import QUERIES
+from support.splits import QUERIES, contents
 
 from robomme_interference_data import load_split
 from robomme_interference_data.cli import app
@@ -133,6 +133,7 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
         (["show", "MoveCube/test/9", "k3", "--split", "{}"], ("MoveCube/test/9", EPISODE)),
         (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
         (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0 k1 k3 k7 k9")),
+        (["show", EPISODE, "k3", "--split", "{}", "--camera", "nope"], ("camera 'nope'", "wrist")),
         (["verify", "{}/nowhere"], ("is not a split",)),
         (["audit", "{}/nowhere"], ("is not a split",)),
         (
@@ -156,6 +157,29 @@ def test_known_errors(
     assert (code, out) == (1, "")
     assert err.startswith("Error: ") and "Traceback" not in err
     assert all(text in err for text in told), err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        f"show {EPISODE} k3 --split S --out S/demonstrations/meta/strip.png",
+        f"retrieve {EPISODE} k3 --split S --out S/manifests/why.png",
+        "retrieval-score S --out S/distractors",
+        "calibrate S --out S/distractors/new/cuts.png",
+        "evaluate --policy hold --split S --out S/demonstrations/run",
+        "merge a b --out S/manifests/run",
+        "score a --out S/distractors/score",
+        "score a --out score --export S/demonstrations",
+    ],
+)
+def test_nothing_is_written_among_the_hashed_files_of_a_split(
+    arguments: str, run: Run, own_split: Path
+) -> None:
+    before = contents(own_split)
+    words = arguments.split()
+    code, _, err = run(*(re.sub("^S(?=/|$)", str(own_split), word) for word in words))
+    assert code == 1 and f"lies inside {own_split}" in err
+    assert contents(own_split) == before
 
 
 # --- list, show, verify, audit -------------------------------------------------------------------

@@ -7,9 +7,13 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.command_lines import parse
+
+from robomme_interference_data.evaluate import run as run_module
+from robomme_interference_data.execution import Serial
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -54,6 +58,51 @@ def test_the_readmes_commands_run(tmp_path: Path) -> None:
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     assert (tmp_path / "strip.png").stat().st_size > 10_000
     assert (tmp_path / "S" / "manifests" / "manifest.json").is_file()
+
+
+ELSEWHERE = (
+    "websocket://",  # a policy server
+    "--simulator robomme",  # the official simulator
+    "simulate ",  # a renderer
+    "--source ",  # recordings, or a renderer
+    "retrieval_rollouts.csv",  # the released rows
+)
+"""What marks command lines of the pages that need what is not at hand: they are parsed alone."""
+
+BEFORE = {
+    "evaluate.md": ["evaluate --policy replay --split my-split --out runs/shard-1 --shard 1/8"],
+    "score.md": [
+        f"evaluate --policy replay:{name} --split my-split --out runs/{name}"
+        for name in ("window", "framesamp")
+    ],
+}
+"""Runs that pages speak of without making them."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.name)
+def test_the_commands_of_the_pages_run(
+    page: Path,
+    own_split: Path,
+    tiny_split: Path,
+    tmp_path: Path,
+    run: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On the golden split, in a world without a renderer, in this process."""
+    for name in ("my-split", "S"):
+        (tmp_path / name).symlink_to(own_split)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WORLDS_SPLIT", str(tiny_split))
+    monkeypatch.setattr(run_module, "Processes", lambda workers: Serial())
+    lines = [line for line in command_lines(page) if not any(mark in line for mark in ELSEWHERE)]
+    for line in (*BEFORE.get(page.name, ()), *lines):
+        given = re.sub(r"--episodes [0-9-]+", "--episodes 0", line)
+        given = given.replace("RouteStick", "PatternLock").replace("VideoUnmask/", "VideoRepick/")
+        if given.startswith("evaluate "):
+            given += " --simulator support.worlds:World"
+        code, out, err = run(*shlex.split(given))
+        assert code == 0, f"{line}\n{out}\n{err}"
 
 
 def test_the_readmes_python_example(

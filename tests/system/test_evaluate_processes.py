@@ -129,7 +129,8 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
         assert len((out / "rollouts.csv").read_text().splitlines()) == len(rows) + 1
     finish(out)
     starts = json.loads((out / "run.json").read_text())["starts"]
-    assert [one["ended"] is None for one in starts] == [one == signal.SIGKILL for one in (*sent, None)]
+    killed = [one == signal.SIGKILL for one in sent]
+    assert [one["ended"] is None for one in starts] == [*killed, False]
     assert ended(out) == undisturbed
 
 
