@@ -1,5 +1,7 @@
 """Whole builds in this process: what is written, what goes on, what grows, what is refused."""
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from robomme_interference_data.console import WorkProgress
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
+    FormatError,
     InterferenceError,
     InvalidIdError,
     InvalidOptionError,
@@ -29,7 +32,7 @@ from robomme_interference_data.errors import (
     SourceError,
 )
 from robomme_interference_data.execution import Serial
-from robomme_interference_data.files import LocalFiles, hold, work_folder
+from robomme_interference_data.files import LocalFiles, hold, read_json, work_folder
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
 
@@ -153,6 +156,15 @@ def test_a_dataset_that_was_built_otherwise_is_left_as_it_is(
         build(built, other, **options)
     assert "otherwise" not in told or "Choose another --out" in str(caught.value.hint)
     assert contents(built) == before
+
+
+@pytest.mark.parametrize("changes", [{"skipped": None}, {"skipped": [{}]}, None])
+def test_a_report_that_is_damaged(built: Path, tmp_path: Path, changes: Any) -> None:
+    out = shutil.copytree(built, tmp_path / "out")
+    path = out / "meta/build_report.json"
+    path.write_text("{}" if changes is None else json.dumps(read_json(path) | changes))
+    with pytest.raises(FormatError, match=r"build_report\.json"):
+        build(out, MadeUpSource({"A/train/1": (260, 5)}, provenance=TABLETOP))
 
 
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:
