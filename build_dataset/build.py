@@ -82,7 +82,7 @@ def build_dataset(
     get_codec(plan.codec)
     out = out.resolve()  # a folder cannot be given the name of a link, or "."
     with working(out) as work:
-        earlier = _earlier(out, plan)
+        earlier = find_earlier(out, plan)
         stored = list(earlier.episodes) if earlier else []
         skipped = dict(earlier.skipped) if earlier else {}
         known = {*skipped, *(str(one.record.episode_id) for one in stored)}
@@ -99,8 +99,13 @@ def build_dataset(
 # --- what is there already ---------------------------------------------------------------------
 
 
-def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
-    """Return the dataset that is there, built in the same way; None if nothing is."""
+def find_earlier(out: Path, plan: BuildPlan) -> Earlier | None:
+    """Return the dataset that is there, built in the same way; None if nothing is.
+
+    Raises:
+        BuildError: Something else is there.
+        MissingFileError, FormatError: It is damaged.
+    """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / IDENTITY_PATH).is_file():

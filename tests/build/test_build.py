@@ -11,7 +11,7 @@ from support.splits import GOLDEN, contents
 
 from robomme_interference_data.build_dataset.build import BuildResult, build_dataset
 from robomme_interference_data.build_dataset.config import (
-    BuildConfig,
+    AllConfig,
     BuildPlan,
     PlanConfig,
     list_episodes,
@@ -237,8 +237,8 @@ def test_filters() -> None:
         listed(source, source)
 
 
-def config(tmp_path: Path, *source: str, **changes: Any) -> BuildConfig:
-    return BuildConfig(source=source or ("sample",), out=tmp_path / "out", **changes)
+def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
+    return AllConfig(source=source or ("sample",), out=tmp_path / "out", **changes)
 
 
 def test_units_are_of_train_episodes(tmp_path: Path) -> None:
@@ -247,6 +247,8 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
     plans = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
     assert [str(one.id) for _, one in plans["demonstrations"].tasks] == ["MoveCube/test/0"]
     assert len(plans["distractors"].tasks) == 27
+    few = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
+    assert len(few["distractors"].tasks) == 18
 
 
 @pytest.mark.parametrize(
@@ -255,6 +257,8 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
         ({"workers": 0}, {}, InvalidOptionError),
         ({"codec": "h264"}, {}, InvalidOptionError),
         ({"episodes": "3-1"}, {}, InvalidOptionError),
+        ({"time_limit": 0.0}, {}, InvalidOptionError),
+        ({"time_limit": float("nan")}, {}, InvalidOptionError),
         ({"columns": ("front",)}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
@@ -269,5 +273,14 @@ def test_build_all_refuses_before_it_reads(
 ) -> None:
     asked = {"source": ("sample",), "out": tmp_path / "out", **changes}
     with pytest.raises(error):
-        plan_all(BuildConfig(**asked), PlanConfig(**plan))
+        plan_all(AllConfig(**asked), PlanConfig(**plan))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "distractors", "manifests"])
+def test_build_all_refuses_strangers_folders_first(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "out" / name
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(BuildError, match=f"{name} exists"):
+        plan_all(config(tmp_path), PlanConfig())
