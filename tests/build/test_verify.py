@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.damage import flipped_bits
 from support.made_up import record, write_metadata
+from support.retrieval import make_index
 from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
 
 from robomme_interference_data import load_split
@@ -96,6 +97,19 @@ def test_a_flipped_bit_anywhere(own_split: Path, path: str) -> None:
             _expect_of_header(own_split)
         else:
             expect(own_split, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
+
+
+def test_a_flipped_bit_in_the_header_of_an_index(own_split: Path) -> None:
+    make_index(own_split)
+    assert found(own_split) == []
+    path = own_split / "distractors/index/thumbnail/index.json"
+    header = json.loads(path.read_text())
+    for changes in ({"typical_cosine": 0.5}, {"computed": {}}, {"encoder": {"name": "thumbnail"}}):
+        path.write_text(json.dumps(header | changes))
+        expect(own_split, "index/thumbnail: .*")
+    path.write_text(json.dumps(header, indent=2))
+    for _ in flipped_bits(path, 4):
+        expect(own_split, "distractors/index/thumbnail: .*")
 
 
 def _expect_of_header(root: Path) -> None:
