@@ -6,7 +6,14 @@ from dataclasses import asdict, dataclass, field
 from statistics import mean
 from typing import Any
 
-from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, DISTRACTORS
+from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    MANIFEST_HEADER,
+    MANIFESTS,
+)
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
@@ -94,15 +101,21 @@ def audit_split(split: Split) -> Audit:
     audit = Audit({name: dict.fromkeys(pool, 0) for name in split.conditions})
     audit.leaks += _pool_leaks(units, queries)
     for manifest in split.manifests():
-        uses = audit.uses[manifest.condition]
+        uses = audit.uses.get(manifest.condition)
+        if uses is None:
+            path = split.root / MANIFESTS / MANIFEST_HEADER
+            raise FormatError.damaged(path, f"{manifest.condition} is not among its conditions")
         places = audit.places.setdefault(manifest.condition, {})
         drawn: Counter[EpisodeId] = Counter()
-        for session in (one for one in manifest.sessions if one.role == "distractor"):
+        for session in manifest.sessions:
             where = f"{manifest}: {session.source}"
+            own = session.role == "lesson" and session.source == manifest.episode_id
+            if session.source.split != "train" and not own:  # whatever its role
+                audit.leaks.append(Leak("not a train episode", where))
+            if session.role != "distractor":
+                continue
             if manifest.episode_id.family in (session.family, session.source.family):
                 audit.leaks.append(Leak("same family", where))
-            if session.source.split != "train":
-                audit.leaks.append(Leak("not a train episode", where))
             if session.source in drawn:
                 audit.leaks.append(Leak("repeated unit", where))
             uses[session.source] = uses.get(session.source, 0) + 1

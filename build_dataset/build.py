@@ -88,7 +88,7 @@ def build_dataset(
             "--out", str(out), "a path in UTF-8: LeRobot's writer can use no other"
         ) from None
     with working(out) as work:
-        earlier = _earlier(out, plan)
+        earlier = find_earlier(out, plan)
         stored = list(earlier.episodes) if earlier else []
         skipped = dict(earlier.skipped) if earlier else {}
         known = {*skipped, *(str(one.record.episode_id) for one in stored)}
@@ -105,8 +105,13 @@ def build_dataset(
 # --- what is there already ---------------------------------------------------------------------
 
 
-def _earlier(out: Path, plan: BuildPlan) -> Earlier | None:
-    """Return the dataset that is there, built in the same way; None if nothing is."""
+def find_earlier(out: Path, plan: BuildPlan) -> Earlier | None:
+    """Return the dataset that is there, built in the same way; None if nothing is.
+
+    Raises:
+        BuildError: Something else is there.
+        MissingFileError, FormatError: It is damaged.
+    """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / IDENTITY_PATH).is_file():

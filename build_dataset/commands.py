@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from robomme_interference_data.build_dataset.config import (
+    AllConfig,
     BuildConfig,
     BuildPlan,
     PlanConfig,
@@ -45,13 +46,16 @@ robomme-interference show MoveCube/train/0 k3 --split my-split --out strip.png
 `build all` is these three, with S=my-split:
 
 ```
-robomme-interference build demonstrations --source robomme-h5:recordings/ --out $S/demonstrations
-robomme-interference build distractors --source robomme-h5:recordings/ --out $S/distractors
+robomme-interference build demonstrations --source robomme-h5:recordings/ \\
+    --out $S/demonstrations
+robomme-interference build distractors --source robomme-h5:recordings/ \\
+    --out $S/distractors
 robomme-interference build manifests $S --conditions no-history k0 k1 k3 k7
 ```
 """,
 )
 
+_KEPT = "Finished episodes are kept"
 _TOLD = 10
 """Episodes that are named when they are left out."""
 
@@ -72,7 +76,8 @@ def demonstrations(config: BuildConfig, as_json: AsJson = False) -> None:
         --cameras front --out S/demonstrations
     ```
     """
-    _build(plan_build(DEMONSTRATIONS, config), config.out, config.workers, as_json=as_json)
+    with stoppable(_KEPT):
+        _build(plan_build(DEMONSTRATIONS, config), config.out, config.workers, as_json=as_json)
 
 
 @app.command()
@@ -89,7 +94,8 @@ def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
         --cameras front --out S/distractors
     ```
     """
-    _build(plan_build(DISTRACTORS, config), config.out, config.workers, as_json=as_json)
+    with stoppable(_KEPT):
+        _build(plan_build(DISTRACTORS, config), config.out, config.workers, as_json=as_json)
 
 
 @app.command()
@@ -106,24 +112,30 @@ def manifests(
     robomme-interference build manifests my-split --conditions no-history k0 k1 k3 k7 --seed 0
     ```
     """
-    _plan(split, config, as_json=as_json)
+    with stoppable("Both datasets are kept"):
+        _plan(split, config, as_json=as_json)
 
 
 @app.command(name="all")
 @with_settings
-def build_all(config: BuildConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
+def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
     """Build demonstrations, distractors and manifests from the same sources.
 
-    Filters choose the query episodes; the units are of all families' train episodes.
+    Filters choose the query episodes; the units are of all families' train episodes, or of those
+    that --unit-episodes names.
 
     Example:
     ```
     robomme-interference build all --source robomme-h5:recordings/ --out my-split
     ```
     """
-    for kind, step in plan_all(config, plan).items():
-        _build(step, config.out / kind, config.workers, as_json=False)
-    _plan(config.out, plan, as_json=as_json)
+    with stoppable(_KEPT):
+        steps = plan_all(config, plan)
+        taken = " and ".join(f"{kind} of {len(step.tasks):,}" for kind, step in steps.items())
+        say(f"Recorded episodes to take: {taken}")
+        for kind, step in steps.items():
+            _build(step, config.out / kind, config.workers, as_json=False)
+        _plan(config.out, plan, as_json=as_json)
     say(f"Next: robomme-interference verify {config.out}")
 
 
@@ -132,7 +144,7 @@ def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
     from robomme_interference_data.execution import Processes
     from robomme_interference_data.work_progress import WorkProgress
 
-    with stoppable("Finished episodes are kept"), WorkProgress(unit="episodes") as progress:
+    with WorkProgress(unit="episodes") as progress:
         result = build_dataset(plan, out, Processes(workers), progress)
     done = f"{result.added} added" if result.added else "was built before"
     say(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
@@ -189,7 +201,11 @@ def verify(
         for violation in violations:
             typer.echo(f"{violation.where}: {violation.what}")
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
-        say(f"{len(violations)} violations" if violations else f"All {what} of {split} hold.")
+        say(
+            f"{len(violations)} violation{'s' * (len(violations) > 1)}"
+            if violations
+            else f"All {what} of {split} hold."
+        )
     if violations:
         raise typer.Exit(1)
 
@@ -216,6 +232,10 @@ def audit(
             typer.echo(table.text() + "\n")
         for leak in report.leaks:
             typer.echo(f"LEAK, {leak.kind}: {leak.where}")
-        say(f"{len(report.leaks)} leaks" if report.leaks else "No leaks.")
+        say(
+            f"{len(report.leaks)} leak{'s' * (len(report.leaks) > 1)}"
+            if report.leaks
+            else "No leaks."
+        )
     if report.leaks:
         raise typer.Exit(1)

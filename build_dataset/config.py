@@ -14,13 +14,16 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     POSITION_LIMIT,
     SPLITS,
+    UNIT_FRAMES,
 )
 from robomme_interference_data.errors import InvalidOptionError, SourceError
-from robomme_interference_data.ids import parse_numbers
+from robomme_interference_data.ids import EpisodeId, parse_numbers
+from robomme_interference_data.records import SessionEntry
 from robomme_interference_data.settings import setting
 
 if TYPE_CHECKING:
     from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
+    from robomme_interference_data.draw import UnitPool
 
 _CPUS = os.cpu_count() or 1
 
@@ -48,7 +51,7 @@ class BuildConfig:
     time_limit: float | None = setting(
         None,
         help="Seconds that one episode may take before it is tried once more.",
-        shown="300 on tabletop, else 1800",
+        shown="300 on tabletop and sample, else 1800",
     )
     columns: tuple[str, ...] = setting(
         (), metavar="NAME=COLUMN…", help="lerobot sources: where columns are named otherwise."
@@ -58,6 +61,15 @@ class BuildConfig:
     )
     robomme_python: str | None = setting(
         None, help="Source robomme: interpreter that has RoboMME.", env="ROBOMME_PYTHON"
+    )
+
+
+@dataclass(frozen=True)
+class AllConfig(BuildConfig):
+    """What to build a whole split of."""
+
+    unit_episodes: str | None = setting(
+        None, help="Numbers of the train episodes that give units, such as 0-3; default: all."
     )
 
 
@@ -97,24 +109,51 @@ class BuildPlan:
     time_limit: float | None = None
 
 
-def plan_all(config: BuildConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
+def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
     """Plan both datasets of a split, and check all that can be known before anything is read.
 
     Raises:
         PoolTooSmallError: Even if every train episode yielded a unit, there were too few.
         InvalidIdError, InvalidOptionError, SourceError: As `plan_build` and `in_order`.
+        BuildError: Something else lies where one of the outputs is to be.
     """
+    from robomme_interference_data.build_dataset.build import find_earlier
+    from robomme_interference_data.build_dataset.manifests import check_place
     from robomme_interference_data.draw import UnitPool
 
     conditions = in_order(plan.conditions)
     position_limit(plan)
     queries = plan_build(DEMONSTRATIONS, config)
-    every = dataclasses.replace(config, families=(), episodes=None, split="train")
+    every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
     units = plan_build(DISTRACTORS, every)
     pool = UnitPool(episode.id for _, episode in units.tasks)
     for query in {episode.id.family: episode.id for _, episode in queries.tasks}.values():
-        pool.draw(query, max(condition.k for condition in conditions))
-    return {DEMONSTRATIONS: queries, DISTRACTORS: units}
+        for condition in conditions:
+            condition.sessions(_Unread(query, pool))
+    plans = {DEMONSTRATIONS: queries, DISTRACTORS: units}
+    for kind, one in plans.items():
+        find_earlier(config.out.resolve() / kind, one)
+    check_place(config.out)
+    return plans
+
+
+@dataclass(frozen=True)
+class _Unread:
+    """The material of a query before anything is read: it tells whether units are enough."""
+
+    query: EpisodeId
+    pool: "UnitPool"
+
+    def lesson(self) -> SessionEntry:
+        return self._entry("lesson", DEMONSTRATIONS, self.query)
+
+    def units(self, k: int) -> Sequence[SessionEntry]:
+        return [
+            self._entry("distractor", DISTRACTORS, unit) for unit in self.pool.draw(self.query, k)
+        ]
+
+    def _entry(self, role: str, kind: str, source: EpisodeId) -> SessionEntry:
+        return SessionEntry(role, source.family, source, kind, "", 0, 0, UNIT_FRAMES, 1, "")
 
 
 def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
@@ -129,6 +168,8 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
     from robomme_interference_data.execution import Processes
 
     get_codec(config.codec)
+    if config.time_limit is not None and not config.time_limit > 0:
+        raise InvalidOptionError.expected("--time-limit", config.time_limit, "seconds, above 0")
     Processes(config.workers)
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
     pairs = [text.partition("=") for text in config.columns]

@@ -13,9 +13,27 @@ from robomme_interference_data.build_dataset.image_stats import before_scaling
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.constants import EPISODES_DIR, REPORT_PATH
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.files import LocalFiles, read_json
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.rows import read_header
+
+
+@dataclass(frozen=True)
+class _Skipped:
+    episode_id: EpisodeId
+    why: str
+
+
+@dataclass(frozen=True)
+class _Report:
+    """`meta/build_report.json`."""
+
+    format_version: int
+    kind: str
+    counts: dict[str, Any]
+    skipped: tuple[_Skipped, ...]
 
 
 @dataclass(frozen=True)
@@ -45,8 +63,8 @@ def read_earlier(root: Path) -> Earlier:
     table = pa.concat_tables(tables).sort_by("episode_index")
     names = [name for name in table.column_names if name.startswith("stats/")]
     statistics = table.select(names).to_pylist()
-    report = read_json(root / REPORT_PATH)
-    skipped = {str(one["episode_id"]): str(one["why"]) for one in report["skipped"]}
+    report = read_header(root / REPORT_PATH, _Report)
+    skipped = {str(one.episode_id): one.why for one in report.skipped}
     episodes = (
         _stored(dataset, record, told)
         for record, told in zip(dataset.records(), statistics, strict=True)

@@ -9,6 +9,7 @@ lossless codec.
 
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -24,6 +25,7 @@ from robomme_interference_data.constants import (
     EPISODES_DIR,
     FORMAT_VERSION,
     IDENTITY_PATH,
+    INDEX_DIR,
     REPORT_PATH,
     STATS_PATH,
     SUMS_PATH,
@@ -31,8 +33,7 @@ from robomme_interference_data.constants import (
     UNIT_STRIDE,
 )
 from robomme_interference_data.files import (
-    Files,
-    LocalFiles,
+    all_files,
     canonical_json,
     format_sums,
     sha256_file,
@@ -47,15 +48,15 @@ _LEROBOTS = ("episode_index", "length")
 """Fields of a record that LeRobot writes."""
 
 
-def listed_files(files: Files) -> list[str]:
+def listed_files(root: Path) -> list[str]:
     """Return the files of a dataset whose SHA-256 is recorded: all but the list and what it names.
 
-    An index has a list of its own, and what people put beside a dataset has none: a README, and
-    hidden files.
+    An index has a list of its own, and what people put beside a dataset has none: README, LICENSE,
+    and hidden files.
     """
-    folders = ("meta", "data", "videos")
-    known = (IDENTITY_PATH, SUMS_PATH)
-    return [path for folder in folders for path in files.list(folder) if path not in known]
+    own = (IDENTITY_PATH, SUMS_PATH)
+    beside = re.compile(rf"(README|LICENSE)[^/]*|\..*|{INDEX_DIR}/.*")
+    return [path for path in all_files(root) if path not in own and not beside.fullmatch(path)]
 
 
 def identity_of(
@@ -112,7 +113,7 @@ def complete_dataset(
         "skipped": [{"episode_id": name, "why": why} for name, why in sorted(skipped.items())],
     }
     write_json(root / REPORT_PATH, report)
-    write_text(root / SUMS_PATH, format_sums(root, listed_files(LocalFiles(root))))
+    write_text(root / SUMS_PATH, format_sums(root, listed_files(root)))
     identity = replace(identity, sums=sha256_file(root / SUMS_PATH))
     write_json(root / IDENTITY_PATH, to_dict(identity))
 

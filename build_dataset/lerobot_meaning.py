@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
@@ -101,9 +102,10 @@ def _rows(dataset: Dataset, index: int, first: int, task: int | None) -> Iterato
     ):
         if not np.array_equal(rows.scalars(name), expected):
             yield path, f"{name} of episode {index} is not {expected[0]} to {expected[-1]}"
-    table = rows.table(["timestamp"])
-    times = table["timestamp"].to_numpy()
-    if np.abs(times - frames / dataset.lerobot.fps).max() > _TOLERANCE_S:
+    times = rows.table(["timestamp"])["timestamp"]
+    if not pa.types.is_floating(times.type):
+        yield path, f"timestamp of episode {index} is of type {times.type}"
+    elif not np.allclose(times.to_numpy(), frames / dataset.lerobot.fps, 0, _TOLERANCE_S):
         yield path, f"timestamp of episode {index} is not frame_index / {dataset.lerobot.fps:g}"
 
 

@@ -157,9 +157,8 @@ class _Material:
         return self._lesson
 
     def units(self, k: int) -> Sequence[SessionEntry]:
-        if k > len(self._units):  # drawn once for the largest k: smaller ones begin it
-            most = max(k, *(condition.k for condition in self._plan.conditions))
-            drawn = self._plan.pool.draw(self._record.episode_id, most)
+        if k > len(self._units):  # fewer begin those that are drawn
+            drawn = self._plan.pool.draw(self._record.episode_id, k)
             self._units = [self._plan.units[unit] for unit in drawn]
         return self._units[:k]
 
@@ -180,7 +179,8 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
         PoolTooSmallError: A query needs more units than the other families have.
         HistoryTooLongError: A buffer exceeds the position limit.
     """
-    exact = {one.episode_id: one.exact for one in plan.distractors.records()}
+    datasets = {one.kind: one for one in (plan.demonstrations, plan.distractors)}
+    exact = {(kind, e.episode_id): e.exact for kind, d in datasets.items() for e in d.records()}
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
         query, material = Query(plan.demonstrations, record), _Material(plan, record)
         for condition in plan.conditions:
@@ -196,7 +196,7 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
                 seed=record.seed,
                 difficulty=record.difficulty,
                 simulator=record.simulator,
-                exact=record.exact and all(exact.get(entry.source, True) for entry in entries),
+                exact=record.exact and all(exact[one.dataset, one.source] for one in entries),
                 lesson_frames=lesson_frames(placed, 0, frames),
                 history_frames=frames,
                 lesson_share=lesson_share(placed, 0, frames),
@@ -218,6 +218,21 @@ def _check_length(
         )
 
 
+def check_place(root: Path) -> None:
+    """Check that nothing else lies where the manifests of a split are to be.
+
+    Raises:
+        BuildError: The folder holds something else.
+    """
+    out = root.resolve() / MANIFESTS
+    strangers = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    strangers -= {MANIFEST_ROWS, MANIFEST_HEADER}
+    if (strangers and not (out / MANIFEST_HEADER).is_file()) or out.is_file():
+        raise BuildError(
+            f"{out} exists and holds no manifests, but {min(strangers, default='is a file')}"
+        )
+
+
 def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
     """Write the manifests of a split; yields the number of buffers done after each batch.
 
@@ -236,9 +251,7 @@ def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
     with working(out) as work:
         try:
             out.mkdir(exist_ok=True)
-            strangers = {path.name for path in out.iterdir()} - {rows.name, header.name}
-            if strangers and not header.is_file():
-                raise BuildError(f"{out} exists and holds no manifests, but {min(strangers)}")
+            check_place(root)
             written = work / rows.name
             counts = yield from _write_rows(plan, written)
             write_json(work / header.name, to_dict(_header(plan, counts, sha256_file(written))))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.build_dataset.identity import identity_of, listed_files
@@ -24,11 +24,13 @@ from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.embeddings import IndexHeader, index_folder
 from robomme_interference_data.encode import CODECS
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.files import LocalFiles, sha256_file
+from robomme_interference_data.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.records import EpisodeRecord, ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.split import load_split
 from robomme_interference_data.work_progress import WorkProgress
+
+_TOO_MANY = "is too many: it is in no list"
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,9 @@ def verify_split(
 def _split(
     root: Path, header: ManifestHeader, decode: bool, progress: WorkProgress
 ) -> Iterator[Violation]:
+    for path in all_files(root / MANIFESTS):
+        if path not in (MANIFEST_HEADER, MANIFEST_ROWS):
+            yield Violation(f"{MANIFESTS}/{path}", _TOO_MANY)
     rows = root / MANIFESTS / MANIFEST_ROWS
     if not rows.is_file():
         yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", "is missing")
@@ -85,9 +90,9 @@ def _split(
     progress.start("Verifying", frames if decode else 0)
     pool = datasets.get(DISTRACTORS)
     for name, dataset in datasets.items():
-        yield from _told(name, _dataset(name, dataset, header, progress if decode else None))
+        yield from _told(name, _dataset(root, name, dataset, header, progress if decode else None))
         if pool is not None:
-            yield from _told(name, _indexes(name, dataset, pool.revision))
+            yield from _indexes(root, name, dataset, pool.revision)
     if len(datasets) == len(header.datasets):
         yield from _told(MANIFESTS, _buffers(root, header))
 
@@ -101,9 +106,9 @@ def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
 
 
 def _dataset(
-    name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
+    root: Path, name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
 ) -> Iterator[Violation]:
-    yield from _files(name, dataset, header)
+    yield from _files(root, name, dataset, header)
     records = list(dataset.records())
     yield from _identity(name, dataset, records, header)
     yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
@@ -115,18 +120,18 @@ def _dataset(
             progress.advance(record.length)
 
 
-def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
+def _files(root: Path, name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
     """Check every byte of a dataset: identity, list of sums, and all files in it."""
     files = dataset.files
     if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
         what = f"does not have the SHA-256 of {MANIFESTS}/{MANIFEST_HEADER}"
         yield Violation(f"{name}/{IDENTITY_PATH}", what)
-    sums, there = dataset.sums(), set(listed_files(files))
+    sums, there = dataset.sums(), set(listed_files(root / name))
     for path in sorted(sums.keys() | there):
-        if path not in there:
+        if path not in sums:
+            yield Violation(f"{name}/{path}", _TOO_MANY)
+        elif path not in there or not (root / name / path).is_file():
             yield Violation(f"{name}/{path}", "is missing")
-        elif path not in sums:
-            yield Violation(f"{name}/{path}", "is too many: it is in no list")
         elif sha256_file(files.path(path)) != sums[path]:
             yield Violation(f"{name}/{path}", "does not have the recorded SHA-256")
 
@@ -169,11 +174,20 @@ def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Vi
                 yield Violation(where, told)
 
 
-def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
+def _indexes(root: Path, name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
     """Check the embeddings beside a dataset, whatever encoders and cameras they are of."""
-    for path in dataset.files.list(INDEX_DIR, f"/{INDEX_HEADER}"):
-        folder = str(PurePath(path).parent)
+    folders: dict[str, list[str]] = {}
+    for path in all_files(root / name / INDEX_DIR):
+        folder, _, file = path.partition("/")
+        if not file:
+            yield Violation(f"{name}/{INDEX_DIR}/{path}", _TOO_MANY)
+        elif not path.startswith("."):  # one that is being made
+            folders.setdefault(f"{INDEX_DIR}/{folder}", []).append(path)
+    for folder, files in folders.items():
         yield from _told(f"{name}/{folder}", _index(name, dataset, folder, pool))
+        for path in files:
+            if not (root / name / INDEX_DIR / path).is_file():
+                yield Violation(f"{name}/{INDEX_DIR}/{path}", "leads nowhere")
 
 
 def _index(name: str, dataset: Dataset, folder: str, pool: str) -> Iterator[Violation]:

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -262,6 +262,7 @@ class _Work:
             typical_cosine=typical,
             sums=sha256_file(made / INDEX_SUMS),
         )
+        header = replace(header, sha256=header.digest())
         write_json(made / INDEX_HEADER, to_dict(header))
         if self.folder.exists():
             self.folder.rename(self.hidden / "before")

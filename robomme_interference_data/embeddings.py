@@ -7,6 +7,7 @@ only. Every episode has a file of its own. `docs/format.md` lists them.
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -29,8 +30,14 @@ from robomme_interference_data.errors import (
     StaleIndexError,
     UnknownNameError,
 )
-from robomme_interference_data.files import Files, LocalFiles, parse_sums, sha256_file
-from robomme_interference_data.rows import read_header
+from robomme_interference_data.files import (
+    Files,
+    LocalFiles,
+    canonical_json,
+    parse_sums,
+    sha256_file,
+)
+from robomme_interference_data.rows import read_header, to_dict
 
 CENTRE_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"
@@ -66,6 +73,7 @@ class IndexHeader:
         size: Values in an embedding.
         typical_cosine: Median cosine of two frames of different distractor units of the pool.
         sums: SHA-256 of `SHA256SUMS`, which lists the other files.
+        sha256: SHA-256 of the canonical JSON of all other fields.
     """
 
     format_version: int
@@ -78,6 +86,12 @@ class IndexHeader:
     size: int
     typical_cosine: float
     sums: str
+    sha256: str = ""
+
+    def digest(self) -> str:
+        """Return what `sha256` must be."""
+        fields = {name: one for name, one in to_dict(self).items() if name != "sha256"}
+        return sha256(canonical_json(fields).encode()).hexdigest()
 
 
 def episode_file(episode_index: int) -> str:
@@ -238,6 +252,9 @@ class EmbeddingIndex:
         Raises:
             FormatError: A file is missing or damaged, or one is too many.
         """
+        finite = np.isfinite(self.header.typical_cosine)
+        if not finite or self.header.sha256 != self.header.digest():
+            raise self._damaged(f"{INDEX_HEADER} does not have the SHA-256 that it records")
         _ = self.centre
         for episode, length in lengths.items():
             self.span(episode, 0, length)

@@ -96,6 +96,12 @@ class LocalFiles:
         return str(self.root)
 
 
+def all_files(root: Path) -> list[str]:
+    """Return the sorted relative paths of all that is no folder, links that lead nowhere too."""
+    found = (path for path in root.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(root).as_posix() for path in found)
+
+
 def check_relative(relative: str, where: str) -> str:
     """Return a relative path that stays in its folder.
 

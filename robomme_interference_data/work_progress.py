@@ -45,6 +45,7 @@ class WorkProgress:
             _Speed(unit),
             TimeRemainingColumn(),
             console=Console(stderr=True, quiet=quiet),
+            speed_estimate_period=3600,  # s; one piece of work may take half of it
         )
         self._task: TaskID | None = None
 
@@ -58,6 +59,7 @@ class WorkProgress:
     def start(self, description: str, frames: int) -> None:
         """Begin a new bar of so many frames."""
         self._task = self._progress.add_task(description, total=frames)
+        self._progress.advance(self._task, 0)  # the speed is since then
 
     def advance(self, frames: int, *, before: bool = False) -> None:
         """Count frames as done.
@@ -71,6 +73,7 @@ class WorkProgress:
         if before:
             task = next(task for task in self._progress.tasks if task.id == self._task)
             self._progress.reset(self._task, completed=int(task.completed) + frames)
+            self._progress.advance(self._task, 0)
         else:
             self._progress.advance(self._task, frames)
 

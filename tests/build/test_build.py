@@ -1,5 +1,7 @@
 """Whole builds in this process: what is written, what goes on, what grows, what is refused."""
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ from support.splits import GOLDEN, contents
 
 from robomme_interference_data.build_dataset.build import BuildResult, build_dataset
 from robomme_interference_data.build_dataset.config import (
-    BuildConfig,
+    AllConfig,
     BuildPlan,
     PlanConfig,
     list_episodes,
@@ -21,6 +23,7 @@ from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
+    FormatError,
     InterferenceError,
     InvalidIdError,
     InvalidOptionError,
@@ -28,7 +31,7 @@ from robomme_interference_data.errors import (
     SourceError,
 )
 from robomme_interference_data.execution import Serial
-from robomme_interference_data.files import LocalFiles, hold, work_folder
+from robomme_interference_data.files import LocalFiles, hold, read_json, work_folder
 from robomme_interference_data.work_progress import WorkProgress
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
@@ -155,6 +158,15 @@ def test_a_dataset_that_was_built_otherwise_is_left_as_it_is(
     assert contents(built) == before
 
 
+@pytest.mark.parametrize("changes", [{"skipped": None}, {"skipped": [{}]}, None])
+def test_a_report_that_is_damaged(built: Path, tmp_path: Path, changes: Any) -> None:
+    out = shutil.copytree(built, tmp_path / "out")
+    path = out / "meta/build_report.json"
+    path.write_text("{}" if changes is None else json.dumps(read_json(path) | changes))
+    with pytest.raises(FormatError, match=r"build_report\.json"):
+        build(out, MadeUpSource({"A/train/1": (260, 5)}, provenance=TABLETOP))
+
+
 def test_episodes_of_other_cameras_mix_in_those_that_all_have(tmp_path: Path) -> None:
     one = MadeUpSource({"A/train/0": (260, None)})
     both = MadeUpSource({"B/train/0": (260, None)}, cameras=("front", "wrist"))
@@ -231,8 +243,8 @@ def test_filters() -> None:
         listed(source, source)
 
 
-def config(tmp_path: Path, *source: str, **changes: Any) -> BuildConfig:
-    return BuildConfig(source=source or ("sample",), out=tmp_path / "out", **changes)
+def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
+    return AllConfig(source=source or ("sample",), out=tmp_path / "out", **changes)
 
 
 def test_units_are_of_train_episodes(tmp_path: Path) -> None:
@@ -241,6 +253,8 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
     plans = plan_all(config(tmp_path, split="test", families=("MoveCube",)), PlanConfig())
     assert [str(one.id) for _, one in plans["demonstrations"].tasks] == ["MoveCube/test/0"]
     assert len(plans["distractors"].tasks) == 27
+    few = plan_all(config(tmp_path, episodes="0", unit_episodes="0-1"), PlanConfig())
+    assert len(few["distractors"].tasks) == 18
 
 
 @pytest.mark.parametrize(
@@ -249,6 +263,8 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
         ({"workers": 0}, {}, InvalidOptionError),
         ({"codec": "h264"}, {}, InvalidOptionError),
         ({"episodes": "3-1"}, {}, InvalidOptionError),
+        ({"time_limit": 0.0}, {}, InvalidOptionError),
+        ({"time_limit": float("nan")}, {}, InvalidOptionError),
         ({"columns": ("front",)}, {}, InvalidOptionError),
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
@@ -263,5 +279,14 @@ def test_build_all_refuses_before_it_reads(
 ) -> None:
     asked = {"source": ("sample",), "out": tmp_path / "out", **changes}
     with pytest.raises(error):
-        plan_all(BuildConfig(**asked), PlanConfig(**plan))
+        plan_all(AllConfig(**asked), PlanConfig(**plan))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "distractors", "manifests"])
+def test_build_all_refuses_strangers_folders_first(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "out" / name
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(BuildError, match=f"{name} exists"):
+        plan_all(config(tmp_path), PlanConfig())

@@ -8,11 +8,13 @@ from support.made_up import record, write_metadata
 from support.splits import CONDITIONS, GOLDEN, QUERIES, contents, copy_split
 
 from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
 from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     planned_buffers,
     write_manifests,
 )
+from robomme_interference_data.conditions import KINDS, Kind
 from robomme_interference_data.digest import combine
 from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import (
@@ -91,6 +93,24 @@ def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
     queries = [record("demonstrations", "MoveCube/test/0")]
     plan = plan_manifests(made_up(tmp_path, queries=queries, units=units), ("k0", "k3"))
     assert [one.exact for one in planned_buffers(plan)] == [True, False]
+
+
+def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a kind's k means is its rule's own affair: here it takes one unit more."""
+    more = Kind("more", lambda material, k: tuple(material.units(k + 1)))
+    monkeypatch.setitem(KINDS, "more", more)
+    root = made_up(tmp_path)
+    plan = plan_manifests(root, ("k1", "more-k1", "more-k8"))
+    found = {one.condition: one.sessions for one in list(planned_buffers(plan))[:3]}
+    assert [len(sessions) for sessions in found.values()] == [2, 2, 9]
+    assert found["more-k1"] == found["more-k8"][:2]
+    with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):
+        list(planned_buffers(plan_manifests(root, ("more-k9",))))
+    split = tmp_path / "split"
+    asked = AllConfig(source=("sample:MoveCube,PatternLock",), out=split, split="test")
+    assert plan_all(asked, PlanConfig(conditions=("more-k1",)))
+    with pytest.raises(PoolTooSmallError, match="needs 4 distractor units"):
+        plan_all(asked, PlanConfig(conditions=("more-k3",)))
 
 
 def test_a_pool_too_small(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.damage import flipped_bits
 from support.made_up import record, write_metadata
+from support.retrieval import make_index
 from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
 
 from robomme_interference_data import load_split
@@ -57,6 +58,14 @@ def first_changed(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
     return lambda table: put(table, name, [value, *table[name].to_pylist()[1:]])
 
 
+def as_text(name: str) -> Callable[[pa.Table], pa.Table]:
+    def change(table: pa.Table) -> pa.Table:
+        place, values = table.column_names.index(name), table[name].to_pylist()
+        return table.set_column(place, name, pa.array(list(map(str, values))))
+
+    return change
+
+
 # --- nothing to find -----------------------------------------------------------------------------
 
 
@@ -70,6 +79,7 @@ def test_a_clean_split() -> None:
 
 def test_what_people_put_beside_a_dataset_is_no_violation(own_split: Path) -> None:
     (own_split / "distractors" / "README.md").write_text("mine")
+    (own_split / "distractors" / "LICENSE").write_text("mine")
     (own_split / "demonstrations" / ".gitattributes").write_text("")
     assert found(own_split) == []
 
@@ -87,6 +97,19 @@ def test_a_flipped_bit_anywhere(own_split: Path, path: str) -> None:
             _expect_of_header(own_split)
         else:
             expect(own_split, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
+
+
+def test_a_flipped_bit_in_the_header_of_an_index(own_split: Path) -> None:
+    make_index(own_split)
+    assert found(own_split) == []
+    path = own_split / "distractors/index/thumbnail/index.json"
+    header = json.loads(path.read_text())
+    for changes in ({"typical_cosine": 0.5}, {"computed": {}}, {"encoder": {"name": "thumbnail"}}):
+        path.write_text(json.dumps(header | changes))
+        expect(own_split, "index/thumbnail: .*")
+    path.write_text(json.dumps(header, indent=2))
+    for _ in flipped_bits(path, 4):
+        expect(own_split, "distractors/index/thumbnail: .*")
 
 
 def _expect_of_header(root: Path) -> None:
@@ -123,10 +146,32 @@ def test_info_that_is_wrong(own_split: Path, before: str, after: str) -> None:
     expect(own_split, "info.json: does not have", "observation.state|is too long|is no path")
 
 
-@pytest.mark.parametrize("path", ["data/x.parquet", "videos/extra.mp4", "meta/more.json"])
-def test_a_file_too_many(own_split: Path, path: str) -> None:
-    (own_split / "distractors" / path).write_text("?")
-    expect(own_split, f"distractors/{path}: is too many")
+@pytest.mark.parametrize(
+    ("path", "told"),
+    [
+        *((f"distractors/{path}", "is too many") for path in ("data/x.parquet", "meta/more.json")),
+        *((f"distractors/{path}", "is too many") for path in ("extra.bin", "more/README.md")),
+        ("distractors/index/x.npy", "is too many"),
+        ("distractors/index/other", "index.json is missing"),
+        ("manifests/x.parquet", "is too many"),
+    ],
+)
+def test_a_file_too_many(own_split: Path, path: str, told: str) -> None:
+    file = own_split / path
+    file = file / "x.npy" if path.endswith("other") else file
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("?")
+    expect(own_split, f"{path}: .*{told}")
+
+
+def test_links_that_lead_nowhere(own_split: Path) -> None:
+    for path in ("distractors/videos/x.mp4", "demonstrations/index/other/x.npy"):
+        (own_split / path).parent.mkdir(parents=True, exist_ok=True)
+        (own_split / path).symlink_to("nowhere")
+    expect(own_split, r"videos/x\.mp4: is too many", r"index/other/x\.npy: leads nowhere")
+    (own_split / VIDEO).unlink()
+    (own_split / VIDEO).symlink_to("nowhere")
+    expect(own_split, f"{VIDEO}: is missing")
 
 
 # --- what the bytes mean: the sums are written anew by whoever changed the files -----------------
@@ -136,6 +181,8 @@ def test_a_file_too_many(own_split: Path, path: str) -> None:
     ("path", "change", "told"),
     [
         (DATA, first_changed("timestamp", 0.05), "timestamp of episode 3"),
+        (DATA, first_changed("timestamp", float("nan")), "timestamp of episode 3"),
+        (DATA, as_text("timestamp"), "timestamp of episode 3 is of type string"),
         (DATA, first_changed("task_index", 0), "task_index of episode 3"),
         (DATA, first_changed("index", 5), "index of episode 3"),
         (DATA, first_changed("frame_index", 1), "holds 32 rows of episode 3"),
@@ -341,23 +388,31 @@ def test_leaks_in_the_pool(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "kind"),
+    ("source", "role", "kind"),
     [
-        ("MoveCube/train/1", "same family"),
-        ("InsertPeg/test/1", "not a train episode"),
-        ("twice", "repeated unit"),
+        ("MoveCube/train/1", "distractor", "same family"),
+        ("InsertPeg/test/1", "distractor", "not a train episode"),
+        ("InsertPeg/val/1", "filler", "not a train episode"),
+        ("InsertPeg/test/1", "lesson", "not a train episode"),
+        ("twice", "distractor", "repeated unit"),
     ],
 )
-def test_leaks_in_a_buffer(own_split: Path, source: str, kind: str) -> None:
+def test_leaks_in_a_buffer(own_split: Path, source: str, role: str, kind: str) -> None:
     def change(table: pa.Table) -> pa.Table:
         rows = table["sessions"].to_pylist()
         place = table["condition"].to_pylist().index("k3", 5)  # MoveCube's
         first, second = rows[place][1:3]
         wanted = first["source"] if source == "twice" else source
-        second |= {"source": wanted, "family": wanted.split("/")[0]}
+        second |= {"source": wanted, "family": wanted.split("/")[0], "role": role}
         return put(table, "sessions", rows)
 
     edit(own_split / ROWS, change)
     leaks = audit_split(load_split(own_split)).leaks
     assert [leak.kind for leak in leaks] == [kind]
     assert leaks[0].where.startswith("MoveCube/test/0 under k3")
+
+
+def test_a_header_without_a_condition_of_the_rows(own_split: Path) -> None:
+    renew_header(own_split, conditions=["no-history", "k0"])
+    with pytest.raises(FormatError, match="k1 is not among its conditions"):
+        audit_split(load_split(own_split))

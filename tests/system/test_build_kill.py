@@ -98,6 +98,18 @@ def test_stopped_at_random_moments(
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
+def test_a_build_that_is_terminated_tells_how_to_go_on(server: BuildServer, tmp_path: Path) -> None:
+    pid = server.start(*command(tmp_path / "out", workers=1))
+    end = time.monotonic() + 60
+    while not staged(tmp_path / "out") and time.monotonic() < end:
+        time.sleep(0.01)
+    os.kill(pid, signal.SIGTERM)
+    finished = server.wait(pid)
+    assert finished.code == 143, finished.stderr
+    told = finished.stderr.split("go on with:\n")[1]
+    assert told.startswith("robomme-interference build distractors --source sample:MoveCube")
+
+
 def test_a_worker_that_is_killed_is_replaced(
     server: BuildServer, undisturbed: tuple[dict[str, bytes], float], tmp_path: Path
 ) -> None:
