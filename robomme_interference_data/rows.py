@@ -42,13 +42,37 @@ def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
 def to_dict(record: Any) -> dict[str, Any]:
     """Return a record as plain values, for JSON and Arrow: columns in order."""
     write = _codec(type(record)).write
-    plain: dict[str, Any] = write(record) if write else record
+    plain: dict[str, Any] = write(record, {}) if write else record
     return plain
 
 
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
-    """Return records as a table."""
-    return pa.Table.from_pylist(list(map(to_dict, records)), schema=schema)
+    """Return records as a table; parts that records share are converted once."""
+    kept = list(records)  # alive, so that an id is one object's
+    write = _codec(type(kept[0])).write if kept else None
+    shared: dict[int, Any] = {}
+    rows = [write(record, shared) for record in kept] if write else []
+    columns = {field.name: [row.get(field.name) for row in rows] for field in schema}
+    return pa.table([_column(columns[field.name], field.type) for field in schema], schema=schema)
+
+
+def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
+    """Return a column; of lists of records, each record that several lists share goes in once."""
+    if not (pa.types.is_list(kind) and pa.types.is_struct(kind.value_type)):
+        return pa.array(values, kind)
+    place: dict[int, int] = {}
+    distinct: list[Any] = []
+    picks: list[int] = []
+    offsets = [0]
+    for listed in values:
+        for one in listed:
+            if id(one) not in place:
+                place[id(one)] = len(distinct)
+                distinct.append(one)
+            picks.append(place[id(one)])
+        offsets.append(len(picks))
+    items = pa.array(distinct, kind.value_type).take(pa.array(picks, pa.int64()))
+    return pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), items, type=kind)
 
 
 def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:
@@ -111,6 +135,9 @@ def _names(record: Any) -> list[str]:
 
 # --- what follows from a type ------------------------------------------------------------------
 
+_Writer = Callable[[Any, dict[int, Any]], Any]
+"""From a value to a plain one; what is shared by many rows is remembered by its id."""
+
 
 @dataclass(frozen=True)
 class _Codec:
@@ -121,7 +148,7 @@ class _Codec:
 
     arrow: Callable[[Sequence[str]], pa.DataType]
     read: Callable[[Any], Any]
-    write: Callable[[Any], Any] | None = None
+    write: _Writer | None = None
     optional: bool = False
 
 
@@ -136,7 +163,7 @@ def _codec_of(hint: Any) -> _Codec:
             lambda value: value if type(value) is hint else hint(_of(types, value, expected)),
         )
     if hint is EpisodeId:
-        write = str
+        write = _remembered(lambda value, shared: str(value))
         return _Codec(lambda keys: pa.string(), EpisodeId.parse, write)
     if is_dataclass(hint):
         return _record(hint)
@@ -153,7 +180,7 @@ def _or_none(plain: _Codec) -> _Codec:
     return _Codec(
         plain.arrow,
         lambda value: None if value is None else read(value),
-        write and (lambda value: None if value is None else write(value)),
+        write and (lambda value, shared: None if value is None else write(value, shared)),
         optional=True,
     )
 
@@ -163,7 +190,7 @@ def _list(item: _Codec) -> _Codec:
     return _Codec(
         lambda keys: pa.list_(pa.field("item", item.arrow(keys), nullable=False)),
         lambda value: tuple(map(read, _of((list, tuple), value, "a list"))),
-        lambda value: [write(one) for one in value] if write else list(value),
+        lambda value, shared: [write(one, shared) for one in value] if write else list(value),
     )
 
 
@@ -177,7 +204,7 @@ def _map(item: _Codec) -> _Codec:
     return _Codec(
         lambda keys: pa.struct([pa.field(key, item.arrow(keys), nullable=False) for key in keys]),
         checked,
-        write and (lambda value: {key: write(one) for key, one in value.items()}),
+        write and (lambda value, shared: {key: write(one, shared) for key, one in value.items()}),
     )
 
 
@@ -206,16 +233,26 @@ def _record(record: Any) -> _Codec:
                 raise ValueError(f"{name}: {first_line(error)}") from None
         return record(**found)
 
-    def write(value: Any) -> Any:
+    def write(value: Any, shared: dict[int, Any]) -> Any:
         found = {}
         for name, codec in codecs.items():
             one = getattr(value, name)
-            found[name] = one if codec.write is None else codec.write(one)
+            found[name] = one if codec.write is None else codec.write(one, shared)
         if identified:
             found |= {part: getattr(value.episode_id, part) for part in _PARTS}
         return found
 
-    return _Codec(arrow, read, write)
+    return _Codec(arrow, read, _remembered(write))
+
+
+def _remembered(write: _Writer) -> _Writer:
+    def found(value: Any, shared: dict[int, Any]) -> Any:
+        plain = shared.get(id(value))
+        if plain is None:
+            plain = shared[id(value)] = write(value, shared)
+        return plain
+
+    return found
 
 
 def _of(types: tuple[type, ...], value: Any, expected: str) -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from support.retrieval import FRAMES, remade
+from support.retrieval import FRAMES, change_header, remade
 from support.splits import QUERIES
 
 from robomme_interference_data import load_split
@@ -47,8 +47,7 @@ def test_index(own_split: Path, run: Run) -> None:
         for place, count in zip(places, FRAMES, strict=True)
     ]
     header = own_split / "distractors/index/thumbnail/index.json"
-    computed = {"computed": {"in": "cuda, bfloat16", "batch": 32}}
-    header.write_text(json.dumps(json.loads(header.read_text()) | computed))
+    change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
     assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_split)[2]
     code, out, err = run("index", own_split, "--json")
     assert (code, err) == (0, "")

@@ -1,6 +1,5 @@
 """The index beside the data: what it holds, and how it is made and made again."""
 
-import json
 import os
 import shutil
 from pathlib import Path
@@ -8,7 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.retrieval import FRAMES, QUIET, Interrupted, TwoSums, files_of, make_index, remade
+from support.retrieval import (
+    FRAMES,
+    QUIET,
+    Interrupted,
+    TwoSums,
+    change_header,
+    files_of,
+    make_index,
+    remade,
+)
 from support.splits import QUERIES, UNITS
 
 from robomme_interference_data import load_buffer, load_split
@@ -134,10 +142,9 @@ def test_an_index_of_another_device_is_kept_one_of_other_units_is_not(
 ) -> None:
     shutil.copytree(indexed, own_split, dirs_exist_ok=True)
     header = own_split / "demonstrations/index/thumbnail/index.json"
-    whole = json.loads(header.read_text())
-    header.write_text(json.dumps(whole | {"computed": {"in": "cuda, bfloat16", "batch": 32}}))
+    change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
     assert make_index(own_split) == [0, 0]
-    header.write_text(json.dumps(whole | {"pool": "0" * 64}))
+    change_header(header, pool="0" * 64)
     assert make_index(own_split) == [FRAMES[0], 0]
 
 

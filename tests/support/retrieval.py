@@ -11,16 +11,25 @@ from support.splits import QUERIES, with_sessions
 
 from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_split
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
+from robomme_interference_data.embeddings import IndexHeader
+from robomme_interference_data.files import write_json
 from robomme_interference_data.records import place_sessions
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
 from robomme_interference_data.retrieval.select import Measured
+from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.work_progress import WorkProgress
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]
 """Stored frames of the golden split: demonstrations and units."""
+
+
+def change_header(path: Path, **fields: Any) -> None:
+    """Change fields of an index's header, and its SHA-256 with them."""
+    header = replace(read_header(path, IndexHeader), **fields)
+    write_json(path, to_dict(replace(header, sha256=header.digest())))
 
 
 class TwoSums:
