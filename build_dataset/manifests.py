@@ -183,8 +183,10 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
     exact = {(kind, e.episode_id): e.exact for kind, d in datasets.items() for e in d.records()}
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
         query, material = Query(plan.demonstrations, record), _Material(plan, record)
+        # The largest first: fewer units begin those that are drawn for it.
+        sessions = {one.name: one.sessions(material) for one in reversed(plan.conditions)}
         for condition in plan.conditions:
-            entries = condition.sessions(material)
+            entries = sessions[condition.name]
             placed = place_sessions(entries)
             frames = placed[-1].stop if placed else 0
             _check_length(plan, record, condition, frames)
