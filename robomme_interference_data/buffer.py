@@ -315,16 +315,17 @@ class Buffer:
         dataset, length = self._datasets[entry.dataset], entry.stop - entry.start
         name, cached = self._cached(entry, camera)
         piece = _PIECE if self._threads > 1 else length
+        shown = target.reshape(length, entry.repeat, *target.shape[1:])  # a view
 
         def read(first: int) -> None:
-            start, last = entry.start + first, min(first + piece, length)
-            frames: Iterable[NDArray[np.uint8]] = (
-                dataset.iter_frames(entry.episode_index, camera, start, entry.start + last)
-                if cached is None
-                else cached[first:last]
-            )
+            last = min(first + piece, length)
+            if cached is not None:
+                shown[first:last] = cached[first:last, None]
+                return
+            start, stop = entry.start + first, entry.start + last
+            frames = dataset.iter_frames(entry.episode_index, camera, start, stop)
             for number, frame in enumerate(frames, first):
-                target[number * entry.repeat : (number + 1) * entry.repeat] = frame
+                shown[number] = frame
 
         reading = [pool.submit(read, first) for first in range(0, length, piece)]
 
@@ -332,7 +333,7 @@ class Buffer:
             for one in reading:
                 one.result()
             if cached is None:
-                self._keep(name, target[:: entry.repeat])
+                self._keep(name, shown[:, 0])
 
         return finish
 
