@@ -6,6 +6,8 @@ SHELL := bash
 BIN := .venv/bin
 # The folders that pyproject.toml maps under robomme_interference_data.
 AREAS := $(filter-out robomme_interference_data,$(patsubst %/__init__.py,%,$(wildcard */__init__.py)))
+# Compiled modules are kept: to compile torch and lerobot again in every process takes half a minute.
+unexport PYTHONDONTWRITEBYTECODE
 # Extra arguments for pytest, e.g. make test ARGS="-k loader".
 ARGS ?=
 

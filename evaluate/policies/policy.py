@@ -1,5 +1,6 @@
 """What every policy is to the harness, whatever is behind it."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -31,7 +32,7 @@ class RolloutInfo:
     simulator: Simulator | None = None
 
 
-class Policy:
+class Policy(ABC):
     """A policy together with its memory, one rollout at a time.
 
     The calls come in this order:
@@ -40,7 +41,7 @@ class Policy:
     observation; `act`; up to 16 of its actions are executed; `observe` with what was seen after
     each of them; `act`; and so on.
 
-    A policy of one's own need not be a subclass; one that is has what it leaves out from here.
+    A policy of one's own need not be a subclass; one that is needs only `act` and `metadata`.
 
     Attributes:
         cameras: Cameras whose live frames it wants, such as `("front", "wrist")`: no others are
@@ -78,6 +79,7 @@ class Policy:
             states: `(T, 8) float32`.
         """
 
+    @abstractmethod
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the next actions, `(n, 8) float32`, n at least 1; 16 at most are executed.
 
@@ -85,11 +87,10 @@ class Policy:
             observation: What is seen now; `observe` has had it.
             goal: The goal in words.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def metadata(self) -> dict[str, Any]:
         """Return plain values that say which policy this is, for the record of the run."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Release everything."""

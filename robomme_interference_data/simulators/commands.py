@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.console import AsJson, print_json
+from robomme_interference_data.console import AsJson, check_output, print_json
 from robomme_interference_data.errors import InvalidOptionError
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def simulate(
         raise InvalidOptionError.one_of(f"--policy on {simulator}", policy, policies)
     if video is not None and (video.suffix != ".mp4" or video.is_dir()):
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
+    check_output(video)
     name = EpisodeId(family, split, episode)
     options: dict[str, Any] = {}
     if simulator in SIMULATORS and video is None:

@@ -163,6 +163,7 @@ def test_known_errors(
     "arguments",
     [
         f"show {EPISODE} k3 --split S --out S/demonstrations/meta/strip.png",
+        "simulate --family MoveCube --video S/distractors/meta/look.mp4",
         f"retrieve {EPISODE} k3 --split S --out S/manifests/why.png",
         "retrieval-score S --out S/distractors",
         "calibrate S --out S/distractors/new/cuts.png",
