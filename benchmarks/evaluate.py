@@ -123,7 +123,7 @@ def overhead(
     """Time an episode's rollout bare and in the harness; return the cells of its line."""
     actions = oracle_actions(episode, simulator)
     policy = Recorded(actions)
-    config = RunConfig("python:recorded", split.root, Path("nowhere"))
+    config = RunConfig("python:recorded", Path(split.location), Path("nowhere"))
     run = Run(config, "recorded", split.name, split.revision)
 
     def bare() -> None:

@@ -220,7 +220,7 @@ def lerobot_reader(
 
     LeRobotDataset decodes every camera of an item; here it is left with the front camera only.
     """
-    opened = {name: open_lerobot(name, split.root / name) for name in split.datasets}
+    opened = {name: open_lerobot(name, Path(split.location) / name) for name in split.datasets}
     for dataset in opened.values():
         for camera in [key for key in dataset.meta.video_keys if key != FRONT]:
             del dataset.meta.info.features[camera]

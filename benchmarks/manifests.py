@@ -20,6 +20,7 @@ from timing import in_fresh_process, machine, megabytes, peak_memory, positive, 
 
 from robomme_interference_data.build_dataset.identity import identity_of
 from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
     plan_manifests,
     planned_buffers,
     write_manifests,
@@ -28,7 +29,7 @@ from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
-    EPISODES_DIR,
+    EPISODES_PATH,
     FAMILIES,
     FPS,
     FRONT,
@@ -104,14 +105,16 @@ def timed(way: Callable[[Path], None], root: Path) -> tuple[float, int]:
 
 def written(root: Path) -> None:
     """Write the manifests as `build manifests` does."""
-    for _ in write_manifests(plan_manifests(root, CONDITIONS, position_limit=None), root):
+    for _ in write_manifests(
+        plan_manifests(in_folder(root), CONDITIONS, position_limit=None), root
+    ):
         pass
 
 
 def plainly(root: Path) -> None:
     """Write the same rows one by one."""
     schema = arrow_schema(BufferManifest)
-    buffers = planned_buffers(plan_manifests(root, CONDITIONS, position_limit=None))
+    buffers = planned_buffers(plan_manifests(in_folder(root), CONDITIONS, position_limit=None))
     with pq.ParquetWriter(root / "plain.parquet", schema, compression="zstd") as writer:
         for batch in batched(buffers, 1024):
             rows = [to_dict(manifest) for manifest in batch]
@@ -136,7 +139,7 @@ def write_dataset(root: Path, kind: str, count: int) -> None:
     write_json(root / INFO_PATH, info)
     identity = identity_of(records, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
-    path = root / EPISODES_DIR / "chunk-000" / "file-000.parquet"
+    path = root / EPISODES_PATH
     path.parent.mkdir(parents=True)
     pq.write_table(to_table(records, arrow_schema(EpisodeRecord, sorted(SHAPES))), path)
 

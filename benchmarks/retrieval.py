@@ -26,7 +26,11 @@ from manifests import write_dataset
 from timing import Times, interleave, machine, positive, table
 
 from robomme_interference_data import Dataset, load_split
-from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -180,7 +184,9 @@ def made_up_split(root: Path, options: argparse.Namespace) -> Path:
     """Write a split of tables and embeddings alone: queries and 900 units."""
     write_dataset(root / DEMONSTRATIONS, DEMONSTRATIONS, options.queries)
     write_dataset(root / DISTRACTORS, DISTRACTORS, 900)
-    for _ in write_manifests(plan_manifests(root, CONDITIONS, position_limit=None), root):
+    for _ in write_manifests(
+        plan_manifests(in_folder(root), CONDITIONS, position_limit=None), root
+    ):
         pass
     roots = [root / DEMONSTRATIONS, root / DISTRACTORS]
     with patch.object(Dataset, "read_frames", lambda *_: None):

@@ -157,11 +157,16 @@ def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
 
 
 def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
-    from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
-    from robomme_interference_data.split import load_split
+    from robomme_interference_data.build_dataset.manifests import (
+        in_folder,
+        plan_manifests,
+        write_manifests,
+    )
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
-    plan = plan_manifests(split, config.conditions, config.seed, position_limit(config))
+    limit = position_limit(config)
+    plan = plan_manifests(in_folder(split), config.conditions, config.seed, limit)
     with WorkProgress(unit="buffers") as progress:
         total = len(plan.demonstrations) * len(plan.conditions)
         progress.start("Planning buffers", total)
@@ -189,10 +194,11 @@ def verify(
     ```
     """
     from robomme_interference_data.build_dataset.verify import verify_split
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
     progress = WorkProgress()
-    checks = verify_split(split, decode=decode, progress=progress)
+    checks = verify_split(load_split(split), decode=decode, progress=progress)
     with progress:
         violations = list(checks)
     if as_json:
@@ -222,7 +228,7 @@ def audit(
     ```
     """
     from robomme_interference_data.build_dataset.audit import audit_split
-    from robomme_interference_data.split import load_split
+    from robomme_interference_data.loading import load_split
 
     report = audit_split(load_split(split))
     if as_json:

@@ -5,7 +5,7 @@ Rules 1 to 5 and 8 of the protocol; the draw itself is `draw.py`, what a conditi
 """
 
 import shutil
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import batched
@@ -38,11 +38,13 @@ from robomme_interference_data.errors import (
     SourceError,
 )
 from robomme_interference_data.files import (
+    Files,
     LocalFiles,
     sha256_file,
     working,
     write_json,
 )
+from robomme_interference_data.hub import HubFiles
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import writing
 from robomme_interference_data.query import Query
@@ -95,13 +97,24 @@ class ManifestPlan:
         }
 
 
+def in_folder(root: Path) -> dict[str, Files]:
+    """Return where the datasets of a split lie that is built in a folder."""
+    return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS)}
+
+
 def plan_manifests(
-    root: Path,
+    places: Mapping[str, Files],
     conditions: Sequence[str | Condition] = DEFAULT_CONDITIONS,
     seed: int = 0,
     position_limit: int | None = POSITION_LIMIT,
 ) -> ManifestPlan:
     """Check that the datasets of a split and the options fit each other.
+
+    Args:
+        places: Where `demonstrations` and `distractors` lie; see `in_folder`.
+        conditions: For which buffers are planned.
+        seed: Seed of the draw.
+        position_limit: See `ManifestPlan`.
 
     Raises:
         InvalidIdError, InvalidOptionError: A condition is none, or comes twice.
@@ -111,10 +124,10 @@ def plan_manifests(
     ordered = in_order(conditions)
     opened = {}
     for name in (DEMONSTRATIONS, DISTRACTORS):
-        opened[name] = dataset = Dataset(LocalFiles(root / name))
+        opened[name] = dataset = Dataset(places[name])
         if dataset.kind != name:
             raise InvalidOptionError(
-                f"{root / name} is a dataset of {dataset.kind}",
+                f"{dataset.files.describe()} is a dataset of {dataset.kind}",
                 f"Put there what robomme-interference build {name} made.",
             )
     shown = {
@@ -294,6 +307,7 @@ def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHe
                 dataset.identity.version,
                 dataset.revision,
                 sha256_file(dataset.files.path(IDENTITY_PATH)),
+                dataset.files.describe() if isinstance(dataset.files, HubFiles) else None,
             )
             for dataset in (plan.demonstrations, plan.distractors)
         },

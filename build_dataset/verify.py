@@ -1,8 +1,7 @@
 """Recompute every hash and every rule of a split, and name each violation."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.build_dataset.identity import identity_of, listed_files
@@ -27,7 +26,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.records import EpisodeRecord, ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
-from robomme_interference_data.split import load_split
+from robomme_interference_data.split import Split
 from robomme_interference_data.work_progress import WorkProgress
 
 _TOO_MANY = "is too many: it is in no list"
@@ -47,7 +46,7 @@ class Violation:
 
 
 def verify_split(
-    root: Path, *, decode: bool = True, progress: WorkProgress | None = None
+    split: Split, *, decode: bool = True, progress: WorkProgress | None = None
 ) -> Iterator[Violation]:
     """Check a split, yielding violations as they are found.
 
@@ -58,23 +57,22 @@ def verify_split(
     seed and compared field by field.
 
     Args:
-        root: Folder of the split.
+        split: The split; all of one on the Hub is downloaded.
         decode: Whether to decode all data: by far the longest part.
         progress: Where to show how many frames are decoded.
 
     Raises:
-        MissingFileError, FormatError: The folder is not a split, or its header cannot be read.
+        HubError: The Hub cannot be reached.
     """
-    return _split(root, load_split(root).header, decode, progress or WorkProgress(quiet=True))
+    return _split(split, decode, progress or WorkProgress(quiet=True))
 
 
-def _split(
-    root: Path, header: ManifestHeader, decode: bool, progress: WorkProgress
-) -> Iterator[Violation]:
-    for path in all_files(root / MANIFESTS):
+def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Violation]:
+    header, own = split.header, split.files.snapshot("*")
+    for path in all_files(own / MANIFESTS):
         if path not in (MANIFEST_HEADER, MANIFEST_ROWS):
             yield Violation(f"{MANIFESTS}/{path}", _TOO_MANY)
-    rows = root / MANIFESTS / MANIFEST_ROWS
+    rows = own / MANIFESTS / MANIFEST_ROWS
     if not rows.is_file():
         yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", "is missing")
     elif sha256_file(rows) != header.rows:
@@ -83,18 +81,18 @@ def _split(
     datasets: dict[str, Dataset] = {}
     for name in header.datasets:
         try:
-            datasets[name] = Dataset(LocalFiles(root / name))
+            datasets[name] = Dataset(LocalFiles(split.place(name).snapshot("*")))
         except InterferenceError as error:
             yield Violation(name, error.message)
     frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
     progress.start("Verifying", frames if decode else 0)
     pool = datasets.get(DISTRACTORS)
     for name, dataset in datasets.items():
-        yield from _told(name, _dataset(root, name, dataset, header, progress if decode else None))
+        yield from _told(name, _dataset(name, dataset, header, progress if decode else None))
         if pool is not None:
-            yield from _indexes(root, name, dataset, pool.revision)
+            yield from _indexes(name, dataset, pool.revision)
     if len(datasets) == len(header.datasets):
-        yield from _told(MANIFESTS, _buffers(root, header))
+        yield from _told(MANIFESTS, _buffers(split, datasets))
 
 
 def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
@@ -106,9 +104,9 @@ def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
 
 
 def _dataset(
-    root: Path, name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
+    name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
 ) -> Iterator[Violation]:
-    yield from _files(root, name, dataset, header)
+    yield from _files(name, dataset, header)
     records = list(dataset.records())
     yield from _identity(name, dataset, records, header)
     yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
@@ -120,17 +118,20 @@ def _dataset(
             progress.advance(record.length)
 
 
-def _files(root: Path, name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
+def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Violation]:
     """Check every byte of a dataset: identity, list of sums, and all files in it."""
-    files = dataset.files
+    files, root = dataset.files, dataset.files.snapshot()
     if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
         what = f"does not have the SHA-256 of {MANIFESTS}/{MANIFEST_HEADER}"
         yield Violation(f"{name}/{IDENTITY_PATH}", what)
-    sums, there = dataset.sums(), set(listed_files(root / name))
+    # Of a split that was fetched, one dataset is at its root, and the other in a folder there.
+    others = tuple(f"{other}/" for other in header.datasets if other != name)
+    sums = dataset.sums()
+    there = {path for path in listed_files(root) if not path.startswith(others)}
     for path in sorted(sums.keys() | there):
         if path not in sums:
             yield Violation(f"{name}/{path}", _TOO_MANY)
-        elif path not in there or not (root / name / path).is_file():
+        elif path not in there or not (root / path).is_file():
             yield Violation(f"{name}/{path}", "is missing")
         elif sha256_file(files.path(path)) != sums[path]:
             yield Violation(f"{name}/{path}", "does not have the recorded SHA-256")
@@ -174,10 +175,11 @@ def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Vi
                 yield Violation(where, told)
 
 
-def _indexes(root: Path, name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
+def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
     """Check the embeddings beside a dataset, whatever encoders and cameras they are of."""
+    root = dataset.files.snapshot() / INDEX_DIR
     folders: dict[str, list[str]] = {}
-    for path in all_files(root / name / INDEX_DIR):
+    for path in all_files(root):
         folder, _, file = path.partition("/")
         if not file:
             yield Violation(f"{name}/{INDEX_DIR}/{path}", _TOO_MANY)
@@ -186,7 +188,7 @@ def _indexes(root: Path, name: str, dataset: Dataset, pool: str) -> Iterator[Vio
     for folder, files in folders.items():
         yield from _told(f"{name}/{folder}", _index(name, dataset, folder, pool))
         for path in files:
-            if not (root / name / INDEX_DIR / path).is_file():
+            if not (root / path).is_file():
                 yield Violation(f"{name}/{INDEX_DIR}/{path}", "leads nowhere")
 
 
@@ -203,15 +205,16 @@ def _index(name: str, dataset: Dataset, folder: str, pool: str) -> Iterator[Viol
         yield Violation(where, "its centre and typical cosine are of other distractors")
 
 
-def _buffers(root: Path, header: ManifestHeader) -> Iterator[Violation]:
+def _buffers(split: Split, datasets: Mapping[str, Dataset]) -> Iterator[Violation]:
     """Plan all buffers anew, and compare them with the rows."""
+    header, places = split.header, {name: one.files for name, one in datasets.items()}
     where = f"{MANIFESTS}/{MANIFEST_HEADER}"
     if header.rule_version != RULE_VERSION:
         what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
         yield Violation(where, what)
         return
-    plan = plan_manifests(root, header.conditions, header.seed, header.position_limit)
-    given = {str(manifest): to_dict(manifest) for manifest in load_split(root).manifests()}
+    plan = plan_manifests(places, header.conditions, header.seed, header.position_limit)
+    given = {str(manifest): to_dict(manifest) for manifest in split.manifests()}
     order = list(given)
     counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
     for number, manifest in enumerate(planned_buffers(plan)):

@@ -95,7 +95,7 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
         check_drawing()
     for camera in policy.history_cameras:
         if camera not in split.cameras:
-            raise UnknownNameError.among("camera", camera, split.root, split.cameras)
+            raise UnknownNameError.among("camera", camera, split.location, split.cameras)
 
 
 def _unusual(config: RunConfig) -> dict[str, str]:

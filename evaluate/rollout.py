@@ -68,7 +68,8 @@ def run_rollout(
     """
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)  # no time limit
-    buffer = split.load(item.episode, item.condition)
+    cameras = policy.history_cameras if selector is None else ()  # until it is known which part
+    buffer = split.load(item.episode, item.condition, cameras=cameras)
     start, stop = 0, len(buffer)
     with ExitStack() as stack:
         history = None

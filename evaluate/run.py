@@ -39,9 +39,10 @@ from robomme_interference_data.evaluate.policies.registry import pin_policy
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.evaluate.worker import RolloutTask, make_selector
 from robomme_interference_data.execution import Executor, Outcome, Processes, end_if_starting
+from robomme_interference_data.loading import load_split
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.simulators.registry import simulator_versions
-from robomme_interference_data.split import Split, load_split
+from robomme_interference_data.split import Split
 
 _PACKAGES = ("robomme-interference-data", "numpy", "av", "mani-skill", "sapien", "torch")
 
@@ -111,7 +112,8 @@ def run_evaluation(
     end_if_starting()
     split, folder = load_split(config.split), Path(config.out)
     name = config.system or default_system(config)
-    config = dataclasses.replace(config, policy=pin_policy(config.policy))
+    pinned = pin_policy(config.policy)  # and the split, if it is on the Hub: one commit for all
+    config = dataclasses.replace(config, policy=pinned, split=Path(split.location))
     policy, said = describe_policy(config.policy, config.policy_options, workers=config.workers)
     check_settings(config, name, split, policy)
     system = name_system(name)
@@ -229,7 +231,7 @@ def _identity(
 ) -> dict[str, Any]:
     """Return what makes the run the one that it is, as plain values."""
     selector = make_selector(config)
-    buffer = split.load(split.episode_ids[0], split.conditions[0])
+    buffer = split.load(split.episode_ids[0], split.conditions[0], cameras=())
     return {
         "system": system,
         "simulator": config.simulator,

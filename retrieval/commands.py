@@ -123,9 +123,9 @@ def retrieve(
     robomme-interference retrieve MoveCube/test/0 k7 --split my-split --rule mean/0.9
     ```
     """
+    from robomme_interference_data.loading import load_buffer
     from robomme_interference_data.retrieval import drawing, encoders, reasons, select
     from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.split import load_buffer
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -242,8 +242,8 @@ def _measured(
     split: Path, encoder: str, camera: str, *, quiet: bool
 ) -> tuple[dict[str, Any], list["Measured"]]:
     """Measure all buffers of a split that hold frames of the lesson; tell what they are of."""
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval.select import measure
-    from robomme_interference_data.split import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
     opened = load_split(split)

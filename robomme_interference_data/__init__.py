@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.dataset import Dataset
     from robomme_interference_data.errors import InterferenceError
     from robomme_interference_data.ids import EpisodeId
+    from robomme_interference_data.loading import load_buffer, load_split
     from robomme_interference_data.query import Query
     from robomme_interference_data.records import (
         BufferManifest,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
         Session,
         SessionEntry,
     )
-    from robomme_interference_data.split import Split, load_buffer, load_split
+    from robomme_interference_data.split import Split
 
 __all__ = [
     # load
@@ -53,6 +54,6 @@ __all__ = [
 
 __getattr__ = lazily(
     __name__,
-    *(".split", ".buffer", ".cache", ".query", ".records", ".ids"),
+    *(".loading", ".split", ".buffer", ".cache", ".query", ".records", ".ids"),
     *(".conditions", ".dataset", ".errors"),
 )

@@ -130,6 +130,23 @@ class Buffer:
         states.setflags(write=False)
         return states
 
+    def fetch(self, cameras: Sequence[str] | None = None) -> None:
+        """Bring the files of the buffer and its query to this machine, if they lie elsewhere.
+
+        Args:
+            cameras: Names of the cameras; None for all.
+
+        Raises:
+            UnknownNameError: There is no such camera.
+            MissingFileError, HubError: A file is not there, or the Hub cannot be reached.
+        """
+        wanted = self.cameras if cameras is None else cameras
+        episodes = {self.query.dataset: [self.query.record.episode_index]}
+        for entry in self.manifest.sessions:
+            episodes.setdefault(self._datasets[entry.dataset], []).append(entry.episode_index)
+        for dataset, indices in episodes.items():
+            dataset.files.fetch(one for i in indices for one in dataset.files_of(i, wanted))
+
     def frames(self, camera: str = "front") -> NDArray[np.uint8]:
         """Decode all frames of a camera, sessions side by side on several threads.
 
@@ -144,6 +161,7 @@ class Buffer:
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
         out = np.empty((len(self), *self.query.dataset.shape(camera)), np.uint8)
+        self.fetch([camera])
         with ThreadPoolExecutor(self._threads) as pool:
             try:
                 for finish in [self._start_reading(s, camera, out, pool) for s in self.sessions]:

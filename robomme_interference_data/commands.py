@@ -35,8 +35,8 @@ def list_buffers(
     robomme-interference list my-split --family MoveCube --json
     ```
     """
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.split import load_split
     from robomme_interference_data.tables import Table
 
     opened = load_split(split)
@@ -49,7 +49,7 @@ def list_buffers(
     )
     table = Table.make(
         "buffers",
-        str(opened.root),
+        opened.location,
         "episode condition difficulty lesson:count history:count share:ratio",
         map(values, found),
         "lesson, history: frames; share: of lesson in an even 32-frame sample",
@@ -73,8 +73,8 @@ def show(
     robomme-interference show VideoRepick/test/7 k7 --split my-split --out strip.png
     ```
     """
+    from robomme_interference_data.loading import load_buffer
     from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.split import load_buffer
     from robomme_interference_data.tables import Table
 
     check_output(out)

@@ -4,7 +4,7 @@ A LeRobot dataset in which every episode has files of its own, with our columns 
 and its identity in `meta/interference.json`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
+    EPISODES_PATH,
     IDENTITY_PATH,
     INFO_PATH,
     STATE,
@@ -57,7 +58,7 @@ class Dataset:
 
     def __init__(self, files: Files):
         self.files = files
-        self.lerobot = LeRobotFiles(files)
+        self.lerobot = LeRobotFiles(files, [EPISODES_PATH])
         try:
             path = files.path(IDENTITY_PATH)
         except MissingFileError:
@@ -158,6 +159,11 @@ class Dataset:
             raise FormatError.damaged(self.files.describe(), "its episodes have no episode_id")
         ids = self.lerobot.table["episode_id"].to_pylist()
         return {str(text): index for index, text in enumerate(ids)}
+
+    def files_of(self, episode_index: int, cameras: Iterable[str]) -> list[str]:
+        """Return the paths of the files that hold an episode's vectors and the given cameras."""
+        place = self.lerobot.place(episode_index)
+        return [place.data, *(place.videos[self._camera(camera)][0] for camera in cameras)]
 
     def index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:
         """Return the embeddings of the stored frames, opened once.

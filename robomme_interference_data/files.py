@@ -44,6 +44,18 @@ class Files(Protocol):
         """Return the sorted relative paths of all files under a folder; empty if none."""
         ...
 
+    def fetch(self, paths: Iterable[str]) -> None:
+        """Bring files to this machine that are about to be read, several at a time.
+
+        Raises:
+            MissingFileError: There is no such file.
+        """
+        ...
+
+    def snapshot(self, *patterns: str) -> Path:
+        """Return the folder that holds all files, bringing those here that match a pattern."""
+        ...
+
     def describe(self) -> str:
         """Return the place in words, for messages: a folder, or a repository and revision."""
         ...
@@ -87,8 +99,11 @@ class LocalFiles:
         found = (self.root / folder).rglob(f"*{suffix}")
         return sorted(p.relative_to(self.root).as_posix() for p in found if p.is_file())
 
+    def fetch(self, paths: Iterable[str]) -> None:
+        """Do nothing: the files are here; see `Files.fetch`."""
+
     def snapshot(self, *patterns: str) -> Path:
-        """Return the folder; see `HubFiles.snapshot`."""
+        """Return the folder; see `Files.snapshot`."""
         return self.root
 
     def describe(self) -> str:

@@ -6,7 +6,10 @@ The stock client does the work, so its own settings hold (`HF_ENDPOINT`, `HF_HUB
 
 import os
 import re
-from functools import cached_property
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +23,39 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import LocalFiles, check_relative
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_VERSION = re.compile(r"data-\d+\.\d+\.\d+")
+_AT_ONCE = 8
 
 
-def locate(location: str | os.PathLike[str], repo_type: str = "dataset") -> "LocalFiles | HubFiles":
+def locate(
+    location: str | os.PathLike[str], repo_type: str = "dataset", revision: str | None = None
+) -> "LocalFiles | HubFiles":
     """Return the files at a location.
 
     Args:
         location: A folder, or a repository on the Hub: `namespace/name`, or with a branch, tag or
             commit `namespace/name@revision`. A folder that is there goes before a repository.
         repo_type: `dataset` or `model`.
+        revision: The branch, tag or commit, if not in `location`.
 
     Raises:
-        InvalidOptionError: It is neither.
+        InvalidOptionError: It is neither, or a folder with a revision.
     """
     folder = Path(location).expanduser()
     if folder.is_dir():
+        if revision is not None:
+            raise InvalidOptionError(
+                f"revision {revision!r} of the folder {folder}; only a repository has revisions",
+                "Leave it out, or give namespace/name instead of the folder.",
+            )
         return LocalFiles(folder)
-    repo_id, at, revision = str(location).partition("@")
-    if not _REPO_ID.fullmatch(repo_id) or (at and not revision):
+    repo_id, at, named = str(location).partition("@")
+    if at and revision is not None and named != revision:
+        raise InvalidOptionError(
+            f"{str(location)!r} and revision {revision!r}", "Give the revision once."
+        )
+    revision = named or revision
+    if not _REPO_ID.fullmatch(repo_id) or (at and not named):
         raise InvalidOptionError(
             f"{str(location)!r} is neither a folder nor a {repo_type} repository on the Hub",
             "Give an existing folder, namespace/name, or namespace/name@revision.",
@@ -49,7 +67,8 @@ class HubFiles:
     """Files of a repository at one commit, downloaded into the Hub's cache when asked for.
 
     The revision is resolved once, at the first use; copies made after that (worker processes get
-    one each) keep the commit. Offline, it is what the revision last stood for.
+    one each) keep the commit. Offline, it is what the revision last stood for; and so it always is
+    for a version's tag, `data-1.0.0`: a published version never changes.
 
     Args:
         repo_id: Repository, `namespace/name`.
@@ -71,10 +90,14 @@ class HubFiles:
                 reached and is not in the cache.
         """
         from huggingface_hub import HfApi
+        from huggingface_hub.errors import RevisionResolutionError
 
-        resolve, kind = HfApi().resolve_revision, self.repo_type
-        found = self._asked(None, resolve, self.repo_id, repo_type=kind, revision=self.revision)
-        return str(found.resolved)
+        resolve, wanted = HfApi().resolve_revision, {"revision": self.revision}
+        wanted["repo_type"] = self.repo_type
+        if _VERSION.fullmatch(self.revision):
+            with suppress(RevisionResolutionError):
+                return str(resolve(self.repo_id, local_files_only=True, **wanted).resolved)
+        return str(self._asked(None, resolve, self.repo_id, **wanted).resolved)
 
     def path(self, relative: str) -> Path:
         """Return the file's path in the cache, downloading it first if need be; see `Files.path`.
@@ -94,8 +117,35 @@ class HubFiles:
                 relative,
                 repo_type=self.repo_type,
                 revision=self.commit,
+                tqdm_class=_silent(),
             )
         )
+
+    def fetch(self, paths: Iterable[str]) -> None:
+        """Download files that are not in the cache, with a bar; see `Files.fetch`."""
+        from huggingface_hub import try_to_load_from_cache
+        from huggingface_hub.utils import tqdm
+
+        there, kind = {"revision": self.commit}, self.repo_type
+        missing = [
+            path
+            for path in dict.fromkeys(paths)
+            if not isinstance(
+                try_to_load_from_cache(self.repo_id, path, repo_type=kind, **there), str
+            )
+        ]
+        if not missing:
+            return
+        with (
+            tqdm(total=len(missing), desc=f"Fetching from {self.repo_id}", unit=" files") as bar,
+            ThreadPoolExecutor(_AT_ONCE) as pool,
+        ):
+            try:
+                for _ in pool.map(self.path, missing):
+                    bar.update()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def snapshot(self, *patterns: str) -> Path:
         """Download the files that match a pattern, such as `meta/*`; return the folder of all.
@@ -189,3 +239,15 @@ class HubFiles:
             f"{what} is not in the cache, and the Hub cannot be reached: {first_line(error)}",
             f"Try again when it can be reached, with: {command}",
         )
+
+
+@cache
+def _silent() -> type:
+    """Return the client's progress bar without a bar: files are small, and counted elsewhere."""
+    from huggingface_hub.utils import tqdm
+
+    class Silent(tqdm):  # type: ignore[misc, valid-type]
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **{**options, "disable": True})
+
+    return Silent

@@ -5,7 +5,7 @@ through it. Tests hold it against lerobot's own.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -39,14 +39,17 @@ class LeRobotFiles:
 
     Args:
         files: How to reach the dataset.
+        tables: Paths of its episode tables, if they are known: on the Hub, to list files takes
+            longer than to fetch these.
 
     Raises:
         MissingFileError: `meta/info.json` is missing.
         FormatError: It is of an unknown version, or damaged.
     """
 
-    def __init__(self, files: Files):
+    def __init__(self, files: Files, tables: Sequence[str] = ()):
         self.files = files
+        self._tables = tables
         self._rows: dict[int, dict[str, Any]] = {}
         try:
             path = files.path(INFO_PATH)
@@ -218,7 +221,8 @@ class LeRobotFiles:
             )
 
     def _v30_table(self) -> pa.Table:
-        paths = [self.files.path(name) for name in self.files.list(EPISODES_DIR, ".parquet")]
+        names = self._tables or self.files.list(EPISODES_DIR, ".parquet")
+        paths = [self.files.path(name) for name in names]
         if not paths:
             raise MissingFileError(
                 f"{EPISODES_DIR} holds no parquet file in {self.files.describe()}",

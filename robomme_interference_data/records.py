@@ -282,12 +282,15 @@ class ManifestDataset:
         version: Its version.
         revision: Its revision: sessions name it.
         identity: SHA-256 of its `meta/interference.json`.
+        place: Where it lies: None for the folder of its name in the split, `.` for the split's own
+            root, `namespace/name@commit` for a repository on the Hub.
     """
 
     kind: str
     version: str
     revision: str
     identity: str
+    place: str | None = None
 
 
 @dataclass(frozen=True)

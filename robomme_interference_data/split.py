@@ -1,18 +1,17 @@
-"""A split: datasets and the manifests that name buffers of them. Opened and loaded here."""
+"""A split: datasets, and the manifests that name buffers of them."""
 
-import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.cache import DecodedCache, default_cache_folder
+from robomme_interference_data.cache import DecodedCache
 from robomme_interference_data.conditions import Condition, parse_condition
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
@@ -28,38 +27,44 @@ from robomme_interference_data.errors import (
     MissingFileError,
     UnknownNameError,
 )
-from robomme_interference_data.files import Files, LocalFiles
+from robomme_interference_data.files import LocalFiles, canonical_json
+from robomme_interference_data.hub import HubFiles
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import BufferManifest, ManifestHeader
-from robomme_interference_data.rows import from_table, read_header
+from robomme_interference_data.rows import from_table, read_header, to_dict
 
 _FOLDER = re.compile(r"\w[\w.-]*")
+_PLACE = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
+HEADER = f"{MANIFESTS}/{MANIFEST_HEADER}"
 _BATCH = 1024
 """Rows that are read at a time."""
 
 
 class Split:
-    """A split; made by `load_split`.
+    """A split; see `load_split`.
 
     Attributes:
-        root: Folder with `demonstrations/`, `distractors/` and `manifests/`.
+        files: The folder, or the repository on the Hub, that holds its manifests.
         header: How its buffers were planned.
     """
 
-    def __init__(self, root: Path, cache: DecodedCache | None, threads: int | None):
-        self.root = root
+    def __init__(
+        self, files: LocalFiles | HubFiles, cache: DecodedCache | None, threads: int | None
+    ):
+        self.files = files
         self._cache = cache
         self._threads = threads
-        self._manifests: Files = LocalFiles(root / MANIFESTS)
-        self.header = read_header(self._manifests.path(MANIFEST_HEADER), ManifestHeader)
+        path = files.path(HEADER)
+        self.header = read_header(path, ManifestHeader)
         if DEMONSTRATIONS not in self.header.datasets:
-            raise FormatError.damaged(root / MANIFESTS / MANIFEST_HEADER, "no demonstrations")
-        for dataset in self.header.datasets:
-            if not _FOLDER.fullmatch(dataset):
-                what = f"dataset {dataset!r} is not the name of a folder"
-                raise FormatError.damaged(root / MANIFESTS / MANIFEST_HEADER, what)
+            raise FormatError.damaged(path, "no demonstrations")
+        for name, dataset in self.header.datasets.items():
+            if not _FOLDER.fullmatch(name):
+                raise FormatError.damaged(path, f"dataset {name!r} is not the name of a folder")
+            if not _PLACE.fullmatch(dataset.place or "."):
+                raise FormatError.damaged(path, f"{name} has the place {dataset.place!r}")
 
     def __repr__(self) -> str:
         return f"Split({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
@@ -70,13 +75,24 @@ class Split:
 
     @property
     def name(self) -> str:
-        """Name of the split: that of its folder."""
-        return self.root.resolve().name
+        """Name of the split: that of its folder or repository."""
+        files = self.files
+        return files.repo_id if isinstance(files, HubFiles) else files.root.resolve().name
+
+    @property
+    def location(self) -> str:
+        """Where it lies: its folder, or its repository with the commit, `namespace/name@…`."""
+        return self.files.describe()
 
     @cached_property
     def revision(self) -> str:
-        """Identity of the split: SHA-256 of `manifest.json`, which names all data by hash."""
-        return sha256(self._manifests.path(MANIFEST_HEADER).read_bytes()).hexdigest()
+        """Identity of the split: SHA-256 over its header, which names all data by hash.
+
+        It is the same wherever the datasets lie.
+        """
+        bare = {name: replace(one, place=None) for name, one in self.header.datasets.items()}
+        text = canonical_json(to_dict(replace(self.header, datasets=bare)))
+        return sha256(text.encode()).hexdigest()
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -92,16 +108,30 @@ class Split:
         """
         opened = {}
         for name, recorded in self.header.datasets.items():
-            dataset = Dataset(LocalFiles(self.root / name))
+            dataset = opened[name] = Dataset(self.place(name))
             if dataset.revision != recorded.revision:
                 raise HashMismatchError(
-                    f"{self.root / name} has revision {dataset.revision[:12]}…; the manifests "
-                    f"were made for {recorded.revision[:12]}…",
+                    f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
+                    f"manifests were made for {recorded.revision[:12]}…",
                     "Put the right dataset there, or build the manifests again: "
-                    f"robomme-interference build manifests {self.root}",
+                    f"robomme-interference build manifests {self.location}",
                 )
-            opened[name] = dataset
         return opened
+
+    def place(self, name: str) -> LocalFiles | HubFiles:
+        """Return where a dataset of the split lies.
+
+        That is the folder of its name, if there is one or the manifests name no other place.
+        """
+        place, own = self.header.datasets[name].place, self.files
+        if isinstance(own, LocalFiles) and (place is None or (own.root / name).is_dir()):
+            return LocalFiles(own.root / name)
+        if place is None:
+            raise MissingFileError(
+                f"the manifests of {self.location} do not say where its {name} are",
+                "A published split says it: robomme-interference publish SPLIT --repo-id NAME",
+            )
+        return own if place == "." else HubFiles(*place.split("@"))
 
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
@@ -142,9 +172,9 @@ class Split:
         wanted = _condition(condition, k)
         if wanted.name not in self.conditions:
             raise UnknownNameError(
-                f"condition {wanted.name!r} is not in {self.root}",
+                f"condition {wanted.name!r} is not in {self.location}",
                 f"Planned there: {' '.join(self.conditions)}. For another one, type: "
-                f"robomme-interference build manifests {self.root} --conditions "
+                f"robomme-interference build manifests {self.location} --conditions "
                 f"{' '.join(self.conditions)} {wanted.name}",
             )
         row = self._places.get((str(episode), wanted.name))
@@ -174,7 +204,7 @@ class Split:
             if value is not None:
                 if value not in self._keys[column]:
                     known = {one for one in self._keys[column] if one is not None}
-                    raise UnknownNameError.among(column, value, self.root, known)
+                    raise UnknownNameError.among(column, value, self.location, known)
                 keep &= np.array([one == value for one in self._keys[column]])
         return self._read(keep)
 
@@ -185,9 +215,11 @@ class Split:
         *,
         k: int | None = None,
         verify: bool = False,
+        cameras: Sequence[str] | None = None,
     ) -> Buffer:
         """Load one buffer; see `load_buffer` for arguments and errors."""
         buffer = self._buffer(self.manifest(episode_id, condition, k=k))
+        buffer.fetch(cameras)
         if verify:
             buffer.verify()
         return buffer
@@ -211,9 +243,9 @@ class Split:
 
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode.family not in self.families:
-            raise UnknownNameError.among("family", episode.family, self.root, self.families)
+            raise UnknownNameError.among("family", episode.family, self.location, self.families)
         if episode not in self.episode_ids:
-            raise UnknownNameError.among("episode", str(episode), self.root, self.episode_ids)
+            raise UnknownNameError.among("episode", str(episode), self.location, self.episode_ids)
 
     def _read(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
         for first in range(0, len(keep), _BATCH):
@@ -224,7 +256,7 @@ class Split:
 
     @cached_property
     def _rows(self) -> RowSpan:
-        return RowSpan(self._manifests.path(MANIFEST_ROWS))
+        return RowSpan(self.files.path(f"{MANIFESTS}/{MANIFEST_ROWS}"))
 
     @cached_property
     def _keys(self) -> dict[str, list[str | None]]:
@@ -243,81 +275,6 @@ class Split:
         return {key: row for row, key in enumerate(keys)}
 
 
-def load_split(
-    split: str | os.PathLike[str],
-    *,
-    cache: bool | str | os.PathLike[str] | DecodedCache = False,
-    threads: int | None = None,
-) -> Split:
-    """Open a split, to list, filter and load its buffers.
-
-    Args:
-        split: Folder with `demonstrations/`, `distractors/` and `manifests/`.
-        cache: Where to keep decoded frames for the next time: a cache, a folder for one of
-            20 GiB, or True for the folder `~/.cache/robomme-interference`.
-        threads: Threads that decode side by side; None for one per processor.
-
-    Raises:
-        MissingFileError: The folder is not a split.
-        FormatError: Its files are damaged, or of another format version.
-        InvalidOptionError: An argument is not what it may be.
-    """
-    root = _folder("split", split, "a folder")
-    if not (root / MANIFESTS / MANIFEST_HEADER).is_file():
-        raise MissingFileError(
-            f"{root} is not a split: {MANIFESTS}/{MANIFEST_HEADER} is missing",
-            "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
-            f"one: robomme-interference build all --source KIND:PATH --out {root}",
-        )
-    if threads is not None:
-        expected = "a number from 1, or None"
-        threads = whole_number("threads", threads, expected)
-        if threads < 1:
-            raise InvalidOptionError.expected("threads", threads, expected)
-    return Split(root, _cache(cache), threads)
-
-
-def load_buffer(
-    episode_id: EpisodeId | str,
-    condition: Condition | str | None = None,
-    *,
-    split: str | os.PathLike[str] | Split,
-    k: int | None = None,
-    verify: bool = False,
-    cache: bool | str | os.PathLike[str] | DecodedCache = False,
-    threads: int | None = None,
-) -> Buffer:
-    """Load the history buffer of one query episode.
-
-    Opens only the manifest row and the small metadata; frames are decoded when asked for.
-
-    Args:
-        episode_id: Id of the query episode, such as `VideoRepick/test/7`.
-        condition: Name of the condition, such as `k3`, one that the split has planned.
-        split: A folder, or what `load_split` returned (then `cache` and `threads` are its own).
-        k: Short for the condition `k<k>`, instead of `condition`.
-        verify: Decode everything now and compare it with the recorded SHA-256; and later what
-            comes out of the cache.
-        cache: As for `load_split`.
-        threads: As for `load_split`.
-
-    Returns:
-        The buffer.
-
-    Raises:
-        InvalidIdError: `episode_id` or `condition` does not read as one.
-        InvalidOptionError: Neither or both of `condition` and `k` are given, or an argument is
-            not what it may be.
-        UnknownNameError: The split does not have this episode or condition; offers the nearest.
-        MissingFileError: The folder is not a split, or a file of it is missing.
-        FormatError: A file is damaged or of another format version.
-        HashMismatchError: The datasets are not the ones that the manifests were made for, or,
-            with `verify`, data is not what the manifest names.
-    """
-    opened = split if isinstance(split, Split) else load_split(split, cache=cache, threads=threads)
-    return opened.load(episode_id, condition, k=k, verify=verify)
-
-
 def _condition(condition: Condition | str | None, k: int | None) -> Condition:
     if (condition is None) == (k is None):
         raise InvalidOptionError(
@@ -327,15 +284,3 @@ def _condition(condition: Condition | str | None, k: int | None) -> Condition:
     if k is None:
         return parse_condition(condition or "")
     return parse_condition(f"k{whole_number('k', k, 'a whole number from 0, such as 3')}")
-
-
-def _cache(cache: bool | str | os.PathLike[str] | DecodedCache) -> DecodedCache | None:
-    if isinstance(cache, bool | DecodedCache | None):
-        return DecodedCache(default_cache_folder()) if cache is True else cache or None
-    return DecodedCache(_folder("cache", cache, "True, False, a folder or a DecodedCache"))
-
-
-def _folder(option: str, given: object, expected: str) -> Path:
-    if not isinstance(given, str | os.PathLike) or not str(given) or "\0" in str(given):
-        raise InvalidOptionError.expected(option, given, expected)
-    return Path(given)

@@ -10,6 +10,7 @@ from support.splits import CONDITIONS, GOLDEN, QUERIES, contents, copy_split
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
 from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
     plan_manifests,
     planned_buffers,
     write_manifests,
@@ -49,13 +50,16 @@ def made_up(root: Path, *, queries: Any = None, units: Any = None) -> Path:
 @pytest.mark.parametrize("name", ["split", "not-utf-8-\udcff"])
 def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
     root = copy_split(tmp_path / name)
-    assert sum(write_manifests(plan_manifests(root, tuple(reversed(CONDITIONS))), root)) == 15
+    assert (
+        sum(write_manifests(plan_manifests(in_folder(root), tuple(reversed(CONDITIONS))), root))
+        == 15
+    )
     assert contents(root) == contents(GOLDEN)
 
 
 def test_what_buffers_hold(tmp_path: Path) -> None:
     root = made_up(tmp_path)
-    plan = plan_manifests(root, ("no-history", "k0", "k2", "k4"), seed=5)
+    plan = plan_manifests(in_folder(root), ("no-history", "k0", "k2", "k4"), seed=5)
     found = {str(one): one for one in planned_buffers(plan)}
     assert len(found) == 8 * 4
     one = found["PatternLock/test/1 under k4"]
@@ -91,7 +95,7 @@ def test_what_buffers_hold(tmp_path: Path) -> None:
 def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
     units = [record("distractors", f"X{n}/train/0", exact=n != 1) for n in range(3)]
     queries = [record("demonstrations", "MoveCube/test/0")]
-    plan = plan_manifests(made_up(tmp_path, queries=queries, units=units), ("k0", "k3"))
+    plan = plan_manifests(in_folder(made_up(tmp_path, queries=queries, units=units)), ("k0", "k3"))
     assert [one.exact for one in planned_buffers(plan)] == [True, False]
 
 
@@ -100,12 +104,12 @@ def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.Monkey
     more = Kind("more", lambda material, k: tuple(material.units(k + 1)))
     monkeypatch.setitem(KINDS, "more", more)
     root = made_up(tmp_path)
-    plan = plan_manifests(root, ("k1", "more-k1", "more-k8"))
+    plan = plan_manifests(in_folder(root), ("k1", "more-k1", "more-k8"))
     found = {one.condition: one.sessions for one in list(planned_buffers(plan))[:3]}
     assert [len(sessions) for sessions in found.values()] == [2, 2, 9]
     assert found["more-k1"] == found["more-k8"][:2]
     with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):
-        list(planned_buffers(plan_manifests(root, ("more-k9",))))
+        list(planned_buffers(plan_manifests(in_folder(root), ("more-k9",))))
     split = tmp_path / "split"
     asked = AllConfig(source=("sample:MoveCube,PatternLock",), out=split, split="test")
     assert plan_all(asked, PlanConfig(conditions=("more-k1",)))
@@ -116,13 +120,13 @@ def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_pool_too_small(tmp_path: Path) -> None:
     root = made_up(tmp_path)
     with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):
-        list(write_manifests(plan_manifests(root, ("k10",)), root))
+        list(write_manifests(plan_manifests(in_folder(root), ("k10",)), root))
     assert list((root / "manifests").iterdir()) == []
 
 
 @pytest.mark.parametrize(("limit", "fits"), [(33 + 32 + 1300, True), (33 + 32 + 1299, False)])
 def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
-    plan = plan_manifests(made_up(tmp_path), ("k1",), position_limit=limit)
+    plan = plan_manifests(in_folder(made_up(tmp_path)), ("k1",), position_limit=limit)
     if fits:
         assert len(list(planned_buffers(plan))) == 8
         return
@@ -134,7 +138,7 @@ def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
 def test_units_must_be_of_train_episodes(tmp_path: Path) -> None:
     units = [record("distractors", "InsertPeg/test/0"), record("distractors", "Drawer/val/0")]
     with pytest.raises(SourceError, match="must come from train episodes.* test, val"):
-        plan_manifests(made_up(tmp_path, units=units))
+        plan_manifests(in_folder(made_up(tmp_path, units=units)))
 
 
 def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
@@ -142,22 +146,22 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
     info = root / "distractors" / "meta" / "info.json"
     info.write_text(info.read_text().replace("      4,\n", "      8,\n"))
     with pytest.raises(SourceError, match="cannot follow one another"):
-        plan_manifests(root)
+        plan_manifests(in_folder(root))
     (root / "distractors").rename(root / "units")
     with pytest.raises(MissingFileError):
-        plan_manifests(root)
+        plan_manifests(in_folder(root))
     (root / "demonstrations").rename(root / "distractors")
     (root / "units").rename(root / "demonstrations")
     with pytest.raises(InvalidOptionError, match="is a dataset of distractors"):
-        plan_manifests(root)
+        plan_manifests(in_folder(root))
 
 
 def test_earlier_manifests_are_replaced_and_strangers_kept(tmp_path: Path) -> None:
     root = copy_split(tmp_path / "split")
-    assert sum(write_manifests(plan_manifests(root, ("k0",)), root)) == len(QUERIES)
+    assert sum(write_manifests(plan_manifests(in_folder(root), ("k0",)), root)) == len(QUERIES)
     assert load_split(root).conditions == ("k0",)
     other = made_up(tmp_path / "other")
     (other / "manifests").mkdir()
     (other / "manifests" / "notes.txt").write_text("mine")
     with pytest.raises(BuildError, match=r"holds no manifests, but notes\.txt"):
-        list(write_manifests(plan_manifests(other), other))
+        list(write_manifests(plan_manifests(in_folder(other)), other))

@@ -20,7 +20,11 @@ from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_split
-from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.files import sha256_file
@@ -34,7 +38,7 @@ ROWS = "manifests/buffers.parquet"
 
 
 def found(root: Path, *, decode: bool = False) -> list[str]:
-    return [f"{one.where}: {one.what}" for one in verify_split(root, decode=decode)]
+    return [f"{one.where}: {one.what}" for one in verify_split(load_split(root), decode=decode)]
 
 
 def expect(root: Path, *patterns: str, decode: bool = False) -> None:
@@ -72,7 +76,7 @@ def as_text(name: str) -> Callable[[pa.Table], pa.Table]:
 def test_a_clean_split() -> None:
     counted: list[int] = []
     shown = SimpleNamespace(start=lambda text, frames: None, advance=counted.append)
-    assert list(verify_split(GOLDEN, progress=shown)) == []
+    assert list(verify_split(load_split(GOLDEN), progress=shown)) == []
     assert counted == [49] * len(QUERIES) + [32] * UNITS
     assert found(GOLDEN) == []
 
@@ -335,7 +339,7 @@ def test_a_dataset_that_is_gone(own_split: Path) -> None:
 def audited(root: Path, queries: list[Any], units: list[Any], *conditions: str) -> Audit:
     write_metadata(root / "demonstrations", "demonstrations", queries)
     write_metadata(root / "distractors", "distractors", units)
-    for _ in write_manifests(plan_manifests(root, conditions or ("k0",)), root):
+    for _ in write_manifests(plan_manifests(in_folder(root), conditions or ("k0",)), root):
         pass
     return audit_split(load_split(root))
 

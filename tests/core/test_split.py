@@ -195,10 +195,14 @@ def test_loading_needs_light_libraries_only() -> None:
 
 
 def test_what_is_no_split(tmp_path: Path) -> None:
-    for folder in (tmp_path, tmp_path / "nowhere", GOLDEN / "demonstrations"):
+    for folder in (tmp_path, GOLDEN / "demonstrations"):
         with pytest.raises(MissingFileError, match="is not a split") as caught:
             load_split(folder)
         assert "robomme-interference build all" in str(caught.value.hint)
+    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
+        load_split(tmp_path / "nowhere")
+    with pytest.raises(InvalidOptionError, match="only a repository has revisions"):
+        load_split(GOLDEN, revision="data-1.0.0")
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors", ROWS])

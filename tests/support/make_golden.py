@@ -5,7 +5,11 @@ from pathlib import Path
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.execution import Serial
 from robomme_interference_data.work_progress import WorkProgress
@@ -21,7 +25,7 @@ def make(root: Path) -> None:
     with WorkProgress(unit="episodes", quiet=True) as progress:
         for kind, tasks in (("demonstrations", queries), ("distractors", units)):
             build_dataset(BuildPlan(kind, source, tasks), root / kind, Serial(), progress)
-    for _ in write_manifests(plan_manifests(root), root):
+    for _ in write_manifests(plan_manifests(in_folder(root)), root):
         pass
 
 

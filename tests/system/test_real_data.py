@@ -12,10 +12,14 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from robomme_interference_data import load_buffer
+from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.execution import Serial
@@ -97,9 +101,9 @@ def test_a_split_of_real_frames(shared_data: Path, recordings: Path, tmp_path: P
         plan = BuildPlan(kind, (source,), list_episodes([source]), ("front",))
         result = build_dataset(plan, split / kind, Serial(), WorkProgress(unit="episodes"))
     assert result.skipped == {"PatternLock/train/0": "96 raw frames; a unit needs 249"}
-    for _ in write_manifests(plan_manifests(split, ("k0", "k1"), 0, None), split):
+    for _ in write_manifests(plan_manifests(in_folder(split), ("k0", "k1"), 0, None), split):
         pass
-    assert list(verify_split(split)) == []
+    assert list(verify_split(load_split(split))) == []
     with h5py.File(recordings / "record_dataset_VideoUnmaskSwap.h5", "r") as file:
         groups = [file[f"episode_0/timestep_{step}"] for step in range(0, 256, 8)]
         unit = np.stack([group["obs/front_rgb"][()] for group in groups])

@@ -9,7 +9,11 @@ import pytest
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
-from robomme_interference_data.build_dataset.manifests import plan_manifests, write_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
@@ -79,7 +83,9 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
         ("sample:VideoRepick",), tmp_path / DISTRACTORS, split="train", cameras=("front",)
     )
     build(DISTRACTORS, units)
-    for _ in write_manifests(plan_manifests(tmp_path, ("no-history", "k0", "k1")), tmp_path):
+    for _ in write_manifests(
+        plan_manifests(in_folder(tmp_path), ("no-history", "k0", "k1")), tmp_path
+    ):
         pass
     config = RunConfig(
         policy="replay",

@@ -58,7 +58,7 @@ class Family(ABC):
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
         """Show the answer."""
 
-    def react(self, arm: Arm) -> None:  # noqa: B027, most scenes do nothing
+    def react(self, arm: Arm) -> None:
         """Let the scene answer to the arm after a step: lamps, the cap of a button."""
 
     @abstractmethod
