@@ -10,11 +10,12 @@ from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
+    MANIFEST_PATH,
 )
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.split import HEADER, Split
+from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
 
 
@@ -101,7 +102,7 @@ def audit_split(split: Split) -> Audit:
     for manifest in split.manifests():
         uses = audit.uses.get(manifest.condition)
         if uses is None:
-            path = split.files.path(HEADER)
+            path = split.files.path(MANIFEST_PATH)
             raise FormatError.damaged(path, f"{manifest.condition} is not among its conditions")
         places = audit.places.setdefault(manifest.condition, {})
         drawn: Counter[EpisodeId] = Counter()

@@ -26,6 +26,7 @@ from robomme_interference_data.constants import (
     FORMAT_VERSION,
     IDENTITY_PATH,
     INDEX_DIR,
+    MANIFESTS,
     REPORT_PATH,
     STATS_PATH,
     SUMS_PATH,
@@ -51,11 +52,11 @@ _LEROBOTS = ("episode_index", "length")
 def listed_files(root: Path) -> list[str]:
     """Return the files of a dataset whose SHA-256 is recorded: all but the list and what it names.
 
-    An index has a list of its own, and what people put beside a dataset has none: README, LICENSE,
-    and hidden files.
+    An index has a list of its own; so have the manifests, which a published split has beside its
+    units. What people put beside a dataset has none: README, LICENSE, cards and hidden files.
     """
     own = (IDENTITY_PATH, SUMS_PATH)
-    beside = re.compile(rf"(README|LICENSE)[^/]*|\..*|{INDEX_DIR}/.*")
+    beside = re.compile(rf"(README|LICENSE|croissant)[^/]*|\..*|({INDEX_DIR}|{MANIFESTS})/.*")
     return [path for path in all_files(root) if path not in own and not beside.fullmatch(path)]
 
 

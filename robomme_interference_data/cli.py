@@ -63,6 +63,7 @@ _GROUPS = {
         ("build", building.app),
         ("verify", building.verify),
         ("audit", building.audit),
+        ("fetch", commands.fetch),
     ),
     "Look": (
         ("list", commands.list_buffers),

@@ -1,4 +1,4 @@
-"""Commands that look at splits and at this machine: `list`, `show` and `doctor`."""
+"""Commands that fetch and look at splits, and at this machine."""
 
 from dataclasses import asdict
 from operator import attrgetter
@@ -17,7 +17,10 @@ from robomme_interference_data.console import (
     check_output,
     print_json,
     say,
+    stoppable,
 )
+from robomme_interference_data.fetch import FetchConfig
+from robomme_interference_data.settings import with_settings
 
 
 def list_buffers(
@@ -101,6 +104,58 @@ def show(
         f"{manifest.lesson_share:.0%} lesson",
     )
     typer.echo(table.text())
+
+
+@with_settings
+def fetch(
+    split: Annotated[str, typer.Argument(help="Repository, namespace/name or …@data-1.0.0.")],
+    config: FetchConfig,
+    to: Annotated[
+        Path | None, typer.Option(help="Folder to copy the files to; by default only the cache.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option(help="Only tell what would be fetched.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fetch a split from the Hub, or the part of it that some buffers need.
+
+    What is there already is not fetched again; every file is checked against its digest.
+
+    Examples:
+    ```
+    robomme-interference fetch namespace/name@data-1.0.0
+    robomme-interference fetch namespace/name --conditions k3 --families MoveCube --cameras front
+    robomme-interference fetch namespace/name --index thumbnail --to my-split
+    ```
+    """
+    from robomme_interference_data.fetch import fetch as fetch_parts
+    from robomme_interference_data.fetch import plan_fetch
+    from robomme_interference_data.loading import load_split
+
+    check_output(to)
+    with stoppable("What was fetched is kept"):
+        opened = load_split(split)
+        parts = plan_fetch(opened, config)
+        told = [
+            {
+                "repository": part.files.describe(),
+                "files": len(part.sizes),
+                "bytes": sum(part.sizes.values()),
+                "missing_files": len(part.missing),
+                "missing_bytes": sum(part.sizes[path] for path in part.missing),
+            }
+            for part in parts
+        ]
+        for one in told:
+            say(
+                "{repository}: {files:,} files, {bytes:,} bytes; to fetch: {missing_files:,} "
+                "files, {missing_bytes:,} bytes".format(**one)
+            )
+        if not dry_run:
+            fetch_parts(parts, to)
+    if as_json:
+        print_json({"to": None if to is None else str(to), "repositories": told})
+    elif not dry_run:
+        say(f"Next: robomme-interference list {to or opened.location}")
 
 
 def doctor(as_json: AsJson = False) -> None:

@@ -89,6 +89,7 @@ DISTRACTORS = "distractors"
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"
+MANIFEST_PATH = f"{MANIFESTS}/{MANIFEST_HEADER}"
 
 # --- files of a run -----------------------------------------------------------------------------
 

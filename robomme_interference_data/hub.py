@@ -9,18 +9,20 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
+from hashlib import sha1
 from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import (
+    HashMismatchError,
     HubError,
     InterferenceError,
     InvalidOptionError,
     MissingFileError,
     first_line,
 )
-from robomme_interference_data.files import LocalFiles, check_relative
+from robomme_interference_data.files import LocalFiles, check_relative, sha256_file
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
@@ -105,11 +107,13 @@ class HubFiles:
         Raises:
             MissingFileError: The repository has no such file.
             HubError: See `commit`.
+            HashMismatchError: What came is not what the Hub has.
         """
         from huggingface_hub import hf_hub_download
 
         check_relative(relative, self.describe())
-        return Path(
+        new = self.missing([relative])
+        path = Path(
             self._asked(
                 relative,
                 hf_hub_download,
@@ -120,20 +124,15 @@ class HubFiles:
                 tqdm_class=_silent(),
             )
         )
+        if new:
+            self._check(relative, path)
+        return path
 
     def fetch(self, paths: Iterable[str]) -> None:
         """Download files that are not in the cache, with a bar; see `Files.fetch`."""
-        from huggingface_hub import try_to_load_from_cache
         from huggingface_hub.utils import tqdm
 
-        there, kind = {"revision": self.commit}, self.repo_type
-        missing = [
-            path
-            for path in dict.fromkeys(paths)
-            if not isinstance(
-                try_to_load_from_cache(self.repo_id, path, repo_type=kind, **there), str
-            )
-        ]
+        missing = self.missing(paths)
         if not missing:
             return
         with (
@@ -146,6 +145,35 @@ class HubFiles:
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
+
+    def missing(self, paths: Iterable[str]) -> list[str]:
+        """Return the files that are not in the cache, each once."""
+        from huggingface_hub import try_to_load_from_cache
+
+        there = partial(
+            try_to_load_from_cache,
+            self.repo_id,
+            repo_type=self.repo_type,
+            revision=self.commit,
+        )
+        return [path for path in dict.fromkeys(paths) if not isinstance(there(path), str)]
+
+    def sizes(self) -> dict[str, int]:
+        """Ask how large every file of the repository is; return bytes by path.
+
+        Raises:
+            HubError: See `commit`.
+        """
+        from huggingface_hub import HfApi
+
+        def listed() -> dict[str, int]:
+            tree = HfApi().list_repo_tree(
+                self.repo_id, recursive=True, revision=self.commit, repo_type=self.repo_type
+            )
+            return {one.path: one.size for one in tree if hasattr(one, "size")}
+
+        found: dict[str, int] = self._asked(None, listed)
+        return found
 
     def snapshot(self, *patterns: str) -> Path:
         """Download the files that match a pattern, such as `meta/*`; return the folder of all.
@@ -177,6 +205,22 @@ class HubFiles:
     def describe(self) -> str:
         """Return `namespace/name@revision`, with the commit as revision once it is known."""
         return f"{self.repo_id}@{self.__dict__.get('commit', self.revision)}"
+
+    def _check(self, relative: str, path: Path) -> None:
+        """Check a file that has just come, and remove it if it is not what the Hub has.
+
+        The client checks its length only. It keeps files under their digests: Git's of small
+        ones, SHA-256 of large ones.
+        """
+        blob = path.resolve()
+        made = {40: partial(_git_sha1, blob), 64: partial(sha256_file, blob)}.get(len(blob.name))
+        if made is not None and made() != blob.name:
+            path.unlink()
+            blob.unlink(missing_ok=True)
+            raise HashMismatchError(
+                f"{relative} of {self.describe()} came damaged: its digest is not {blob.name}",
+                "It was thrown away. Type the same command again.",
+            )
 
     def _asked(self, relative: str | None, ask: Any, *arguments: Any, **options: Any) -> Any:
         """Ask the client, and return its error in this package's words."""
@@ -239,6 +283,11 @@ class HubFiles:
             f"{what} is not in the cache, and the Hub cannot be reached: {first_line(error)}",
             f"Try again when it can be reached, with: {command}",
         )
+
+
+def _git_sha1(path: Path) -> str:
+    data = path.read_bytes()
+    return sha1(b"blob %d\0" % len(data) + data).hexdigest()
 
 
 @cache

@@ -7,10 +7,11 @@ from pathlib import Path
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.cache import DecodedCache, default_cache_folder
 from robomme_interference_data.conditions import Condition
+from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.hub import locate
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.split import HEADER, Split
+from robomme_interference_data.split import Split
 
 
 def load_split(
@@ -45,7 +46,7 @@ def load_split(
         return Split(files, _cache(cache), threads)
     except MissingFileError as error:
         raise MissingFileError(
-            f"{files.describe()} is not a split: {HEADER} is missing",
+            f"{files.describe()} is not a split: {MANIFEST_PATH} is missing",
             "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
             "one: robomme-interference build all --source KIND:PATH --out SPLIT",
         ) from error

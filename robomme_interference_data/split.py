@@ -15,7 +15,7 @@ from robomme_interference_data.cache import DecodedCache
 from robomme_interference_data.conditions import Condition, parse_condition
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
-    MANIFEST_HEADER,
+    MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
 )
@@ -37,7 +37,6 @@ from robomme_interference_data.rows import from_table, read_header, to_dict
 
 _FOLDER = re.compile(r"\w[\w.-]*")
 _PLACE = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
-HEADER = f"{MANIFESTS}/{MANIFEST_HEADER}"
 _BATCH = 1024
 """Rows that are read at a time."""
 
@@ -56,7 +55,7 @@ class Split:
         self.files = files
         self._cache = cache
         self._threads = threads
-        path = files.path(HEADER)
+        path = files.path(MANIFEST_PATH)
         self.header = read_header(path, ManifestHeader)
         if DEMONSTRATIONS not in self.header.datasets:
             raise FormatError.damaged(path, "no demonstrations")

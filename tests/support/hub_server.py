@@ -117,7 +117,7 @@ class HubServer:
 
 
 def _sha1(data: bytes) -> str:
-    return hashlib.sha1(data).hexdigest()
+    return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()  # as Git names it
 
 
 def _error(status: int, code: str, commit: str = "") -> Answer:

@@ -1,0 +1,184 @@
+"""Splits on a Hub, through the real client and a server on the loopback interface."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from huggingface_hub import constants
+from support.hub import BASE, SPLIT, push_split, running_hub
+from support.hub_server import HubServer
+from support.splits import GOLDEN
+
+from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.build_dataset.audit import audit_split
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.cli import app
+from robomme_interference_data.errors import FormatError, HubError, MissingFileError
+
+QUERY = "MoveCube/test/0"
+VERSION = "data-1.0.0"
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
+    with running_hub(tmp_path / "cache", monkeypatch) as server:
+        push_split(server, GOLDEN, tmp_path / "work")
+        yield server
+
+
+def test_a_buffer_is_the_one_on_disk(hub: HubServer) -> None:
+    here = load_buffer(QUERY, "k3", split=GOLDEN)
+    there = load_buffer(QUERY, "k3", split=SPLIT, revision=VERSION, verify=True)
+    assert there.manifest == here.manifest
+    for camera in here.cameras:
+        assert np.array_equal(there.frames(camera), here.frames(camera))
+    assert np.array_equal(there.states, here.states)
+    assert np.array_equal(there.query.frame(), here.query.frame())
+
+
+def test_no_more_is_downloaded_than_the_buffer_needs(hub: HubServer) -> None:
+    buffer = load_buffer(QUERY, "k1", split=SPLIT, revision=VERSION, cameras=["front"])
+    found = set(hub.downloads())
+    small = {"meta/info.json", "meta/interference.json", "meta/episodes/chunk-000/file-000.parquet"}
+    numbers = {0} | {entry.episode_index for entry in buffer.manifest.sessions[1:]}
+    assert {path for path in found if "/observation.images.wrist/" in path} == set()
+    assert {path for path in found if path.startswith("meta/")} == small
+    videos = [path for path in hub.downloads() if path.startswith("videos/")]
+    assert len(videos) == len(buffer.sessions) and len(numbers) <= len(videos)
+    before = len(hub.requests)
+    buffer.frames("front")
+    _ = buffer.states
+    assert len(hub.requests) == before
+
+
+def test_a_second_load_makes_no_request(hub: HubServer) -> None:
+    load_buffer(QUERY, "k3", split=SPLIT, revision=VERSION)
+    before = len(hub.requests)
+    load_buffer(QUERY, "k3", split=f"{SPLIT}@{VERSION}", verify=True)
+    assert len(hub.requests) == before
+
+
+def test_offline(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    load_buffer(QUERY, "k1", split=SPLIT, revision=VERSION)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert len(load_buffer(QUERY, "k1", split=SPLIT, revision=VERSION).frames()) > 0
+    with pytest.raises(HubError, match="not in the cache") as caught:
+        load_buffer(QUERY, "k7", split=SPLIT, revision=VERSION)
+    assert "hf download" in str(caught.value.hint)
+
+
+def test_a_version_stays_when_its_tag_is_moved_or_gone(hub: HubServer, tmp_path: Path) -> None:
+    first = load_split(SPLIT, revision=VERSION)
+    hub.push(f"datasets/{SPLIT}", {"README.md": b"another"}, VERSION)
+    again = load_split(SPLIT, revision=VERSION)
+    assert again.location == first.location and again.location.startswith(f"{SPLIT}@")
+
+
+def test_a_split_has_one_revision_wherever_it_lies(hub: HubServer, tmp_path: Path) -> None:
+    published, local = load_split(SPLIT), load_split(GOLDEN)
+    assert published.revision == local.revision
+    assert (published.name, local.name) == (SPLIT, "split")
+    assert [*published.manifests()] == [*local.manifests()]
+
+
+def test_verify_and_audit_take_a_repository(hub: HubServer) -> None:
+    split = load_split(SPLIT, revision=VERSION)
+    assert [*verify_split(split)] == []
+    assert audit_split(split).leaks == []
+
+
+def test_a_place_that_leads_elsewhere(tmp_path: Path) -> None:
+    root = shutil.copytree(GOLDEN, tmp_path / "split")
+    header = root / "manifests" / "manifest.json"
+    value = json.loads(header.read_text(encoding="utf-8"))
+    for place in ("..", "/etc", "a/b", "a/b@main", "https://somewhere/a/b"):
+        value["datasets"]["distractors"]["place"] = place
+        header.write_text(json.dumps(value), encoding="utf-8")
+        with pytest.raises(FormatError, match="place"):
+            load_split(root)
+
+
+# --- fetch ---------------------------------------------------------------------------------------
+
+
+Fetched = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def fetch(capfd: pytest.CaptureFixture[str]) -> Fetched:
+    from typer.testing import CliRunner
+
+    def run(*arguments: object) -> tuple[int, str]:
+        result = CliRunner().invoke(app, ["fetch", *map(str, arguments)])
+        return result.exit_code, result.output + str(result.exception or "")
+
+    return run
+
+
+def test_fetch_the_whole_split(hub: HubServer, fetch: Fetched, tmp_path: Path) -> None:
+    code, told = fetch(f"{SPLIT}@{VERSION}", "--to", tmp_path / "here", "--json")
+    assert code == 0
+    hub.down = True
+    split = load_split(tmp_path / "here")
+    assert [*verify_split(split)] == [] and len(split) == len(load_split(GOLDEN))
+    found = {p.name for p in (tmp_path / "here").iterdir()}
+    assert found >= {"demonstrations", "manifests", "meta", "data", "videos"}
+    answer = json.loads(told[told.index("{\n") :])
+    assert [one["missing_files"] for one in answer["repositories"]] == [
+        one["files"] - known for one, known in zip(answer["repositories"], (5, 3), strict=True)
+    ]
+
+
+def test_fetch_a_part_twice(hub: HubServer, fetch: Fetched) -> None:
+    wanted = (
+        f"{SPLIT}@{VERSION}",
+        "--families",
+        "MoveCube",
+        "--conditions",
+        "k0",
+        "--cameras",
+        "front",
+    )
+    assert fetch(*wanted, "--dry-run")[0] == 0
+    assert not [path for path in hub.downloads() if path.endswith(".mp4")]
+    assert fetch(*wanted)[0] == 0
+    videos = [path for path in hub.downloads() if path.endswith(".mp4")]
+    assert len(videos) == 1 and "front" in videos[0]
+    count = len(hub.downloads())
+    code, told = fetch(*wanted)
+    assert code == 0 and len(hub.downloads()) == count and "to fetch: 0 files" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--families", "MoveCub"], "MoveCub"),
+        (["--conditions", "k9"], "k9"),
+        (["--cameras", "side"], "side"),
+        (["--episodes", "40-49"], "no buffer"),
+        (["--index", "thumbnail"], "lacks index"),
+    ],
+)
+def test_what_cannot_be_fetched(
+    hub: HubServer, fetch: Fetched, options: list[str], words: str
+) -> None:
+    code, told = fetch(f"{SPLIT}@{VERSION}", *options)
+    assert code == 1 and words in told
+
+
+def test_fetch_is_for_repositories_and_mixes_no_splits(
+    hub: HubServer, fetch: Fetched, tmp_path: Path
+) -> None:
+    assert fetch(GOLDEN)[0] == 1
+    (tmp_path / "other" / "manifests").mkdir(parents=True)
+    (tmp_path / "other" / "manifests" / "manifest.json").write_text("{}", encoding="utf-8")
+    code, told = fetch(SPLIT, "--to", tmp_path / "other")
+    assert code == 1 and "another split" in told
+
+
+def test_a_repository_that_is_no_split(hub: HubServer) -> None:
+    with pytest.raises(MissingFileError, match="is not a split"):
+        load_split(BASE)
