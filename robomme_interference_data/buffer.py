@@ -4,6 +4,7 @@ import os
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, repeat
@@ -18,6 +19,7 @@ from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
+    MissingExtraError,
     StaleIndexError,
     UnknownNameError,
 )
@@ -85,6 +87,14 @@ class Buffer:
             f"Buffer({self.episode_id}, {self.condition}, frames={len(self)}, "
             f"sessions={len(self.sessions)}, cameras={list(self.cameras)})"
         )
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the film strip, as notebooks show it; without matplotlib they show the text."""
+        from robomme_interference_data.strip import strip_png
+
+        with suppress(MissingExtraError):
+            return strip_png(self, "front" if "front" in self.cameras else self.cameras[0])
+        return None
 
     def __len__(self) -> int:
         """Return the number of history frames, without the first live observation."""

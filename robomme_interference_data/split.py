@@ -1,6 +1,7 @@
 """A split: datasets, and the manifests that name buffers of them."""
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -34,6 +35,7 @@ from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import from_table, read_header, to_dict
+from robomme_interference_data.tables import Table
 
 _FOLDER = re.compile(r"\w[\w.-]*")
 _PLACE = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
@@ -67,6 +69,17 @@ class Split:
 
     def __repr__(self) -> str:
         return f"Split({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
+
+    def _repr_html_(self) -> str:
+        """Return the table of its buffers by family, as notebooks show it."""
+        counts = Counter(zip(self._keys["family"], self._keys["condition"], strict=True))
+        return Table.make(
+            "buffers",
+            f"{self.name}: {len(self):,} buffers of {len(self.episode_ids):,} query episodes",
+            " ".join(["family", *(f"{name}:count" for name in self.conditions)]),
+            ((one, *(counts[one, name] for name in self.conditions)) for one in self.families),
+            f"Buffers by family and condition. Cameras: {', '.join(self.cameras)}.",
+        ).html()
 
     def __len__(self) -> int:
         """Return the number of buffers."""

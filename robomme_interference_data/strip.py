@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
@@ -127,6 +128,14 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
         page.text(middle, bottom + 0.03, str(len(buffer)), 5.5, color=_GREY)
         page.text(middle, bottom + 0.13, "first live observation", 6, width=_LIVE)
         page.height = bottom + 0.28
+
+
+def strip_png(buffer: Buffer, camera: str = "front") -> bytes:
+    """Return what `draw_strip` draws, as PNG."""
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "strip.png"
+        draw_strip(buffer, out, camera=camera)
+        return out.read_bytes()
 
 
 def _draw_head(page: Page, buffer: Buffer, camera: str) -> float:

@@ -5,6 +5,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any, Literal, Self, cast
 
 import pyarrow as pa
@@ -90,6 +91,22 @@ class Table:
         lines = [heads, rule, *cells]
         text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
         return "\n\n".join(part for part in (f"# {self.title}", text, self.note) if part) + "\n"
+
+    def html(self) -> str:
+        """Return the table as HTML, under its title."""
+        sides = ["left" if column.kind in ("text", "flag") else "right" for column in self.columns]
+
+        def line(tag: str, cells: Sequence[str]) -> str:
+            found = (
+                f'<{tag} style="text-align: {side}">{escape(cell)}</{tag}>'
+                for side, cell in zip(sides, cells, strict=True)
+            )
+            return f"<tr>{''.join(found)}</tr>"
+
+        heads = line("th", [column.name.replace("_", " ") for column in self.columns])
+        rows = "".join(line("td", self.cells(row)) for row in self.rows)
+        table = f"<table><thead>{heads}</thead><tbody>{rows}</tbody></table>"
+        return f"<p>{escape(self.title)}</p>{table}<p>{escape(self.note)}</p>"
 
     def text(self) -> str:
         """Return the table for a terminal: aligned, under its title, the note below."""

@@ -1,0 +1,47 @@
+"""The example notebook, run cell by cell; what buffers and splits show in one."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from IPython.core.interactiveshell import InteractiveShell
+from support.splits import GOLDEN
+
+from robomme_interference_data import load_buffer, load_split
+
+NOTEBOOK = Path(__file__).parents[2] / "examples" / "buffers.ipynb"
+
+
+@pytest.fixture
+def shell() -> InteractiveShell:
+    return InteractiveShell.instance()
+
+
+def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPLIT", str(GOLDEN))
+    shown = []
+    for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            result = shell.run_cell("".join(cell["source"]))
+            result.raise_error()
+            if result.result is not None:
+                formats, _ = shell.display_formatter.format(result.result)
+                shown.append(sorted(formats))
+    assert ["text/html", "text/plain"] in shown and ["image/png", "text/plain"] in shown
+
+
+def test_a_split_is_a_table(shell: InteractiveShell) -> None:
+    formats, _ = shell.display_formatter.format(load_split(GOLDEN))
+    assert "<td" in formats["text/html"] and "MoveCube" in formats["text/html"]
+
+
+def test_without_matplotlib_a_buffer_is_text(
+    shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [one for one in sys.modules if one.partition(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    buffer = load_buffer("MoveCube/test/0", "k1", split=GOLDEN)
+    formats, _ = shell.display_formatter.format(buffer)
+    assert [*formats] == ["text/plain"] and "MoveCube/test/0" in formats["text/plain"]
