@@ -193,9 +193,11 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
         HistoryTooLongError: A buffer exceeds the position limit.
     """
     datasets = {one.kind: one for one in (plan.demonstrations, plan.distractors)}
-    exact = {(kind, e.episode_id): e.exact for kind, d in datasets.items() for e in d.records()}
+    lossy = {
+        (kind, e.episode_id) for kind, d in datasets.items() for e in d.records() if not e.exact
+    }
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
-        query, material = Query(plan.demonstrations, record), _Material(plan, record)
+        place, material = Query(plan.demonstrations, record).place, _Material(plan, record)
         # The largest first: fewer units begin those that are drawn for it.
         sessions = {one.name: one.sessions(material) for one in reversed(plan.conditions)}
         for condition in plan.conditions:
@@ -211,11 +213,12 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
                 seed=record.seed,
                 difficulty=record.difficulty,
                 simulator=record.simulator,
-                exact=record.exact and all(exact[one.dataset, one.source] for one in entries),
+                exact=record.exact
+                and not (lossy and any((one.dataset, one.source) in lossy for one in entries)),
                 lesson_frames=lesson_frames(placed, 0, frames),
                 history_frames=frames,
                 lesson_share=lesson_share(placed, 0, frames),
-                query=query.place,
+                query=place,
                 sessions=entries,
             )
 

@@ -4,7 +4,8 @@ The columns of every table and the fields of every header follow from these (see
 `docs/format.md` describes them to readers of the files.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import accumulate
 from typing import Any
@@ -183,32 +184,38 @@ class Session:
     """A session in its place in a buffer.
 
     Attributes:
-        role: `lesson`, `distractor`, … (see `ROLES`).
-        family: Family of the recorded episode.
-        source: Id of the recorded episode.
         start: First frame of the session in the buffer.
         stop: Frame after its last one.
-        entry: Where the frames are stored.
+        entry: What it is, and where its frames are stored.
     """
 
-    role: str
-    family: str
-    source: EpisodeId
     start: int
     stop: int
-    entry: SessionEntry = field(repr=False)
+    entry: SessionEntry
 
     def __len__(self) -> int:
         return self.stop - self.start
 
+    @property
+    def role(self) -> str:
+        """`lesson`, `distractor`, … (see `ROLES`)."""
+        return self.entry.role
 
-def place_sessions(entries: tuple[SessionEntry, ...]) -> tuple[Session, ...]:
+    @property
+    def family(self) -> str:
+        """Family of the recorded episode."""
+        return self.entry.family
+
+    @property
+    def source(self) -> EpisodeId:
+        """Id of the recorded episode."""
+        return self.entry.source
+
+
+def place_sessions(entries: Sequence[SessionEntry]) -> tuple[Session, ...]:
     """Return sessions in their places, one after the other."""
-    stops = accumulate(entry.num_frames for entry in entries)
-    return tuple(
-        Session(one.role, one.family, one.source, stop - one.num_frames, stop, one)
-        for one, stop in zip(entries, stops, strict=True)
-    )
+    stops = [0, *accumulate(entry.num_frames for entry in entries)]
+    return tuple(map(Session, stops, stops[1:], entries))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ field `episode_id` also has the columns `family`, `split` and `index`, to filter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
+from itertools import accumulate
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -49,30 +50,31 @@ def to_dict(record: Any) -> dict[str, Any]:
 def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
     """Return records as a table; parts that records share are converted once."""
     kept = list(records)  # alive, so that an id is one object's
-    write = _codec(type(kept[0])).write if kept else None
     shared: dict[int, Any] = {}
-    rows = [write(record, shared) for record in kept] if write else []
-    columns = {field.name: [row.get(field.name) for row in rows] for field in schema}
-    return pa.table([_column(columns[field.name], field.type) for field in schema], schema=schema)
+    return pa.table([_column(field, kept, shared) for field in schema], schema=schema)
 
 
-def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
-    """Return a column; of lists of records, each record that several lists share goes in once."""
-    if not (pa.types.is_list(kind) and pa.types.is_struct(kind.value_type)):
-        return pa.array(values, kind)
-    place: dict[int, int] = {}
-    distinct: list[Any] = []
-    picks: list[int] = []
-    offsets = [0]
-    for listed in values:
-        for one in listed:
-            if id(one) not in place:
-                place[id(one)] = len(distinct)
-                distinct.append(one)
-            picks.append(place[id(one)])
-        offsets.append(len(picks))
-    items = pa.array(distinct, kind.value_type).take(pa.array(picks, pa.int64()))
-    return pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), items, type=kind)
+def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> pa.Array:
+    """Return a column; of lists, each record that several lists share goes in once."""
+    if not records:
+        return pa.array([], field.type)
+    known = _names(records[0])
+    if field.name not in known:  # a part of the id
+        return pa.array([getattr(one.episode_id, field.name) for one in records], field.type)
+    values = [getattr(one, field.name) for one in records]
+    codec = _codec(get_type_hints(type(records[0]))[field.name])
+    if codec.write is None:
+        return pa.array(values, field.type)
+    if codec.item is None:
+        return pa.array([codec.write(one, shared) for one in values], field.type)
+    listed = [one for value in values for one in value]
+    distinct = {id(one): one for one in listed}
+    place = dict(zip(distinct, range(len(distinct)), strict=True))
+    items = pa.array(
+        [codec.item(one, shared) for one in distinct.values()], field.type.value_type
+    ).take(pa.array([place[id(one)] for one in listed], pa.int64()))
+    offsets = pa.array([0, *accumulate(map(len, values))], pa.int32())
+    return pa.ListArray.from_arrays(offsets, items, type=field.type)
 
 
 def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:
@@ -143,13 +145,14 @@ _Writer = Callable[[Any, dict[int, Any]], Any]
 class _Codec:
     """How values of a type are kept: its Arrow type, given the keys of maps, and both ways.
 
-    There is no `write` where values are plain already.
+    There is no `write` where values are plain already. Of a list, `item` writes one of its values.
     """
 
     arrow: Callable[[Sequence[str]], pa.DataType]
     read: Callable[[Any], Any]
     write: _Writer | None = None
     optional: bool = False
+    item: _Writer | None = None
 
 
 def _codec_of(hint: Any) -> _Codec:
@@ -191,6 +194,7 @@ def _list(item: _Codec) -> _Codec:
         lambda keys: pa.list_(pa.field("item", item.arrow(keys), nullable=False)),
         lambda value: tuple(map(read, _of((list, tuple), value, "a list"))),
         lambda value, shared: [write(one, shared) for one in value] if write else list(value),
+        item=write,
     )
 
 

@@ -2,6 +2,7 @@
 
 import csv
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ def sessions(*lengths: int) -> list[Session]:
     found, start = [], 0
     for length in lengths:
         role = "lesson" if length > 0 else "distractor"
-        found.append(Session(role, "MoveCube", NAME, start, start + abs(length), ENTRY))
+        found.append(Session(start, start + abs(length), replace(ENTRY, role=role)))
         start += abs(length)
     return found
 
