@@ -13,7 +13,6 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     MissingExtraError,
-    MissingFileError,
     MissingIndexError,
     NoRendererError,
     PolicyError,
@@ -90,7 +89,7 @@ def test_only_simulators_that_exist_are_offered(
 
 
 def test_a_missing_split_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MissingFileError, match="is not a split"):
+    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
         run_evaluation(RunConfig("hold", tmp_path / "none", tmp_path / "run"))
 
 

@@ -30,7 +30,7 @@ def running_hub(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubSer
         yield server
 
 
-def push_split(hub: HubServer, root: Path, work: Path) -> tuple[str, str]:
+def push_split(hub: HubServer, root: Path, work: Path, name: str = SPLIT) -> tuple[str, str]:
     """Put a split into two repositories; return the commits of split and demonstrations."""
     base = hub.push(f"datasets/{BASE}", root / DEMONSTRATIONS)
     shutil.copytree(root / DISTRACTORS, work)
@@ -39,6 +39,6 @@ def push_split(hub: HubServer, root: Path, work: Path) -> tuple[str, str]:
     places = {DEMONSTRATIONS: f"{BASE}@{base}", DISTRACTORS: "."}
     datasets = {name: replace(one, place=places[name]) for name, one in header.datasets.items()}
     write_json(work / MANIFEST_PATH, to_dict(replace(header, datasets=datasets)))
-    commit = hub.push(f"datasets/{SPLIT}", work, "data-1.0.0")
-    hub.push(f"datasets/{SPLIT}", work)
+    commit = hub.push(f"datasets/{name}", work, "data-1.0.0")
+    hub.push(f"datasets/{name}", work)
     return commit, base

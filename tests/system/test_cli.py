@@ -49,7 +49,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
     words = [line.strip().split("  ")[0].removesuffix(":") for line in out.splitlines()]
     listed = [word for word in words if (word,) in ALL or word in GROUPS]
     assert listed == [
-        *("Data", "doctor", "build", "verify", "audit"),
+        *("Data", "doctor", "build", "verify", "audit", "fetch"),
         *("Look", "list", "show", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "evaluate", "merge"),
@@ -126,7 +126,7 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["list", "{}/nowhere"], ("is not a split", "build all")),
+        (["list", "{}/nowhere"], ("neither a folder nor", "namespace/name")),
         (["list", "{}", "--family", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
         (["list", "{}", "--condition", "k9"], ("'k9'", "k0", "k7")),
         (["list", "{}", "--condition", "seven"], ("'seven'", "k0")),
@@ -134,8 +134,8 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
         (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
         (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0 k1 k3 k7 k9")),
         (["show", EPISODE, "k3", "--split", "{}", "--camera", "nope"], ("camera 'nope'", "wrist")),
-        (["verify", "{}/nowhere"], ("is not a split",)),
-        (["audit", "{}/nowhere"], ("is not a split",)),
+        (["verify", "{}/nowhere"], ("neither a folder nor",)),
+        (["audit", "{}/nowhere"], ("neither a folder nor",)),
         (
             ["build", "distractors", "--source", "frmes:{}", "--out", "{}/out"],
             ("frmes", "Did you mean 'frames'?"),

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 from support.command_lines import parse
+from support.hub import push_split, running_hub
+from support.splits import GOLDEN
 
 from robomme_interference_data.evaluate import run as run_module
 from robomme_interference_data.execution import Serial
@@ -40,24 +42,32 @@ def test_command_lines_are_understood(page: str, line: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_readmes_commands_run(tmp_path: Path) -> None:
+def test_the_readmes_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # RoboMME's recordings are not at hand everywhere: made-up episodes take their place, and a
     # world without a renderer that of the embedded simulator, on which `make demo` runs it.
+    with running_hub(tmp_path / "cache", monkeypatch) as hub:
+        push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
+        there = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_CACHE": str(tmp_path / "cache")}
+        there["HF_HUB_OFFLINE"] = "0"
+        _run_readme(tmp_path, there)
+    assert (tmp_path / "strip.png").stat().st_size > 10_000
+    assert (tmp_path / "S" / "manifests" / "manifest.json").is_file()
+
+
+def _run_readme(tmp_path: Path, there: dict[str, str]) -> None:
     for line in command_lines(ROOT / "README.md"):
         given = line.replace("robomme-h5:recordings/", "sample")
         given = given.replace("demo/tabletop", "S --simulator support.worlds:World")
         done = subprocess.run(
             [str(COMMAND), *shlex.split(given)],
             cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "WORLDS_SPLIT": "S"},
+            env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "WORLDS_SPLIT": "S"} | there,
             capture_output=True,
             text=True,
             timeout=300,
             check=False,
         )
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
-    assert (tmp_path / "strip.png").stat().st_size > 10_000
-    assert (tmp_path / "S" / "manifests" / "manifest.json").is_file()
 
 
 ELSEWHERE = (
@@ -66,6 +76,7 @@ ELSEWHERE = (
     "simulate ",  # a renderer
     "--source ",  # recordings, or a renderer
     "retrieval_rollouts.csv",  # the released rows
+    "fetch ",  # a Hub
 )
 """What marks command lines of the pages that need what is not at hand: they are parsed alone."""
 
@@ -105,17 +116,20 @@ def test_the_commands_of_the_pages_run(
         assert code == 0, f"{line}\n{out}\n{err}"
 
 
-def test_the_readmes_python_example(
-    tmp_path: Path, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("example", ["hub", "load"])
+def test_the_readmes_python_examples(
+    example: str, tmp_path: Path, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.search(r"<!-- example: load -->\n```python\n(.*?)```", text, flags=re.S)
+    found = re.search(rf"<!-- example: {example} -->\n```python\n(.*?)```", text, flags=re.S)
     assert found is not None
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "split").symlink_to(tiny_split)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec(found[1], names)
+    with running_hub(tmp_path / "cache", monkeypatch) as hub:
+        push_split(hub, tiny_split, tmp_path / "work", "namespace/name")
+        exec(found[1], names)
     buffer = names["buffer"]
     assert len(buffer) == 48 + 3 * 32  # type: ignore[arg-type]
     assert str(buffer.episode_id) == "VideoRepick/test/0"  # type: ignore[attr-defined]
