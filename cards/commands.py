@@ -5,8 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from robomme_interference_data.errors import MissingFileError
+
 if TYPE_CHECKING:
     from robomme_interference_data.cards.publication import Publication
+    from robomme_interference_data.files import Files
 
 
 def card(
@@ -44,24 +47,40 @@ def card_text(source: str, about: "Publication") -> str:
 
     Raises:
         MissingFileError: There is no split, no dataset and no run.
+        InvalidOptionError: It is neither a folder nor the name of a repository.
         MissingExtraError: jinja2 is not installed.
         InterferenceError: It cannot be read.
     """
     from robomme_interference_data.cards import render
     from robomme_interference_data.constants import (
         IDENTITY_PATH,
-        MANIFEST_HEADER,
-        MANIFESTS,
         RUN_HEADER,
+        RUN_RECORD,
+        RUN_TABLES,
     )
     from robomme_interference_data.dataset import Dataset
-    from robomme_interference_data.files import LocalFiles
-    from robomme_interference_data.split import load_split
+    from robomme_interference_data.hub import locate
+    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.split import HEADER
 
-    folder = Path(source)
-    split = (folder / MANIFESTS / MANIFEST_HEADER).is_file()
-    if not split and (folder / IDENTITY_PATH).is_file():
-        return render.demonstrations_text(Dataset(LocalFiles(folder)), about)
-    if folder.is_file() or (folder / RUN_HEADER).is_file():
-        return render.results_text(folder, about)
-    return render.split_text(load_split(source), about)
+    if Path(source).is_file():
+        return render.results_text(Path(source), about)
+    files = locate(source)
+    if _has(files, HEADER):
+        return render.split_text(load_split(files.describe()), about)
+    if _has(files, IDENTITY_PATH):
+        return render.demonstrations_text(Dataset(files), about)
+    if _has(files, RUN_HEADER):
+        return render.results_text(files.snapshot(RUN_HEADER, RUN_RECORD, *RUN_TABLES), about)
+    raise MissingFileError(
+        f"{files.describe()} holds no split, no demonstrations and no run: {HEADER}, "
+        f"{IDENTITY_PATH} and {RUN_HEADER} are missing",
+        "Point to the folder that robomme-interference build or evaluate wrote.",
+    )
+
+
+def _has(files: "Files", path: str) -> bool:
+    try:
+        return files.path(path).is_file()
+    except MissingFileError:
+        return False

@@ -17,7 +17,8 @@ from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts, kind
 from robomme_interference_data.cards.metadata import BUFFERS, BUFFERS_FILE, EPISODES, ROLLOUTS
 from robomme_interference_data.cards.publication import HUB, OTHER, Publication
 from robomme_interference_data.cards.results import ResultsFacts
-from robomme_interference_data.constants import EPISODES_DIR
+from robomme_interference_data.constants import EPISODES_PATH, SUMS_PATH
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.files import sha256_file
 from robomme_interference_data.records import BufferManifest, EpisodeRecord
 
@@ -274,10 +275,12 @@ def _format(path: str) -> str:
 
 
 def _episodes_file(facts: DatasetFacts, about: Publication) -> dict[str, Any]:
-    """Return the table of episodes, which is one file in every dataset that this package wrote."""
-    sums = facts.dataset.sums()
-    path = min(path for path in sums if path.startswith(f"{EPISODES_DIR}/"))
-    return _file(about, path, sums[path])
+    """Return the table of episodes, which is one file."""
+    digest = facts.dataset.sums().get(EPISODES_PATH)
+    if digest is None:
+        where = facts.dataset.files.describe()
+        raise FormatError.damaged(where, f"{EPISODES_PATH} is not in {SUMS_PATH}")
+    return _file(about, EPISODES_PATH, digest)
 
 
 def _size(facts: DatasetFacts) -> str:

@@ -137,6 +137,11 @@ class SplitFacts:
         return self.datasets[DEMONSTRATIONS]
 
     @property
+    def base(self) -> str | None:
+        """Where the demonstrations lie on the Hub, `namespace/name@commit`, if they do."""
+        return self.split.header.datasets[DEMONSTRATIONS].place
+
+    @property
     def units(self) -> dict[str, DatasetFacts]:
         """The datasets of units by name."""
         return {name: one for name, one in self.datasets.items() if name != DEMONSTRATIONS}

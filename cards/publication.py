@@ -1,7 +1,8 @@
 """What is published, as whom and as which version."""
 
 import re
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 from robomme_interference_data.errors import InvalidOptionError
 
@@ -84,6 +85,13 @@ class Publication:
                 expected = "namespace/name@ and the 40 digits of a commit"
                 raise InvalidOptionError.expected("base", self.base, expected)
             check_repo_id(repo_id, "base")
+
+    def made_for(self, place: object) -> "Publication":
+        """Return the same with a base, if it has none and `place` names one on the Hub."""
+        with suppress(InvalidOptionError):
+            if self.base is None and isinstance(place, str):
+                return replace(self, base=place)
+        return self
 
     @property
     def tag(self) -> str:

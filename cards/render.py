@@ -77,13 +77,15 @@ def split_files(split: Split, about: Publication) -> dict[str, bytes]:
 
     Args:
         split: The split.
-        about: As what it is published; `base` names the demonstrations.
+        about: As what it is published; `base` names the demonstrations; without it
+            the manifests do.
 
     Raises:
         MissingExtraError: jinja2 or matplotlib is not installed.
         MissingFileError, FormatError, TruncatedVideoError: The split cannot be read.
     """
     facts = SplitFacts(split)
+    about = about.made_for(facts.base)
     text, film = _split_text(facts, about)
     data = croissant.of_split(facts, about)
     return {README: text.encode(), STRIP: film.png, CROISSANT: croissant.as_bytes(data)}
@@ -96,7 +98,7 @@ def results_files(results: Score | Path, about: Publication) -> dict[str, bytes]
 
     Args:
         results: The folder of a run, a file of rows, or what either scored.
-        about: As what they are published; `base` names the split.
+        about: As what they are published; `base` names the split, without it `run.json` does.
 
     Raises:
         InvalidOptionError: The score is of several runs.
@@ -104,6 +106,7 @@ def results_files(results: Score | Path, about: Publication) -> dict[str, bytes]
         BadRowsError, MissingFileError, FormatError: The rows cannot be scored.
     """
     facts = ResultsFacts.of(results)
+    about = about.made_for(facts.base)
     data = croissant.of_results(facts, about)
     return {README: _results_text(facts, about).encode(), CROISSANT: croissant.as_bytes(data)}
 
@@ -115,12 +118,14 @@ def demonstrations_text(dataset: Dataset, about: Publication) -> str:
 
 def split_text(split: Split, about: Publication) -> str:
     """Return the README of a split alone, without drawing; see `split_files`."""
-    return _split_text(SplitFacts(split), about)[0]
+    facts = SplitFacts(split)
+    return _split_text(facts, about.made_for(facts.base))[0]
 
 
 def results_text(results: Score | Path, about: Publication) -> str:
     """Return the README of results alone; see `results_files`."""
-    return _results_text(ResultsFacts.of(results), about)
+    facts = ResultsFacts.of(results)
+    return _results_text(facts, about.made_for(facts.base))
 
 
 def _demonstrations(dataset: Dataset) -> DatasetFacts:

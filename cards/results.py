@@ -59,6 +59,12 @@ class ResultsFacts:
         [(source, run)] = found.rows.sources.items()
         return cls(found, source, run)
 
+    @property
+    def base(self) -> object:
+        """What the run says of where its split lies: `namespace/name@commit` on the Hub."""
+        starts = self.run.starts if self.run is not None else ()
+        return starts[-1].settings.get("split") if starts else None
+
     @cached_property
     def rows_file(self) -> Path:
         """The file of rows that tables are loaded from: the exported one if it is there."""
