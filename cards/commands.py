@@ -34,7 +34,7 @@ def card(
     ```
     robomme-interference card my-split --repo-id my-name/my-split
     robomme-interference card my-split/demonstrations --license cc-by-4.0
-    robomme-interference card my-run > README.md
+    robomme-interference card my-run --repo-id my-name/my-results
     ```
     """
     from robomme_interference_data.cards.publication import Publication
