@@ -5,7 +5,7 @@ dataset tracks ask for at least are filled in.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 from urllib.parse import quote
 
@@ -16,6 +16,7 @@ from robomme_interference_data.cards.columns import Column, columns_of
 from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts, kinds_of_sources
 from robomme_interference_data.cards.metadata import BUFFERS, BUFFERS_FILE, EPISODES, ROLLOUTS
 from robomme_interference_data.cards.publication import HUB, OTHER, Publication
+from robomme_interference_data.cards.responsible import origin, responsible
 from robomme_interference_data.cards.results import ResultsFacts
 from robomme_interference_data.constants import EPISODES_PATH, SUMS_PATH
 from robomme_interference_data.errors import FormatError
@@ -76,8 +77,8 @@ def of_demonstrations(facts: DatasetFacts, about: Publication) -> dict[str, Any]
     table = _episodes_file(facts, about)
     return {
         **_core(about, f"Demonstrations of RoboMME-Interference: {_size(facts)}."),
-        **_responsible(facts.limits, facts.families, facts.dataset.identity.simulators),
-        **_origin(
+        **responsible(facts.limits, facts.families, facts.dataset.identity.simulators),
+        **origin(
             about,
             facts.repositories,
             kinds_of_sources([facts]),
@@ -100,8 +101,8 @@ def of_split(facts: SplitFacts, about: Publication) -> dict[str, Any]:
     )
     return {
         **_core(about, told),
-        **_responsible(facts.limits, tuple(families), facts.simulators),
-        **_origin(
+        **responsible(facts.limits, tuple(families), facts.simulators),
+        **origin(
             about,
             facts.repositories,
             kinds_of_sources(facts.datasets.values()),
@@ -133,8 +134,8 @@ def of_results(facts: ResultsFacts, about: Publication) -> dict[str, Any]:
     families = tuple(facts.score.rows.names("family"))
     return {
         **_core(about, told),
-        **_responsible(facts.limits, families, simulators),
-        **_origin(about, {}, [], "A policy was rolled out in a simulator, a row an episode."),
+        **responsible(facts.limits, families, simulators),
+        **origin(about, {}, [], "A policy was rolled out in a simulator, a row an episode."),
         "distribution": [_repository(about), rows],
         "recordSet": [_record_set(ROLLOUTS, facts.columns, rows["@id"])],
     }
@@ -166,63 +167,6 @@ def _license(about: Publication) -> str:
     if about.license == OTHER:
         return f"{about.url}#licence"
     return f"https://choosealicense.com/licenses/{about.license}/"
-
-
-def _responsible(
-    limitations: Iterable[str], families: Sequence[str], simulators: Sequence[str]
-) -> dict[str, Any]:
-    made_up = bool(simulators)
-    return {
-        "rai:dataLimitations": list(limitations),
-        "rai:dataBiases": (
-            f"One robot arm at a table, in {len(families)} task families ({', '.join(families)}); "
-            "scenes, objects and wordings are those that the recordings happen to have, and "
-            "families differ in the length of their lessons."
-        ),
-        "rai:personalSensitiveInformation": (
-            "None: the pictures are of simulated scenes, without people or places."
-            if made_up
-            else "Not checked: recordings of a real robot may show people and places."
-        ),
-        "rai:dataUseCases": (
-            "To measure whether robot policies can use the one past session that matters when it "
-            "lies behind others that do not. Not for training on test episodes, and no sign of "
-            "fitness for use on a real robot."
-        ),
-        "rai:dataSocialImpact": (
-            "Robots that remember better need to be shown less often; memory of past sessions may "
-            "also keep what people nearby did not mean to be kept. The data itself shows no people."
-            if made_up
-            else "Robots that remember better need to be shown less often; memory of past sessions "
-            "may also keep what people nearby did not mean to be kept."
-        ),
-        "rai:hasSyntheticData": made_up,
-    }
-
-
-def _origin(
-    about: Publication, repositories: Mapping[str, str | None], kinds: Iterable[str], how: str
-) -> dict[str, Any]:
-    found = dict(repositories)
-    if about.base_repo:
-        found[about.base_repo] = about.base_commit
-    sources = [
-        {
-            "@type": "sc:Dataset",
-            "name": repo,
-            "url": f"{HUB}/datasets/{repo}" + (f"/tree/{commit}" if commit else ""),
-        }
-        for repo, commit in sorted(found.items())
-    ]
-    named = (f"recorded episodes, read as {kind}" for kind in kinds)
-    sources += [{"@type": "sc:Dataset", "name": name} for name in named]
-    activity: dict[str, Any] = {
-        "@type": "prov:Activity",
-        "name": "robomme-interference-data",
-        "description": how + (f" Command: {about.command}" if about.command else ""),
-    }
-    derived = {"prov:wasDerivedFrom": sources} if sources else {}
-    return {**derived, "prov:wasGeneratedBy": [activity]}
 
 
 # --- files and columns -------------------------------------------------------------------------

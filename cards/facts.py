@@ -1,13 +1,14 @@
 """What cards tell of data, computed from it: counts, exactness, provenance, limits."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import mean, median
 from typing import Any
 
+from robomme_interference_data.cards.limits import limits
 from robomme_interference_data.cards.markdown import escape
 from robomme_interference_data.cards.publication import check_repo_id, is_commit
 from robomme_interference_data.conditions import DEFAULT_CONDITIONS
@@ -20,7 +21,6 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.cube import TEST_EPISODES
 from robomme_interference_data.files import read_json, sha256_file
 from robomme_interference_data.records import BufferManifest, EpisodeRecord
 from robomme_interference_data.split import Split
@@ -259,50 +259,6 @@ def by_family(records: Iterable[EpisodeRecord]) -> dict[str, list[EpisodeRecord]
     return {name: groups[name] for name in sorted(groups, key=_family_rank)}
 
 
-def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:
-    """Tell whether queries are the paper's: nine families, test episodes 0 to 49 each."""
-    ids = {(one.episode_id.family, one.episode_id.split, one.episode_id.index) for one in records}
-    return ids == {(f, "test", n) for f in FAMILIES for n in range(TEST_EPISODES)}
-
-
-def simulated(simulators: Sequence[str]) -> str:
-    """Return where episodes come from, in a sentence."""
-    told = {
-        "robomme": "the official simulator, RoboMME",
-        "tabletop": "tabletop, the simulator embedded in this project, which is not RoboMME: its "
-        "results stand beside each other, not beside the paper's",
-        "sample": "sample, made-up pictures without content, for trying the tools out",
-    }
-    named = [told.get(name, f"the simulator {name}") for name in simulators]
-    if not named:
-        return "The recordings name no simulator."
-    return f"The episodes come from {'; and from '.join(named)}."
-
-
-def limits(
-    queries: Sequence[EpisodeRecord], simulators: Sequence[str], more: Iterable[str] = ()
-) -> list[str]:
-    """Return what the data is not good for, as plain text, a sentence or two each."""
-    found = [simulated(simulators)]
-    if not is_whole_grid(queries):
-        found.append(
-            f"{len(queries):,} query episode{'s' * (len(queries) != 1)}, not the paper's grid of "
-            f"{len(FAMILIES)} families × {TEST_EPISODES} test episodes: rates over these are not "
-            "rates over the benchmark."
-        )
-    if any(record.episode_id.split == "test" for record in queries):
-        found.append(
-            "Test episodes are for evaluation. A policy that was trained on their demonstrations, "
-            "goals or scenes is not measured by them."
-        )
-    found.append(
-        "A lesson shows the answer to its own query, and the history is recorded, not what the "
-        "robot itself went through: nothing here measures learning from failure, or forgetting by "
-        "a policy's own training."
-    )
-    return [*found, *more]
-
-
 def _difficulties(records: Sequence[EpisodeRecord]) -> tuple[int, ...]:
     counts = Counter(record.difficulty for record in records)
     known = [counts[name] for name in DIFFICULTIES]
@@ -321,8 +277,3 @@ def kinds_of_sources(facts: Iterable[DatasetFacts]) -> list[str]:
     """Return the kinds of the sources that datasets were built from, such as `robomme-h5`."""
     every = (one.get("kind") for own in facts for one in own.dataset.identity.sources)
     return sorted({kind for kind in every if isinstance(kind, str)})
-
-
-def plain_sources(facts: Mapping[str, DatasetFacts]) -> dict[str, list[dict[str, Any]]]:
-    """Return what the sources of datasets say of themselves, by name of the dataset."""
-    return {name: list(one.dataset.identity.sources) for name, one in facts.items()}

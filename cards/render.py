@@ -4,9 +4,7 @@ The same data, publication and version of this package (and, for the picture, of
 the same bytes.
 """
 
-import json
 from collections.abc import Iterable, Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,6 @@ from robomme_interference_data.cards.facts import (
     LOSSY_SOURCE,
     DatasetFacts,
     SplitFacts,
-    plain_sources,
 )
 from robomme_interference_data.cards.film import Film, film_of_lesson, film_of_split
 from robomme_interference_data.cards.markdown import Raw, block, code, escape, table
@@ -28,12 +25,18 @@ from robomme_interference_data.cards.metadata import (
     config,
     front_matter,
 )
+from robomme_interference_data.cards.provenance import (
+    as_json,
+    dataset_rows,
+    provenance,
+    sources,
+    split_rows,
+)
 from robomme_interference_data.cards.publication import OTHER, Publication
 from robomme_interference_data.cards.results import ResultsFacts, results_values
 from robomme_interference_data.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
-    FORMAT_VERSION,
     FPS,
     MAX_STEPS,
     POSITION_LIMIT,
@@ -155,8 +158,8 @@ def _demonstrations_text(facts: DatasetFacts, about: Publication) -> tuple[str, 
         "skipped": 0,
         "check": "sha256sum --check meta/SHA256SUMS",
         **_exactness(facts.inexact, len(facts.records), "episodes", facts.repositories),
-        "provenance": _provenance(about, _dataset_rows(facts)),
-        "details": _sources({DEMONSTRATIONS: facts}),
+        "provenance": provenance(about, dataset_rows(facts)),
+        "details": sources({DEMONSTRATIONS: facts}),
         "limits": facts.limits,
     }
     head = front_matter(
@@ -193,8 +196,8 @@ def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
         "skipped": sum(one.skipped for one in units.values()),
         "check": f"robomme-interference verify {about.repo_id}",
         **_exactness(facts.inexact, len(facts.manifests), "buffers", facts.repositories),
-        "provenance": _provenance(about, _split_rows(facts, about)),
-        "details": _sources(facts.datasets),
+        "provenance": provenance(about, split_rows(facts, about)),
+        "details": sources(facts.datasets),
         "limits": facts.limits,
     }
     head = front_matter(
@@ -216,8 +219,8 @@ def _results_text(facts: ResultsFacts, about: Publication) -> str:
         **_publication(about),
         **results_values(facts),
         "columns": _columns(facts.columns),
-        "provenance": _provenance(about, facts.provenance(about)),
-        "details": {name: _json(value) for name, value in facts.details.items()},
+        "provenance": provenance(about, facts.provenance(about)),
+        "details": {name: as_json(value) for name, value in facts.details.items()},
     }
     head = front_matter(
         about,
@@ -278,54 +281,3 @@ def _columns(columns: Iterable[Column]) -> Table:
         for part in column.parts:
             rows.append((code(f"{column.name}.{part.name}"), part.words, escape(part.about)))
     return Table.make("columns", "Columns", "column type meaning", rows)
-
-
-# --- provenance --------------------------------------------------------------------------------
-
-
-def _provenance(about: Publication, rows: Iterable[tuple[str, Any]]) -> Table:
-    own = (
-        ("repository", code(about.repo_id)),
-        ("version", code(about.tag)),
-        *rows,
-        ("made with", code(f"robomme-interference-data {_package_version()}")),
-        ("version of the format", code(FORMAT_VERSION)),
-    )
-    return Table.make("provenance", "Provenance", "what value", own)
-
-
-def _package_version() -> str:
-    return metadata.version("robomme-interference-data")
-
-
-def _dataset_rows(facts: DatasetFacts, name: str = "") -> list[tuple[str, Any]]:
-    identity, of = facts.dataset.identity, f" of the {escape(name)}" if name else ""
-    rows = [
-        (f"revision of the content{of}", code(identity.revision)),
-        (f"SHA-256 of `meta/interference.json`{of}", code(facts.identity_sha256)),
-        (f"codec{of}", code(identity.codec)),
-    ]
-    for repo, commit in facts.repositories.items():
-        rows.append((f"source{of}", code(f"{repo}@{commit}" if commit else repo)))
-    return rows
-
-
-def _split_rows(facts: SplitFacts, about: Publication) -> list[tuple[str, Any]]:
-    split = facts.split
-    rows: list[tuple[str, Any]] = [
-        ("demonstrations", code(about.base) if about.base else "not published"),
-        ("revision of the split", code(split.revision)),
-        ("SHA-256 of `manifests/buffers.parquet`", code(split.header.rows)),
-    ]
-    for name, one in facts.datasets.items():
-        rows += _dataset_rows(one, name)
-    return [*rows, ("version of the draw", code(split.header.rule_version))]
-
-
-def _sources(facts: Mapping[str, DatasetFacts]) -> dict[str, str]:
-    found = plain_sources(facts)
-    return {f"Sources of the {name}": _json(told) for name, told in found.items() if told}
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False)

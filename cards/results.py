@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.cards.columns import Column, columns_of
-from robomme_interference_data.cards.facts import one_split, simulated
+from robomme_interference_data.cards.facts import one_split
+from robomme_interference_data.cards.limits import simulated
 from robomme_interference_data.cards.markdown import Raw, code, escape
 from robomme_interference_data.cards.metadata import ROLLOUTS, config
 from robomme_interference_data.cards.publication import Publication

@@ -16,7 +16,8 @@ from robomme_interference_data.build_dataset.manifests import (
     write_manifests,
 )
 from robomme_interference_data.cards.commands import card_text
-from robomme_interference_data.cards.facts import SplitFacts, is_whole_grid
+from robomme_interference_data.cards.facts import SplitFacts
+from robomme_interference_data.cards.limits import is_whole_grid
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import (
     demonstrations_text,
