@@ -54,6 +54,7 @@ def card_text(source: str, about: "Publication") -> str:
     from robomme_interference_data.cards import render
     from robomme_interference_data.constants import (
         IDENTITY_PATH,
+        MANIFEST_PATH,
         RUN_HEADER,
         RUN_RECORD,
         RUN_TABLES,
@@ -61,19 +62,18 @@ def card_text(source: str, about: "Publication") -> str:
     from robomme_interference_data.dataset import Dataset
     from robomme_interference_data.hub import locate
     from robomme_interference_data.loading import load_split
-    from robomme_interference_data.split import HEADER
 
     if Path(source).is_file():
         return render.results_text(Path(source), about)
     files = locate(source)
-    if _has(files, HEADER):
+    if _has(files, MANIFEST_PATH):
         return render.split_text(load_split(files.describe()), about)
     if _has(files, IDENTITY_PATH):
         return render.demonstrations_text(Dataset(files), about)
     if _has(files, RUN_HEADER):
         return render.results_text(files.snapshot(RUN_HEADER, RUN_RECORD, *RUN_TABLES), about)
     raise MissingFileError(
-        f"{files.describe()} holds no split, no demonstrations and no run: {HEADER}, "
+        f"{files.describe()} holds no split, no demonstrations and no run: {MANIFEST_PATH}, "
         f"{IDENTITY_PATH} and {RUN_HEADER} are missing",
         "Point to the folder that robomme-interference build or evaluate wrote.",
     )

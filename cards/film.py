@@ -1,9 +1,7 @@
 """The film strip of a card: which buffer is shown, and its picture."""
 
-import tempfile
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts
@@ -17,7 +15,7 @@ from robomme_interference_data.records import (
     place_sessions,
 )
 from robomme_interference_data.sampling import lesson_share
-from robomme_interference_data.strip import draw_strip
+from robomme_interference_data.strip import strip_png
 
 FIRST_CHOICE = "k3"
 """The condition that a strip shows if there is such a one."""
@@ -41,10 +39,7 @@ class Film:
             MissingExtraError: matplotlib is not installed.
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "strip.png"
-            draw_strip(self.buffer, out, camera=self.camera)
-            return out.read_bytes()
+        return strip_png(self.buffer, self.camera)
 
     @property
     def camera(self) -> str:
