@@ -25,9 +25,9 @@ from robomme_interference_data.records import BufferManifest, EpisodeRecord
 
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0")
 
-_TERMS = "citeAs column conformsTo=dct extract field fileProperty fileObject fileSet format"
-_TERMS += " includes isLiveDataset jsonPath key md5 parentField path recordSet references regex"
-_TERMS += " repeated replace separator source subField transform"
+_TERMS = "citeAs column conformsTo=dct equivalentProperty extract field fileProperty fileObject"
+_TERMS += " fileSet format includes isLiveDataset jsonPath key md5 parentField path recordSet"
+_TERMS += " references regex repeated replace samplingRate separator source subField transform"
 CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",

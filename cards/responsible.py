@@ -20,7 +20,7 @@ def responsible(
     return {
         "rai:dataLimitations": list(limitations),
         "rai:dataBiases": (
-            f"One robot arm at a table, in {len(families)} task families ({', '.join(families)}); "
+            f"One robot arm at a table, in tasks of these families only: {', '.join(families)}; "
             "scenes, objects and wordings are those that the recordings happen to have, and "
             "families differ in the length of their lessons."
         ),
