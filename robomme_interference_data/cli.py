@@ -11,6 +11,7 @@ import typer
 
 from robomme_interference_data import commands
 from robomme_interference_data.build_dataset import commands as building
+from robomme_interference_data.cards import commands as publishing
 from robomme_interference_data.console import Group, say
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluating
@@ -78,6 +79,7 @@ _GROUPS = {
     ),
     "Rollouts": (("evaluate", evaluating.evaluate), ("merge", evaluating.merge)),
     "Scores": (("score", scoring.score), ("compare", scoring.compare)),
+    "Publish": (("card", publishing.card),),
 }
 """Commands in the order in which one uses them."""
 

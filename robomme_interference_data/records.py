@@ -220,7 +220,14 @@ def place_sessions(entries: Sequence[SessionEntry]) -> tuple[Session, ...]:
 
 @dataclass(frozen=True)
 class QueryFrame:
-    """Where the first live observation of a query episode is stored."""
+    """Where the first live observation of a query episode is stored.
+
+    Attributes:
+        dataset: Name of the dataset in the split.
+        revision: Identity of that dataset.
+        episode_index: Number of the episode in that dataset.
+        frame: The stored frame.
+    """
 
     dataset: str
     revision: str

@@ -85,12 +85,16 @@ class Table:
 
     def markdown(self) -> str:
         """Return the table as Markdown, under its title."""
+        return (
+            "\n\n".join(part for part in (f"# {self.title}", self.grid(), self.note) if part) + "\n"
+        )
+
+    def grid(self) -> str:
+        """Return the table as Markdown, without title and note."""
         rule = ["---" if column.kind in ("text", "flag") else "---:" for column in self.columns]
         heads = [column.name.replace("_", " ") for column in self.columns]
         cells = ([cell.replace("|", "\\|") for cell in self.cells(row)] for row in self.rows)
-        lines = [heads, rule, *cells]
-        text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-        return "\n\n".join(part for part in (f"# {self.title}", text, self.note) if part) + "\n"
+        return "\n".join(f"| {' | '.join(line)} |" for line in [heads, rule, *cells])
 
     def html(self) -> str:
         """Return the table as HTML, under its title."""

@@ -6,17 +6,15 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from importlib import metadata, resources
+from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.cube import STATUSES, success
@@ -27,6 +25,7 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import sha256_file, write_text
 from robomme_interference_data.rows import to_dict
+from robomme_interference_data.templates import fill
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
@@ -51,39 +50,22 @@ def write_report(
     Raises:
         MissingExtraError: jinja2 is not installed.
     """
-    jinja2 = load_jinja2()
-    template = resources.files(__package__).joinpath("templates", "report.html.j2")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
     cubes = score.cubes.values()
     conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
-    html = environment.from_string(template.read_text(encoding="utf-8")).render(
-        headlines={simulator: headline(score, simulator) for simulator in score.cubes},
-        grids=score.grids,
-        tables=score.tables.values(),
-        display_name=display_name,
-        figures={name: _data(path) for name, path in figures.items()},
-        titles=FIGURES,
-        conditions=conditions,
-        episodes=_episodes(score, conditions, out.parent),
-        sources={str(path): _source(path, run) for path, run in score.rows.sources.items()},
-        facts=_facts(score, command),
-    )
+    values = {
+        "headlines": {simulator: headline(score, simulator) for simulator in score.cubes},
+        "grids": score.grids,
+        "tables": score.tables.values(),
+        "display_name": display_name,
+        "figures": {name: _data(path) for name, path in figures.items()},
+        "titles": FIGURES,
+        "conditions": conditions,
+        "episodes": _episodes(score, conditions, out.parent),
+        "sources": {str(path): _source(path, run) for path, run in score.rows.sources.items()},
+        "facts": _facts(score, command),
+    }
+    html = fill(__package__, "report.html.j2", values, what="the report", autoescape=True)
     write_text(out, html)
-
-
-def load_jinja2() -> Any:
-    """Return the library that fills in the page.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingExtraError.needs("the report", "jinja2", "score") from error
-    return jinja2
 
 
 def _data(path: Path) -> str:

@@ -13,6 +13,7 @@ from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.files import write_text
 from robomme_interference_data.tables import Table
+from robomme_interference_data.templates import load_jinja2
 
 TABLES = ("main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage", "paper")
 """Every table that a score may have."""
@@ -139,7 +140,7 @@ def write_score(
     from robomme_interference_data.evaluate.score import export, figures, report
 
     with open_figure():
-        report.load_jinja2()
+        load_jinja2("the report")
     exported = [] if export_to is None else export.export(score.rows, export_to)
     texts = {f"{name}.csv": table.csv() for name, table in score.tables.items()}
     texts |= {f"{name}.md": table.markdown() for name, table in score.tables.items()}

@@ -54,10 +54,11 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "evaluate", "merge"),
         *("Scores", "score", "compare"),
+        *("Publish", "card"),
     ]
 
 
-GROUPS = ("Data", "Look", "Retrieval", "Rollouts", "Scores")
+GROUPS = ("Data", "Look", "Retrieval", "Rollouts", "Scores", "Publish")
 
 
 @pytest.mark.parametrize("path", ALL, ids=" ".join)

@@ -26,8 +26,8 @@ MAY_IMPORT = {
     "simulators": {"core", "simulators"},
     "build_dataset": {"core", "simulators", "build_dataset"},
     "retrieval": {"core", "retrieval"},
-    "cards": {"core", "cards"},
     "evaluate": {"core", "simulators", "retrieval", "evaluate"},
+    "cards": {"core", "build_dataset", "retrieval", "evaluate", "cards"},
 }
 
 HEAVY = ("torch", "lerobot", "h5py", "matplotlib", "datasets", "pandas", "mani_skill", "sapien")

@@ -1,0 +1,104 @@
+"""The film strip of a card: which buffer is shown, and its picture."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts
+from robomme_interference_data.digest import combine
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.query import Query
+from robomme_interference_data.records import (
+    BufferManifest,
+    EpisodeRecord,
+    SessionEntry,
+    place_sessions,
+)
+from robomme_interference_data.sampling import lesson_share
+from robomme_interference_data.strip import strip_png
+
+FIRST_CHOICE = "k3"
+"""The condition that a strip shows if there is such a one."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """A buffer and its film strip.
+
+    Attributes:
+        buffer: The buffer.
+    """
+
+    buffer: Buffer
+
+    @cached_property
+    def png(self) -> bytes:
+        """The picture; drawn only when it is asked for.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed.
+            MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
+        """
+        return strip_png(self.buffer, self.camera)
+
+    @property
+    def camera(self) -> str:
+        """The camera that is shown."""
+        cameras = self.buffer.cameras
+        return "front" if "front" in cameras else cameras[0]
+
+    @property
+    def condition(self) -> str:
+        """Its condition."""
+        return self.buffer.condition
+
+    @property
+    def about(self) -> str:
+        """What it shows, in a sentence."""
+        buffer = self.buffer
+        sessions = ", ".join(f"{one.role} {one.source}" for one in buffer.sessions) or "no session"
+        return f"{buffer.episode_id} under {buffer.condition}: {sessions}. Goal: {buffer.goal}"
+
+
+def film_of_split(facts: SplitFacts) -> Film:
+    """Return the film strip of the first query, under `k3` or whatever holds most sessions."""
+    split, first = facts.split, facts.queries[0].episode_id
+    own = [one for one in facts.manifests if one.episode_id == first]
+    chosen = max(own, key=lambda one: (one.condition == FIRST_CHOICE, len(one.sessions)))
+    return Film(split.load(first, chosen.condition))
+
+
+def film_of_lesson(facts: DatasetFacts) -> Film:
+    """Return the film strip of the first lesson: a buffer of nothing else.
+
+    Raises:
+        FormatError: The dataset holds no lesson.
+    """
+    dataset, record = facts.dataset, facts.records[0]
+    query = Query(dataset, record)
+    sessions = (_lesson(facts, record, query.lesson_frames),)
+    manifest = BufferManifest(
+        episode_id=record.episode_id,
+        condition="k0",
+        k=0,
+        goals=record.goals,
+        seed=record.seed,
+        difficulty=record.difficulty,
+        simulator=record.simulator,
+        exact=record.exact,
+        lesson_frames=query.lesson_frames,
+        history_frames=query.lesson_frames,
+        lesson_share=lesson_share(place_sessions(sessions), 0, query.lesson_frames),
+        query=query.place,
+        sessions=sessions,
+    )
+    return Film(Buffer(manifest, query, {dataset.kind: dataset}))
+
+
+def _lesson(facts: DatasetFacts, record: EpisodeRecord, frames: int) -> SessionEntry:
+    dataset, name = facts.dataset, record.episode_id
+    if record.lesson_sha256 is None:
+        raise FormatError.damaged(dataset.files.describe(), f"{name}: no lesson")
+    place = dataset.kind, dataset.revision, record.episode_index
+    sha256 = combine(record.lesson_sha256)
+    return SessionEntry("lesson", name.family, name, *place, 0, frames, 1, sha256)

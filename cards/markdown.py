@@ -1,0 +1,74 @@
+"""Text that a stranger wrote, made safe for Markdown as the Hub shows it."""
+
+import re
+import unicodedata
+from typing import Any
+
+from robomme_interference_data.tables import Table
+
+_MOST = 400
+"""Letters of a text that are shown."""
+
+_ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "$": "&#36;"}
+_SPECIAL = re.compile(r"[\\`*_\[\]~]")
+_BEGINS = re.compile(r"^(?:[#+=-]|\d{1,9}(?=[.)]))")  # a heading, a list, a line under a heading
+_LINK = re.compile(r"(?i)(?<=\w):(?=//)|(?<=www)\.|@")
+
+
+class Raw(str):
+    """Markdown that is written as it is."""
+
+    __slots__ = ()
+
+
+def escape(value: Any) -> Raw:
+    """Return a value as text that Markdown shows as it is, in one line: nothing in it works.
+
+    This is what every value in a card goes through, but for what is `Raw`.
+    """
+    if isinstance(value, Raw):
+        return value
+    text = _shortened(_one_line(str(value)))
+    text = "".join(_ENTITIES.get(letter, letter) for letter in text)
+    text = _SPECIAL.sub(r"\\\g<0>", text)
+    text = _LINK.sub(lambda match: f"&#{ord(match[0])};", text)
+    begin = _BEGINS.match(text)
+    if begin is None:
+        return Raw(text)
+    first = begin[0]
+    return Raw(f"&#{ord(first[0])};{text[1:]}")
+
+
+def code(value: Any) -> Raw:
+    """Return a value as code inside a line."""
+    text = _shortened(_one_line(str(value)))
+    if text.strip() == text and text and not re.search(r"[`|]", text):
+        return Raw(f"`{text}`")
+    # What backquotes and the lines of a table would take for their own.
+    shown = "".join(_ENTITIES.get(letter, letter) for letter in text)
+    return Raw(f"<code>{re.sub(_SPECIAL, lambda match: f'&#{ord(match[0])};', shown)}</code>")
+
+
+def block(value: Any, language: str = "") -> Raw:
+    """Return a text of several lines as a block of code."""
+    text = "".join(letter if letter == "\n" or _shown(letter) else " " for letter in str(value))
+    fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))
+    return Raw(f"{fence}{language}\n{text.rstrip()}\n{fence}")
+
+
+def table(value: Table) -> Raw:
+    """Return a table without its title; its texts are escaped already, with `escape`."""
+    return Raw(value.grid())
+
+
+def _one_line(text: str) -> str:
+    return " ".join("".join(letter if _shown(letter) else " " for letter in text).split())
+
+
+def _shown(letter: str) -> bool:
+    """Tell whether a letter is one: not a control, a direction mark or half of a pair."""
+    return unicodedata.category(letter)[0] != "C"
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _MOST else text[: _MOST - 1] + "…"

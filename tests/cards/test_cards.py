@@ -1,0 +1,154 @@
+"""Cards as files: golden ones, what the Hub's own libraries read of them, and that they load."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from support.cards import CARDS, OF_DEMONSTRATIONS, OF_SPLIT, without_version
+from support.splits import GOLDEN
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.cards import citation
+from robomme_interference_data.cards.metadata import size_category
+from robomme_interference_data.cards.render import CROISSANT, README, STRIP, split_files
+from robomme_interference_data.constants import EPISODES_PATH
+
+NAMES = ("demonstrations", "split", "results")
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_cards(made: dict[str, dict[str, bytes]], name: str) -> None:
+    files = made[name]
+    assert files.keys() - {STRIP} == {README, CROISSANT}
+    for path, suffix in ((README, "md"), (CROISSANT, "json")):
+        golden = (CARDS / f"{name}.{suffix}").read_text(encoding="utf-8")
+        assert without_version(files[path]) == golden
+
+
+def test_the_same_data_gives_the_same_bytes(made: dict[str, dict[str, bytes]]) -> None:
+    again = split_files(load_split(GOLDEN), OF_SPLIT)
+    assert again == made["split"]
+    assert again[STRIP].startswith(b"\x89PNG\r\n\x1a\n")
+    assert again[STRIP] != made["demonstrations"][STRIP]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> None:
+    text = (published / name / README).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)]*)\)", text)
+    assert citation.URL in links
+    for link in links:
+        assert link == citation.URL or (published / name / link).is_file()
+    for path in re.findall(r"`((?:manifests|meta)/[\w./]+\.\w+)`", text):
+        root = published / ("split" if path.startswith("manifests") else name)
+        assert (root / path).is_file(), path
+
+
+# --- front matter ---------------------------------------------------------------------------------
+
+
+def front_matter(text: str) -> dict[str, Any]:
+    from huggingface_hub import DatasetCard
+
+    card = DatasetCard(text)
+    assert card.text.lstrip().startswith("# ")
+    return dict(card.data.to_dict())
+
+
+def test_the_front_matter_of_a_split(made: dict[str, dict[str, bytes]]) -> None:
+    found = front_matter(made["split"][README].decode())
+    assert found["tags"][0] == "LeRobot"
+    assert found["task_categories"] == ["robotics"]
+    assert found["size_categories"] == ["n<1K"]
+    assert found["license"] == "cc-by-4.0"
+    assert found["source_datasets"] == [OF_DEMONSTRATIONS.repo_id]
+    assert "tiny-split" in found["pretty_name"]
+
+
+def test_front_matter_of_what_was_made_from_nothing_published(
+    made: dict[str, dict[str, bytes]],
+) -> None:
+    found = front_matter(made["demonstrations"][README].decode())
+    assert (found["license"], found["source_datasets"]) == ("other", ["original"])
+
+
+@pytest.mark.parametrize(
+    ("name", "configs", "default"),
+    [
+        ("demonstrations", {"episodes"}, "episodes"),
+        ("split", {"buffers", "episodes"}, "buffers"),
+        ("results", {"rollouts"}, "rollouts"),
+    ],
+)
+def test_configs(
+    made: dict[str, dict[str, bytes]], name: str, configs: set[str], default: str
+) -> None:
+    from datasets.utils.metadata import MetadataConfigs
+    from huggingface_hub import DatasetCard
+
+    card = DatasetCard(made[name][README].decode())
+    found = MetadataConfigs.from_dataset_card_data(card.data)
+    assert found.keys() == configs
+    assert found.get_default_config_name() == default
+
+
+@pytest.mark.parametrize(
+    ("tree", "name", "split", "file"),
+    [
+        ("split", "buffers", "test", "manifests/buffers.parquet"),
+        ("split", "episodes", "train", EPISODES_PATH),
+        ("demonstrations", "episodes", "test", EPISODES_PATH),
+    ],
+)
+def test_load_dataset_gives_the_rows(
+    published: Path, tmp_path: Path, tree: str, name: str, split: str, file: str
+) -> None:
+    from datasets import load_dataset
+
+    root = published / tree
+    found = load_dataset(str(root), name, split=split, cache_dir=str(tmp_path))
+    assert found.to_list() == pq.read_table(root / file).to_pylist()
+
+
+def test_load_dataset_gives_rollouts(published: Path, tmp_path: Path) -> None:
+    from datasets import load_dataset
+
+    found = load_dataset(str(published / "results"), cache_dir=str(tmp_path))
+    assert found.keys() == {"test"}
+    assert found["test"]["status"] == ["success", "timeout", "error"]
+
+
+@pytest.mark.parametrize(
+    ("count", "category"),
+    [(0, "n<1K"), (999, "n<1K"), (1000, "1K<n<10K"), (768_897, "100K<n<1M"), (10**13, "n>1T")],
+)
+def test_size_categories(count: int, category: str) -> None:
+    assert size_category(count) == category
+
+
+# --- beside the data ------------------------------------------------------------------------------
+
+
+def test_a_card_beside_the_data_is_no_violation(
+    own_split: Path, made: dict[str, dict[str, bytes]]
+) -> None:
+    for name, files in (("demonstrations", "demonstrations"), ("distractors", "split")):
+        for path, content in made[files].items():
+            (own_split / name / path).write_bytes(content)
+    assert list(verify_split(load_split(own_split), decode=False)) == []
+
+
+def test_the_citation_is_the_project_s() -> None:
+    found = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    paper = found["preferred-citation"]
+    [author] = paper["authors"]
+    assert (paper["title"], paper["url"]) == (citation.TITLE, citation.URL)
+    assert (paper["year"], paper["month"]) == (citation.YEAR, citation.MONTH)
+    assert f"{author['family-names']}, {author['given-names']}" == citation.AUTHOR
+    for part in (citation.TITLE, citation.AUTHOR, citation.URL, str(citation.YEAR)):
+        assert part in citation.BIBTEX

@@ -1,0 +1,111 @@
+"""`croissant.json`: what the reference library reads of it, and what dataset tracks ask for."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from support.cards import OF_SPLIT
+
+from robomme_interference_data.cards.columns import columns_of
+from robomme_interference_data.cards.croissant import as_bytes
+from robomme_interference_data.cards.render import CROISSANT
+from robomme_interference_data.constants import EPISODES_PATH
+from robomme_interference_data.files import sha256_file
+from robomme_interference_data.records import BufferManifest, EpisodeRecord, Rollout
+from robomme_interference_data.rows import arrow_schema
+
+NAMES = ("demonstrations", "split", "results")
+MINIMAL = (
+    "rai:dataLimitations",
+    "rai:dataBiases",
+    "rai:personalSensitiveInformation",
+    "rai:dataUseCases",
+    "rai:dataSocialImpact",
+    "rai:hasSyntheticData",
+    "prov:wasDerivedFrom",
+    "prov:wasGeneratedBy",
+)
+CORE = ("name", "description", "url", "version", "license", "creator", "citeAs", "conformsTo")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_core_and_minimal_fields_are_there(published: Path, name: str) -> None:
+    found = json.loads((published / name / CROISSANT).read_text(encoding="utf-8"))
+    for field in (*CORE, *MINIMAL):
+        assert found[field] not in ("", [], None), field
+    assert found["rai:hasSyntheticData"] is True
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_and_their_hashes(published: Path, name: str) -> None:
+    found = json.loads((published / name / CROISSANT).read_text(encoding="utf-8"))
+    files = {one["@id"]: one for one in found["distribution"] if one["@type"] == "cr:FileObject"}
+    files.pop("repository")
+    assert files
+    for path, one in files.items():
+        assert sha256_file(published / name / path) == one["sha256"]
+        assert one["contentUrl"].endswith(f"/{path}")
+    for one in found["distribution"]:
+        if one["@type"] == "cr:FileSet":
+            assert [*(published / name).glob(one["includes"])], one["@id"]
+
+
+def read(path: Path, mapping: dict[str, Path] | None = None) -> Any:
+    import mlcroissant
+
+    given = {name: str(path) for name, path in (mapping or {}).items()}
+    return mlcroissant.Dataset(jsonld=json.loads(path.read_text("utf-8")), mapping=given)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_reference_library_finds_no_fault(published: Path, name: str) -> None:
+    dataset = read(published / name / CROISSANT)
+    issues = dataset.metadata.ctx.issues
+    assert not issues.errors
+    assert all("datePublished" in warning for warning in issues.warnings)  # cards have no clock
+    assert dataset.metadata.version in ("1.0.0", "1.2.0", "1.0.1")
+    assert dataset.metadata.to_json()["name"] == f"tiny-{name}"
+
+
+def test_the_reference_library_reads_the_rows(published: Path) -> None:
+    root = published / "split"
+    files = {path: root / path for path in ("manifests/buffers.parquet", EPISODES_PATH)}
+    dataset = read(root / CROISSANT, files)
+    table = pq.read_table(root / "manifests" / "buffers.parquet")
+    rows = list(dataset.records("buffers"))
+    assert len(rows) == len(table)
+    conditions = [row["buffers/condition"].decode() for row in rows]
+    assert conditions == table["condition"].to_pylist()
+    episodes = [row["episodes/episode_id"].decode() for row in dataset.records("episodes")]
+    assert episodes == pq.read_table(root / EPISODES_PATH)["episode_id"].to_pylist()
+
+
+# --- columns --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Rollout])
+def test_every_column_is_described(record: type) -> None:
+    columns = columns_of(record)
+    maps = {"feature_sha256", "lesson_sha256"}
+    assert {one.name for one in columns} == {*arrow_schema(record).names} - maps
+    for column in (part for one in columns for part in (one, *one.parts)):
+        assert column.about.endswith((".", "…")), column.name
+        assert "`" not in column.about
+
+
+def test_records_in_columns_have_their_parts() -> None:
+    columns = {one.name: one for one in columns_of(BufferManifest)}
+    assert [one.name for one in columns["query"].parts] == [
+        *("dataset", "revision", "episode_index", "frame")
+    ]
+    assert columns["sessions"].words == "list of records"
+    assert columns["goals"].words == "list of text"
+    assert columns["query"].words == "record"
+
+
+def test_the_file_is_safe_in_a_page() -> None:
+    data = as_bytes({"a": "</script>", "b": OF_SPLIT.repo_id, "c": "\udcff"})
+    assert b"<" not in data
+    assert json.loads(data)["a"] == "</script>"

@@ -1,0 +1,248 @@
+"""What cards say follows from the data: exactness, protocol, limits, and nobody else's words."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.cards import OF_DEMONSTRATIONS, OF_RESULTS, OF_SPLIT, RUN
+from support.made_up import record, write_metadata
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
+from robomme_interference_data.cards.commands import card_text
+from robomme_interference_data.cards.facts import SplitFacts
+from robomme_interference_data.cards.limits import is_whole_grid
+from robomme_interference_data.cards.publication import Publication
+from robomme_interference_data.cards.render import (
+    demonstrations_text,
+    results_files,
+    results_text,
+    split_text,
+)
+from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH, REPORT_PATH
+from robomme_interference_data.errors import FormatError, InvalidOptionError
+from robomme_interference_data.evaluate.score import Settings
+from robomme_interference_data.evaluate.score.scoring import score
+from robomme_interference_data.files import read_json, write_json
+from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.split import Split
+
+COMMIT = "0123456789" * 4
+
+
+def made_up(
+    root: Path,
+    *,
+    query: dict[str, Any] | None = None,
+    unit: dict[str, Any] | None = None,
+    identity: dict[str, Any] | None = None,
+    report: dict[str, Any] | None = None,
+    **options: Any,
+) -> Split:
+    """A split of metadata alone: one query, and two units of each of three families."""
+    asked = [record("demonstrations", "MoveCube/test/0", **(query or {}))]
+    pool = [
+        record("distractors", f"{family}/train/{number}", **(unit or {}))
+        for family in ("MoveCube", "InsertPeg", "PatternLock")
+        for number in range(2)
+    ]
+    for kind, records in (("demonstrations", asked), ("distractors", pool)):
+        write_metadata(root / kind, kind, records)
+        path = root / kind / IDENTITY_PATH
+        write_json(path, {**read_json(path), **(identity or {})})
+        write_json(root / kind / REPORT_PATH, {"skipped": [], **(report or {})})
+    planned = {"conditions": ("no-history", "k0", "k1", "k3"), **options}
+    for _ in write_manifests(plan_manifests(in_folder(root), **planned), root):
+        pass
+    return load_split(root)
+
+
+def test_exact_data_is_called_so(tmp_path: Path) -> None:
+    text = split_text(made_up(tmp_path), OF_SPLIT)
+    assert "**Exact.**" in text
+    assert "**Lossy.**" not in text
+    assert "`lerobot/robomme` is AV1-lossy" in text
+
+
+@pytest.mark.parametrize(("part", "inexact"), [("query", 4), ("unit", 2)])
+def test_lossy_data_is_called_so(tmp_path: Path, part: str, inexact: int) -> None:
+    split = made_up(tmp_path, **{part: {"exact": False}})  # no-history and k0 hold no unit
+    text = split_text(split, OF_SPLIT)
+    assert "**Exact.**" not in text
+    assert f"**Lossy.** {inexact} of 4 buffers" in text
+    demonstrations = demonstrations_text(split.datasets["demonstrations"], OF_DEMONSTRATIONS)
+    assert ("**Lossy.** 1 of 1 episodes" in demonstrations) == (part == "query")
+
+
+def test_the_lossy_copy_of_the_recordings_is_named(tmp_path: Path) -> None:
+    source = {"kind": "lerobot", "repo": "lerobot/robomme", "revision": COMMIT}
+    split = made_up(tmp_path, query={"exact": False}, identity={"sources": [source]})
+    text = split_text(split, Publication("people/tiny"))
+    assert "It was built from `lerobot/robomme`, the AV1-lossy copy" in text
+    assert f"`lerobot/robomme@{COMMIT}`" in text
+    assert "source_datasets:\n- lerobot/robomme\n" in text
+
+
+HOSTILE = (
+    "{{ about }} | `x` <script>alert(1)</script>\n\n---\n# A title [a](http://b.c) " + "y" * 999
+)
+
+
+def test_hostile_goals_are_text(tmp_path: Path) -> None:
+    split = made_up(tmp_path, query={"goals": (HOSTILE,), "difficulty": HOSTILE})
+    for text in (
+        split_text(split, OF_SPLIT),
+        demonstrations_text(split.datasets["demonstrations"], OF_DEMONSTRATIONS),
+    ):
+        assert "{{ about }} &#124; \\`x\\` &lt;script&gt;" in text
+        assert "<script" not in text
+        assert "http://b.c" not in text
+        assert "# A title [a]" not in text
+        assert "y" * 400 not in text
+        assert text.count("\n---\n") == 1  # the end of the front matter
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        {"kind": "```\n# x", "repo": "../../x", "revision": "main"},
+        {"kind": 7, "repo": ["a/b"], "revision": None},
+        {"repo": "a/b", "revision": "javascript:x"},
+    ],
+)
+def test_hostile_sources_are_text(tmp_path: Path, source: dict[str, Any]) -> None:
+    text = split_text(made_up(tmp_path, identity={"sources": [source]}), OF_SPLIT)
+    assert "\n# x" not in text
+    front = text.split("---\n")[1]
+    assert "../" not in front
+    assert ("- a/b\n" in front) == (source["repo"] == "a/b")
+    assert "`a/b@" not in text
+
+
+def test_a_split_of_the_own_family_is_labelled(tmp_path: Path) -> None:
+    split = made_up(tmp_path, conditions=("k0", "k1"))
+    [k0, k1] = split.manifests()
+    lesson, unit = k1.sessions
+    own = replace(unit, family="MoveCube", source=lesson.source)
+    other = BufferManifest(**{**vars(k1), "sessions": (lesson, own)})
+    facts = SplitFacts(split)
+    assert facts.same_family == 0
+    assert "own family" not in split_text(split, OF_SPLIT)
+    facts = SplitFacts(split)
+    vars(facts)["manifests"] = (k0, other)
+    assert facts.same_family == 1
+    assert any("own family" in one for one in facts.limits)
+
+
+def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
+    split = made_up(tmp_path, conditions=("k0", "k2"), position_limit=None, seed=3)
+    text = split_text(split, OF_SPLIT)
+    assert "Conditions beyond the paper's: k2." in text
+    assert "no limit on the length" in text
+    assert "seed 3" in text
+    assert "| k0 | paper |" in text
+    assert "| k2 | ours |" in text
+
+
+@pytest.mark.parametrize(
+    ("simulators", "told"),
+    [
+        ([], "name no simulator"),
+        (["robomme"], "official simulator"),
+        (["tabletop"], "is not RoboMME"),
+        (["sample"], "made-up pictures"),
+        (["<mine>"], "the simulator &lt;mine&gt;"),
+    ],
+)
+def test_where_episodes_come_from(tmp_path: Path, simulators: list[str], told: str) -> None:
+    assert told in split_text(made_up(tmp_path, identity={"simulators": simulators}), OF_SPLIT)
+
+
+def test_what_yielded_nothing_is_counted(tmp_path: Path) -> None:
+    report = {"skipped": [{"episode_id": "MoveCube/train/9", "why": "short"}] * 3}
+    split = made_up(tmp_path, report=report)
+    assert "(3 recorded episodes yielded nothing here" in split_text(split, OF_SPLIT)
+    text = demonstrations_text(split.datasets["demonstrations"], OF_DEMONSTRATIONS)
+    assert "3 recorded episodes yielded no demonstration" in text
+
+
+def test_the_paper_s_grid() -> None:
+    def query(family: str, number: int) -> EpisodeRecord:
+        return record("demonstrations", f"{family}/test/{number}")
+
+    whole = [query(family, number) for family in FAMILIES for number in range(50)]
+    assert is_whole_grid(whole)
+    assert not is_whole_grid(whole[1:])
+    assert not is_whole_grid([*whole, query("MoveCube", 50)])
+
+
+def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
+    split = made_up(tmp_path)
+    header = split.header
+    place = f"people/demonstrations@{COMMIT}"
+    placed = replace(header.datasets["demonstrations"], place=place)
+    split.header = replace(header, datasets={**header.datasets, "demonstrations": placed})
+    assert f"| demonstrations | `{place}` |" in split_text(split, Publication("people/tiny"))
+    assert "| demonstrations | not published |" not in split_text(split, OF_SPLIT)
+    split.header = header
+    assert "| demonstrations | not published |" in split_text(split, Publication("people/tiny"))
+
+
+def test_units_have_no_card_of_their_own(tmp_path: Path) -> None:
+    split = made_up(tmp_path)
+    with pytest.raises(InvalidOptionError, match="distractors"):
+        demonstrations_text(split.datasets["distractors"], OF_DEMONSTRATIONS)
+
+
+def test_a_damaged_report(tmp_path: Path) -> None:
+    split = made_up(tmp_path)
+    (tmp_path / "distractors" / REPORT_PATH).write_text("{")
+    with pytest.raises(FormatError, match="build_report"):
+        split_text(split, OF_SPLIT)
+
+
+# --- results --------------------------------------------------------------------------------------
+
+
+def test_results_are_those_of_the_score() -> None:
+    found = score(Settings(rows=(RUN,)))
+    assert results_files(found, OF_RESULTS) == results_files(RUN, OF_RESULTS)
+    text = results_text(found, OF_RESULTS)
+    [grid] = found.grids
+    assert grid.grid() in text
+    assert "0 of 5 cells are complete" in text
+    assert "1 success, 0 fail, 1 timeout, 1 error" in text
+
+
+def test_results_of_several_runs_are_refused(tmp_path: Path) -> None:
+    copy = tmp_path / "rollouts.jsonl"
+    copy.write_bytes((RUN / "rollouts.jsonl").read_bytes().replace(b"replay-full", b"my-memory"))
+    found = score(Settings(rows=(RUN, copy)))
+    with pytest.raises(InvalidOptionError, match="2 files"):
+        results_text(found, OF_RESULTS)
+
+
+def test_results_of_rows_without_a_run(tmp_path: Path) -> None:
+    (tmp_path / "rows.jsonl").write_bytes((RUN / "rollouts.jsonl").read_bytes())
+    text = card_text(str(tmp_path / "rows.jsonl"), Publication("people/rows"))
+    assert "path: rows.jsonl" in text
+    assert "The run is" not in text
+
+
+def test_results_name_the_split_that_the_run_names(tmp_path: Path) -> None:
+    place = f"people/tiny@{COMMIT}"
+    (tmp_path / "rollouts.jsonl").write_bytes((RUN / "rollouts.jsonl").read_bytes())
+    header = json.loads((RUN / "run.json").read_text())
+    header["starts"][0]["settings"]["split"] = place
+    header["identity"]["policy"] = "a | `b`"
+    write_json(tmp_path / "run.json", header)
+    text = results_text(tmp_path, Publication("people/results"))
+    assert f"| published split | `{place}` |" in text
+    assert "source_datasets:\n- people/tiny\n" in text
+    assert "| policy | <code>a &#124; &#96;b&#96;</code> |" in text

@@ -1,0 +1,58 @@
+"""Cards of the golden split and run, and the trees that are published of them."""
+
+import shutil
+from importlib import metadata
+from pathlib import Path
+
+from support.splits import GOLDEN
+
+from robomme_interference_data.cards.publication import Publication
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFESTS
+
+CARDS = GOLDEN.parent / "cards"
+"""Golden cards, made by `support/make_golden_cards.py`."""
+
+RUN = GOLDEN.parent / "run"
+
+OF_DEMONSTRATIONS = Publication("robot-memory/tiny-demonstrations", "1.0.0")
+OF_SPLIT = Publication(
+    "robot-memory/tiny-split",
+    "1.2.0",
+    "cc-by-4.0",
+    f"{OF_DEMONSTRATIONS.repo_id}@{'0123456789' * 4}",
+    "robomme-interference publish tiny --repo-id robot-memory/tiny-split",
+)
+OF_RESULTS = Publication(
+    "robot-memory/tiny-results", "1.0.1", base=f"{OF_SPLIT.repo_id}@{'abcdef0123' * 4}"
+)
+
+
+def without_version(file: bytes) -> str:
+    """Return a card's file as text, the same whatever the version of this package."""
+    own = f"robomme-interference-data {metadata.version('robomme-interference-data')}"
+    return file.decode().replace(own, "robomme-interference-data X.Y.Z")
+
+
+def published_split(root: Path, files: dict[str, bytes]) -> Path:
+    """Make the tree of a split's repository: the units at its root, manifests and a card."""
+    shutil.copytree(GOLDEN / DISTRACTORS, root)
+    shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS)
+    return _with_card(root, files)
+
+
+def published_demonstrations(root: Path, files: dict[str, bytes]) -> Path:
+    """Make the tree of the demonstrations' repository."""
+    shutil.copytree(GOLDEN / DEMONSTRATIONS, root)
+    return _with_card(root, files)
+
+
+def published_run(root: Path, files: dict[str, bytes]) -> Path:
+    """Make the tree of a results repository."""
+    shutil.copytree(RUN, root)
+    return _with_card(root, files)
+
+
+def _with_card(root: Path, files: dict[str, bytes]) -> Path:
+    for path, content in files.items():
+        (root / path).write_bytes(content)
+    return root

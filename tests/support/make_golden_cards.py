@@ -1,0 +1,39 @@
+"""Make the golden cards anew: `python tests/support/make_golden_cards.py tests/golden/cards`."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from support.cards import OF_DEMONSTRATIONS, OF_RESULTS, OF_SPLIT, RUN, without_version
+from support.splits import GOLDEN
+
+from robomme_interference_data import load_split
+from robomme_interference_data.cards.render import (
+    README,
+    STRIP,
+    demonstrations_files,
+    results_files,
+    split_files,
+)
+
+
+def cards() -> Iterator[tuple[str, dict[str, bytes]]]:
+    """Yield the cards by name."""
+    split = load_split(GOLDEN)
+    yield (
+        "demonstrations",
+        demonstrations_files(split.datasets["demonstrations"], OF_DEMONSTRATIONS),
+    )
+    yield "split", split_files(split, OF_SPLIT)
+    yield "results", results_files(RUN, OF_RESULTS)
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    folder.mkdir(exist_ok=True)
+    for name, files in cards():
+        for path, content in files.items():
+            if path != STRIP:
+                suffix = "md" if path == README else "json"
+                text = without_version(content)
+                (folder / f"{name}.{suffix}").write_text(text, encoding="utf-8", newline="\n")
