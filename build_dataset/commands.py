@@ -1,7 +1,7 @@
 """Commands that make splits and check them: `build …`, `verify`, `audit`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -9,9 +9,11 @@ from robomme_interference_data.build_dataset.config import (
     AllConfig,
     BuildConfig,
     BuildPlan,
+    NewConfig,
     PlanConfig,
     plan_all,
     plan_build,
+    plan_new,
     position_limit,
 )
 from robomme_interference_data.console import (
@@ -29,6 +31,9 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
 )
 from robomme_interference_data.settings import with_settings
+
+if TYPE_CHECKING:
+    from robomme_interference_data.files import Files
 
 app = typer.Typer(
     cls=Group,
@@ -139,6 +144,29 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
     say(f"Next: robomme-interference verify {config.out}")
 
 
+@with_settings
+def new_split(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
+    r"""Build a split of your own for demonstrations that are published: units and manifests.
+
+    The units are of the sources' train episodes, whatever robot or simulator they are of; their
+    cameras and sizes must be those of the demonstrations. Ends with an audit; fails on a leak.
+
+    Examples:
+    ```
+    robomme-interference new-split --demonstrations namespace/name@data-1.0.0 \
+        --source lerobot:NAMESPACE/NAME --out my-split
+    robomme-interference publish my-split --repo-id my-name/my-split
+    ```
+    """
+    with stoppable(_KEPT):
+        base, units = plan_new(config, plan)
+        say(f"Demonstrations: {base.files.describe()}; episodes to take: {len(units.tasks):,}")
+        _build(units, config.out / DISTRACTORS, config.workers, as_json=False)
+        _plan(config.out, plan, as_json=as_json, base=base.files)
+        audit(config.out)
+    say(f"Next: robomme-interference publish {config.out} --repo-id NAMESPACE/NAME")
+
+
 def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
     from robomme_interference_data.build_dataset.build import build_dataset
     from robomme_interference_data.execution import Processes
@@ -156,7 +184,7 @@ def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
         print_json({**vars(result), "out": str(result.out)})
 
 
-def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
+def _plan(split: Path, config: PlanConfig, *, as_json: bool, base: "Files | None" = None) -> None:
     from robomme_interference_data.build_dataset.manifests import (
         in_folder,
         plan_manifests,
@@ -166,7 +194,8 @@ def _plan(split: Path, config: PlanConfig, *, as_json: bool) -> None:
     from robomme_interference_data.work_progress import WorkProgress
 
     limit = position_limit(config)
-    plan = plan_manifests(in_folder(split), config.conditions, config.seed, limit)
+    places = in_folder(split) | ({} if base is None else {DEMONSTRATIONS: base})
+    plan = plan_manifests(places, config.conditions, config.seed, limit)
     with WorkProgress(unit="buffers") as progress:
         total = len(plan.demonstrations) * len(plan.conditions)
         progress.start("Planning buffers", total)

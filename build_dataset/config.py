@@ -23,6 +23,7 @@ from robomme_interference_data.settings import setting
 
 if TYPE_CHECKING:
     from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
+    from robomme_interference_data.dataset import Dataset
     from robomme_interference_data.draw import UnitPool
 
 _CPUS = os.cpu_count() or 1
@@ -73,6 +74,15 @@ class AllConfig(BuildConfig):
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class NewConfig(BuildConfig):
+    """What to build a split of for demonstrations that are published."""
+
+    demonstrations: str = setting(
+        metavar="NAME", help="Repository of the demonstrations, namespace/name[@REVISION]."
+    )
+
+
 @dataclass(frozen=True)
 class PlanConfig:
     """Which buffers to plan."""
@@ -117,24 +127,58 @@ def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
         InvalidIdError, InvalidOptionError, SourceError: As `plan_build` and `in_order`.
         BuildError: Something else lies where one of the outputs is to be.
     """
+    queries = plan_build(DEMONSTRATIONS, config)
+    every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
+    plans = {DEMONSTRATIONS: queries, DISTRACTORS: plan_build(DISTRACTORS, every)}
+    _check_plans((episode.id for _, episode in queries.tasks), plans, config.out, plan)
+    return plans
+
+
+def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]":
+    """Open published demonstrations, and plan units for them; see `plan_all`.
+
+    The units have the cameras of the demonstrations, unless some are asked for.
+
+    Raises:
+        InvalidOptionError: What is given as demonstrations is a folder, or of another kind; and as
+            `plan_all`.
+        HubError, MissingFileError, FormatError: The demonstrations cannot be read.
+    """
+    from robomme_interference_data.dataset import Dataset
+    from robomme_interference_data.hub import HubFiles, locate
+
+    base = Dataset(locate(config.demonstrations))
+    if not isinstance(base.files, HubFiles) or base.kind != DEMONSTRATIONS:
+        raise InvalidOptionError.expected(
+            "--demonstrations",
+            config.demonstrations,
+            "demonstrations that are published",
+            "For demonstrations in a folder: robomme-interference build all, or build distractors "
+            "and build manifests.",
+        )
+    cameras = config.cameras or base.cameras
+    units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))
+    queries = (record.episode_id for record in base.records())
+    _check_plans(queries, {DISTRACTORS: units}, config.out, plan)
+    return base, units
+
+
+def _check_plans(
+    queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], out: Path, plan: PlanConfig
+) -> None:
     from robomme_interference_data.build_dataset.build import find_earlier
     from robomme_interference_data.build_dataset.manifests import check_place
     from robomme_interference_data.draw import UnitPool
 
     conditions = in_order(plan.conditions)
     position_limit(plan)
-    queries = plan_build(DEMONSTRATIONS, config)
-    every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    units = plan_build(DISTRACTORS, every)
-    pool = UnitPool(episode.id for _, episode in units.tasks)
-    for query in {episode.id.family: episode.id for _, episode in queries.tasks}.values():
+    pool = UnitPool(episode.id for _, episode in plans[DISTRACTORS].tasks)
+    for query in {one.family: one for one in queries}.values():
         for condition in conditions:
             condition.sessions(_Unread(query, pool))
-    plans = {DEMONSTRATIONS: queries, DISTRACTORS: units}
     for kind, one in plans.items():
-        find_earlier(config.out.resolve() / kind, one)
-    check_place(config.out)
-    return plans
+        find_earlier(out.resolve() / kind, one)
+    check_place(out)
 
 
 @dataclass(frozen=True)

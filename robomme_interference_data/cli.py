@@ -62,6 +62,7 @@ _GROUPS = {
     "Data": (
         ("doctor", commands.doctor),
         ("build", building.app),
+        ("new-split", building.new_split),
         ("verify", building.verify),
         ("audit", building.audit),
         ("fetch", commands.fetch),

@@ -49,7 +49,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
     words = [line.strip().split("  ")[0].removesuffix(":") for line in out.splitlines()]
     listed = [word for word in words if (word,) in ALL or word in GROUPS]
     assert listed == [
-        *("Data", "doctor", "build", "verify", "audit", "fetch"),
+        *("Data", "doctor", "build", "new-split", "verify", "audit", "fetch"),
         *("Look", "list", "show", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "evaluate", "merge"),
