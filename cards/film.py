@@ -39,6 +39,7 @@ class Film:
             MissingExtraError: matplotlib is not installed.
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
+        self.buffer.fetch([self.camera])
         return strip_png(self.buffer, self.camera)
 
     @property
@@ -61,11 +62,19 @@ class Film:
 
 
 def film_of_split(facts: SplitFacts) -> Film:
-    """Return the film strip of the first query, under `k3` or whatever holds most sessions."""
-    split, first = facts.split, facts.queries[0].episode_id
+    """Return the film strip of the first query, under `k3` or whatever holds most sessions.
+
+    Raises:
+        FormatError: The split holds no buffer.
+    """
+    split = facts.split
+    if not (facts.manifests and facts.queries):
+        raise FormatError.damaged(split.location, "no buffers")
+    first = facts.queries[0].episode_id
     own = [one for one in facts.manifests if one.episode_id == first]
     chosen = max(own, key=lambda one: (one.condition == FIRST_CHOICE, len(one.sessions)))
-    return Film(split.load(first, chosen.condition))
+    # Of a split on the Hub no video is fetched before it is drawn.
+    return Film(split.load(first, chosen.condition, cameras=()))
 
 
 def film_of_lesson(facts: DatasetFacts) -> Film:
@@ -74,7 +83,10 @@ def film_of_lesson(facts: DatasetFacts) -> Film:
     Raises:
         FormatError: The dataset holds no lesson.
     """
-    dataset, record = facts.dataset, facts.records[0]
+    dataset = facts.dataset
+    if not facts.records:
+        raise FormatError.damaged(dataset.files.describe(), "no episodes")
+    record = facts.records[0]
     query = Query(dataset, record)
     sessions = (_lesson(facts, record, query.lesson_frames),)
     manifest = BufferManifest(

@@ -6,7 +6,7 @@ from typing import Any
 
 from robomme_interference_data.tables import Table
 
-_MOST = 400
+_MOST, _MOST_IN_BLOCK = 400, 20_000
 """Letters of a text that are shown."""
 
 _ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "$": "&#36;"}
@@ -49,9 +49,18 @@ def code(value: Any) -> Raw:
     return Raw(f"<code>{re.sub(_SPECIAL, lambda match: f'&#{ord(match[0])};', shown)}</code>")
 
 
+def quoted(value: Any) -> Raw:
+    """Return a text as Python writes it, for a line in a block of code."""
+    text = str(value)
+    if re.fullmatch(r"[\w./-]*", text, re.ASCII):
+        return Raw(f'"{text}"')
+    return Raw(ascii(text).replace("`", "\\x60"))
+
+
 def block(value: Any, language: str = "") -> Raw:
     """Return a text of several lines as a block of code."""
-    text = "".join(letter if letter == "\n" or _shown(letter) else " " for letter in str(value))
+    kept = (letter if letter == "\n" or _shown(letter) else " " for letter in str(value))
+    text = _shortened("".join(kept), _MOST_IN_BLOCK)
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))
     return Raw(f"{fence}{language}\n{text.rstrip()}\n{fence}")
 
@@ -70,5 +79,5 @@ def _shown(letter: str) -> bool:
     return unicodedata.category(letter)[0] != "C"
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= _MOST else text[: _MOST - 1] + "…"
+def _shortened(text: str, most: int = _MOST) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"

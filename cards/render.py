@@ -16,7 +16,7 @@ from robomme_interference_data.cards.facts import (
     SplitFacts,
 )
 from robomme_interference_data.cards.film import Film, film_of_lesson, film_of_split
-from robomme_interference_data.cards.markdown import Raw, block, code, escape, table
+from robomme_interference_data.cards.markdown import Raw, block, code, escape, quoted, table
 from robomme_interference_data.cards.metadata import (
     BUFFERS,
     BUFFERS_FILE,
@@ -97,7 +97,8 @@ def split_files(split: Split, about: Publication) -> dict[str, bytes]:
 def results_files(results: Score | Path, about: Publication) -> dict[str, bytes]:
     """Return the card of a run's results: its files by their path in the repository.
 
-    The repository holds the files of the run's folder at its root.
+    The repository holds the files of the run's folder at its root. Pictures are
+    `README-<simulator>.png`.
 
     Args:
         results: The folder of a run, a file of rows, or what either scored.
@@ -105,13 +106,14 @@ def results_files(results: Score | Path, about: Publication) -> dict[str, bytes]
 
     Raises:
         InvalidOptionError: The score is of several runs.
-        MissingExtraError: jinja2 is not installed.
+        MissingExtraError: jinja2 or matplotlib is not installed.
         BadRowsError, MissingFileError, FormatError: The rows cannot be scored.
     """
     facts = ResultsFacts.of(results)
     about = about.made_for(facts.base)
     data = croissant.of_results(facts, about)
-    return {README: _results_text(facts, about).encode(), CROISSANT: croissant.as_bytes(data)}
+    text = _results_text(facts, about)
+    return {README: text.encode(), **facts.pictures(), CROISSANT: croissant.as_bytes(data)}
 
 
 def demonstrations_text(dataset: Dataset, about: Publication) -> str:
@@ -194,7 +196,7 @@ def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
         "other_conditions": [one for one in split.conditions if one not in DEFAULT_CONDITIONS],
         "same_family": facts.same_family,
         "skipped": sum(one.skipped for one in units.values()),
-        "check": f"robomme-interference verify {about.repo_id}",
+        "check": f"robomme-interference verify {about.repo_id}@{about.tag}",
         **_exactness(facts.inexact, len(facts.manifests), "buffers", facts.repositories),
         "provenance": provenance(about, split_rows(facts, about)),
         "details": sources(facts.datasets),
@@ -233,7 +235,8 @@ def _results_text(facts: ResultsFacts, about: Publication) -> str:
 
 
 def _filled(name: str, values: Mapping[str, Any]) -> str:
-    filters = {"code": code, "block": block, "table": table, "raw": Raw, "number": "{:,}".format}
+    filters = {"code": code, "block": block, "table": table, "quoted": quoted}
+    filters |= {"raw": Raw, "number": "{:,}".format}
     package = "robomme_interference_data.cards"
     text = fill(package, name, values, what="a card", finalize=escape, filters=filters)
     return text.rstrip() + "\n"

@@ -1,9 +1,11 @@
 """What a card of results tells, computed from the rows of a run."""
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from robomme_interference_data.cards.columns import Column, columns_of
@@ -13,9 +15,12 @@ from robomme_interference_data.cards.markdown import Raw, code, escape
 from robomme_interference_data.cards.metadata import ROLLOUTS, config
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_TABLES
+from robomme_interference_data.drawing import open_figure, save_figure
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score import Grid, Settings
+from robomme_interference_data.evaluate.score.curves import Data
+from robomme_interference_data.evaluate.score.figures import draw_figure
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.systems import display_name
@@ -120,6 +125,28 @@ class ResultsFacts:
         run = f"The run is {self.run.status}: {counted:,} of {self.run.planned:,} planned rollouts"
         return f"{run} have a row. {told}"
 
+    @cached_property
+    def figures(self) -> dict[str, str]:
+        """The simulators of which there is a figure, by the file of its picture."""
+        return {
+            f"README-{re.sub('[^A-Za-z0-9._-]', '-', simulator)}.png": simulator
+            for simulator in self.score.cubes
+            if Data(self.score, simulator).cells
+        }
+
+    def pictures(self) -> dict[str, bytes]:
+        """Draw the figures: success by condition.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed.
+        """
+        with TemporaryDirectory() as folder:
+            for file, simulator in self.figures.items():
+                with open_figure() as figure:
+                    draw_figure("success", figure, Data(self.score, simulator))
+                    save_figure(figure, Path(folder) / file)
+            return {file: (Path(folder) / file).read_bytes() for file in self.figures}
+
     def provenance(self, about: Publication) -> list[tuple[str, Any]]:
         """Return where the results come from: split, revision, rows and policy."""
         rows: list[tuple[str, Any]] = []
@@ -161,6 +188,9 @@ def results_values(facts: ResultsFacts) -> dict[str, Any]:
     return {
         "systems": facts.systems,
         "headlines": {name: headline(found, name) for name in found.cubes},
+        "figures": {
+            file: f"Success by condition, {simulator}" for file, simulator in facts.figures.items()
+        },
         "grids": [{"title": one.title, "table": one, "note": Raw(one.note)} for one in found.grids],
         "effects": {"table": effects, "note": Raw(effects.note)} if effects.rows else None,
         "standing": facts.standing,

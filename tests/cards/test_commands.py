@@ -6,10 +6,13 @@ from pathlib import Path
 
 import pytest
 from support.cards import RUN
+from support.hub import BASE, SPLIT, push_split, running_hub
 from support.splits import GOLDEN
 
+from robomme_interference_data import load_split
+from robomme_interference_data.cards.commands import card_text
 from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.render import results_text
+from robomme_interference_data.cards.render import results_text, split_text
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -31,6 +34,21 @@ def test_a_card_of_a_run(run: Run) -> None:
     code, out, _ = run("card", RUN)
     assert code == 0
     assert out == results_text(RUN, Publication("namespace/name"))
+
+
+def test_a_card_of_what_is_on_the_hub(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running_hub(tmp_path / "cache", monkeypatch) as hub:
+        _, base = push_split(hub, GOLDEN, tmp_path / "work")
+        code, out, _ = run("card", SPLIT, "--repo-id", SPLIT)
+        assert code == 0
+        place = f"{BASE}@{base}"
+        assert out == split_text(load_split(GOLDEN), Publication(SPLIT, base=place))
+        assert not [path for path in hub.downloads() if path.endswith(".mp4")]
+        code, out, _ = run("card", place, "--repo-id", BASE)
+        assert code == 0
+        assert out == card_text(str(GOLDEN / "demonstrations"), Publication(BASE))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """What a stranger wrote is shown as it is, whatever Markdown could make of it."""
 
+import ast
 import re
 import unicodedata
 from typing import Any
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
-from robomme_interference_data.cards.markdown import Raw, block, code, escape, table
+from robomme_interference_data.cards.markdown import Raw, block, code, escape, quoted, table
 from robomme_interference_data.tables import Table
 
 READER = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
@@ -62,6 +63,14 @@ def test_code_in_a_line_shows_the_text(text: str) -> None:
 def test_a_block_of_code_is_one_block(text: str, fence: int) -> None:
     [token] = READER.parse(block(text + "\n" + "`" * fence, "bash"))
     assert (token.type, token.info) == ("fence", "bash")
+
+
+@given(st.one_of(st.text(max_size=60), NASTY))
+def test_quoted_text_is_a_literal_in_a_block_of_code(text: str) -> None:
+    line = f"load({quoted(text)})"
+    assert "\n" not in line
+    assert "`" not in line
+    assert ast.literal_eval(line.removeprefix("load")) == text
 
 
 def test_a_hostile_goal() -> None:

@@ -17,6 +17,7 @@ from robomme_interference_data.build_dataset.manifests import (
 )
 from robomme_interference_data.cards.commands import card_text
 from robomme_interference_data.cards.facts import SplitFacts
+from robomme_interference_data.cards.film import film_of_split
 from robomme_interference_data.cards.limits import is_whole_grid
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import (
@@ -205,6 +206,13 @@ def test_a_damaged_report(tmp_path: Path) -> None:
     (tmp_path / "distractors" / REPORT_PATH).write_text("{")
     with pytest.raises(FormatError, match="build_report"):
         split_text(split, OF_SPLIT)
+
+
+def test_a_split_without_buffers(tmp_path: Path) -> None:
+    facts = SplitFacts(made_up(tmp_path))
+    vars(facts)["manifests"] = ()
+    with pytest.raises(FormatError, match="no buffers"):
+        film_of_split(facts)
 
 
 # --- results --------------------------------------------------------------------------------------

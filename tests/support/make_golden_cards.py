@@ -9,8 +9,8 @@ from support.splits import GOLDEN
 
 from robomme_interference_data import load_split
 from robomme_interference_data.cards.render import (
+    CROISSANT,
     README,
-    STRIP,
     demonstrations_files,
     results_files,
     split_files,
@@ -33,7 +33,7 @@ if __name__ == "__main__":
     folder.mkdir(exist_ok=True)
     for name, files in cards():
         for path, content in files.items():
-            if path != STRIP:
+            if path in (README, CROISSANT):
                 suffix = "md" if path == README else "json"
                 text = without_version(content)
                 (folder / f"{name}.{suffix}").write_text(text, encoding="utf-8", newline="\n")
