@@ -235,7 +235,7 @@ def _results_text(facts: ResultsFacts, about: Publication) -> str:
 
 
 def _filled(name: str, values: Mapping[str, Any]) -> str:
-    filters = {"code": code, "block": block, "table": table, "quoted": quoted}
+    filters: dict[str, Any] = {"code": code, "block": block, "table": table, "quoted": quoted}
     filters |= {"raw": Raw, "number": "{:,}".format}
     package = "robomme_interference_data.cards"
     text = fill(package, name, values, what="a card", finalize=escape, filters=filters)
