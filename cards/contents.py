@@ -4,14 +4,14 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import PurePosixPath
 
+from robomme_interference_data.cards.metadata import BUFFERS_FILE
 from robomme_interference_data.cards.tree import Content, Tree
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
     IDENTITY_PATH,
     INDEX_DIR,
-    MANIFEST_ROWS,
-    MANIFESTS,
+    MANIFEST_PATH,
     SUMS_PATH,
 )
 from robomme_interference_data.dataset import Dataset
@@ -19,9 +19,7 @@ from robomme_interference_data.errors import HashMismatchError
 from robomme_interference_data.files import canonical_json, indented_json
 from robomme_interference_data.records import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import to_dict
-from robomme_interference_data.split import HEADER, Split
-
-ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
+from robomme_interference_data.split import Split
 
 
 def dataset_tree(dataset: Dataset) -> Tree:
@@ -51,14 +49,18 @@ def split_tree(split: Split, base: str | None) -> Tree:
         HashMismatchError: The rows are not those that the header names.
         FormatError, MissingFileError, HubError: See `dataset_tree`.
     """
-    rows = Content(split.files.path(ROWS))
+    rows = Content(split.files.path(BUFFERS_FILE))
     if rows.sha256 != split.header.rows:
         raise HashMismatchError(
-            f"{ROWS} of {split.location} does not have the SHA-256 that {HEADER} says",
+            f"{BUFFERS_FILE} of {split.location} does not have the SHA-256 of {MANIFEST_PATH}",
             f"Build the manifests again: robomme-interference build manifests {split.location}",
         )
     header = indented_json(to_dict(placed(split.header, base))).encode()
-    return {**dataset_tree(split.datasets[DISTRACTORS]), HEADER: Content(header), ROWS: rows}
+    return {
+        **dataset_tree(split.datasets[DISTRACTORS]),
+        MANIFEST_PATH: Content(header),
+        BUFFERS_FILE: rows,
+    }
 
 
 def placed(header: ManifestHeader, base: str | None) -> ManifestHeader:

@@ -6,10 +6,10 @@ from pathlib import Path
 from robomme_interference_data.cards.publish import demonstrations_of, units_of
 from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.cards.tree import Content, Tree
-from robomme_interference_data.constants import DEMONSTRATIONS, IDENTITY_PATH
+from robomme_interference_data.constants import DEMONSTRATIONS, IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import PublishError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file, working
-from robomme_interference_data.split import HEADER, Split
+from robomme_interference_data.split import Split
 
 
 def exported_tree(split: Split, config: PublishConfig) -> Tree:
@@ -42,7 +42,8 @@ def write_tree(tree: Tree, out: Path) -> bool:
         BuildError: Another process writes it.
     """
     there = all_files(out) if out.is_dir() else []
-    if (out.exists() and not out.is_dir()) or (there and not {HEADER, IDENTITY_PATH} <= {*there}):
+    ours = {MANIFEST_PATH, IDENTITY_PATH} <= {*there}
+    if (out.exists() and not out.is_dir()) or (there and not ours):
         raise PublishError(
             f"{out} is there, and is nothing that was exported", "Give --to another folder."
         )

@@ -3,9 +3,10 @@
 The tag comes last. What has no tag is no version, whatever an upload that failed has left behind.
 """
 
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 from robomme_interference_data.cards import render
 from robomme_interference_data.cards.contents import (
@@ -16,7 +17,7 @@ from robomme_interference_data.cards.contents import (
 )
 from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.cards.step import Step
-from robomme_interference_data.cards.tree import Content, Entry, Tree, beside, compare
+from robomme_interference_data.cards.tree import Content, Difference, Entry, Tree, beside, compare
 from robomme_interference_data.cards.upload import HubRepository, State
 from robomme_interference_data.cards.versions import Change, Version, change_between
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, IDENTITY_PATH
@@ -118,7 +119,7 @@ class Publisher:
         config: As what.
         private: Whether repositories that have to be made are private.
         tell: Is told what happens, in a line.
-        wait: Waits for so many seconds while the Hub is busy; None for the clock's.
+        wait: Waits for so many seconds, while the Hub is busy.
     """
 
     def __init__(
@@ -128,13 +129,13 @@ class Publisher:
         *,
         private: bool = False,
         tell: Callable[[str], object] = lambda _: None,
-        wait: Callable[[float], object] | None = None,
+        wait: Callable[[float], object] = time.sleep,
     ):
         self.split = split
         self.config = config
         self._private = private
         self._tell = tell
-        self._open = partial(HubRepository, tell=tell, **({"wait": wait} if wait else {}))
+        self._wait = wait
 
     @cached_property
     def base(self) -> str | None:
@@ -200,14 +201,15 @@ class Publisher:
             follows: Its versions count on their own: where its data are as they were, whatever the
                 card says, it stays as it is, and otherwise takes the next version that fits.
         """
-        repository, wanted = self._open(goods.repo_id), self.config.wanted
+        repository = HubRepository(goods.repo_id, self._tell, self._wait)
+        wanted = self.config.wanted
         state = repository.state()
         there = repository.tree(state.head) if state else {}
 
-        def step(version: Version, published: str | None = None) -> Step:
-            tag = str(goods.dataset.lerobot.version)
-            tree = goods.tree(version)
-            return Step(repository, version, tree, state, there, published, tag)
+        def step(version: Version) -> Step:
+            tree, lerobot = goods.tree(version), str(goods.dataset.lerobot.version)
+            difference = compare(tree, there)
+            return Step(repository, version, tree, state, difference, None, lerobot)
 
         if state is None or not state.versions:
             _check_ours(repository, there)
@@ -219,7 +221,7 @@ class Publisher:
             held = repository.tree(commit)
             differs = compare(found.tree, held)
             if not differs or (follows and not compare(goods.files, _without_card(held))):
-                return replace(found, published=commit)
+                return replace(found, published=commit, difference=Difference())
         fits = newest.after(self._change(goods, state, newest))
         if follows:
             return step(max(wanted or fits, fits))

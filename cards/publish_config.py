@@ -24,7 +24,7 @@ class PublishConfig:
     license: str = setting(OTHER, help="Its licence, such as cc-by-4.0; other: the recordings'.")
 
     def __post_init__(self) -> None:
-        self.about(self.repo_id, self.version or "1.0.0")  # checks them
+        self.about(self.repo_id, "1.0.0" if self.version is None else self.version)  # checks them
         if self.demonstrations_id is not None:
             check_repo_id(self.demonstrations_id, "--demonstrations-id")
         if self.repo_id == self.demonstrations_id:

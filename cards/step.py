@@ -1,11 +1,10 @@
 """What is to become of a repository that is published to, and how that is told."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-from robomme_interference_data.cards.tree import Difference, Entry, Tree, compare, total_size
+from robomme_interference_data.cards.tree import Difference, Tree, total_size
 from robomme_interference_data.cards.upload import HubRepository, State
 from robomme_interference_data.cards.versions import Version
 from robomme_interference_data.tables import Table
@@ -20,8 +19,8 @@ class Step:
         version: Version that it is to have.
         tree: All files of that version.
         state: What is there; None if the repository is to be made.
-        there: The files of its main branch.
-        published: Commit of the version, if it is there already.
+        difference: What has to be sent and removed.
+        published: Commit of the version; None as long as it is not there.
         lerobot: Tag by which LeRobot finds a dataset of its format, such as `v3.0`.
     """
 
@@ -29,14 +28,9 @@ class Step:
     version: Version
     tree: Tree
     state: State | None
-    there: Mapping[str, Entry]
+    difference: Difference
     published: str | None
     lerobot: str
-
-    @cached_property
-    def difference(self) -> Difference:
-        """What has to be sent and removed."""
-        return Difference((), (), ()) if self.published else compare(self.tree, self.there)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values, for JSON."""

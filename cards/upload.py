@@ -213,9 +213,10 @@ class HubRepository:
                 response = getattr(cause, "response", None)
                 if response is None and getattr(cause, "errno", None) is not None:
                     raise cause from None  # the system's word on a file
-                busy = response is not None and response.status_code in _BUSY
-                seconds = _seconds(response.headers) if busy else 0
-                if not busy or not left or seconds > _LONGEST_WAIT:
+                seconds = None
+                if response is not None and response.status_code in _BUSY:
+                    seconds = _seconds(response.headers)
+                if seconds is None or not left or seconds > _LONGEST_WAIT:
                     raise self._explained(cause) from error
                 self._tell(f"The Hub is busy: trying again in {seconds:.0f} s")
                 self._wait(seconds)
@@ -242,7 +243,7 @@ class HubRepository:
         elif code in _BUSY:
             seconds = _seconds(error.response.headers)  # type: ignore[attr-defined]
             what = f"the Hub is busy: {self.repo_id} is not published yet"
-            hint = f"{again} in {max(seconds / 60, 1):.0f} minutes."
+            hint = f"{again} in {max(seconds / 60, 1):.0f} minutes or more."
         elif constants.HF_HUB_OFFLINE:
             what = f"{self.repo_id} cannot be reached: HF_HUB_OFFLINE is set"
             hint = "Type the same command again, with HF_HUB_OFFLINE=0 in front."

@@ -27,7 +27,12 @@ def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def card(_: Any, about: Publication) -> dict[str, bytes]:
         text = f"---\nlicense: {about.license}\n---\n{about}\n"
-        return {"README.md": text.encode(), "README-strip.png": b"png", "croissant.json": b"{}"}
+        picture, machines = about.repo_id.encode(), b"{}"
+        return {
+            "README.md": text.encode(),
+            "README-strip.png": picture,
+            "croissant.json": machines,
+        }
 
     for name in ("demonstrations_files", "split_files"):
         monkeypatch.setattr(render, name, card)
