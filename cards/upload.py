@@ -12,6 +12,7 @@ from robomme_interference_data.errors import HubError
 
 _TRIES = 5
 _BUSY = (429, 503)
+_AGAIN = "What was sent is kept: type the same command again"
 _LONGEST_WAIT = 330
 """Seconds; the Hub counts requests in windows of five minutes."""
 
@@ -107,10 +108,14 @@ class HubRepository:
 
     def create(self, private: bool) -> State:
         """Make it if it is not there; return what it holds then."""
-        self._ask(self._api.create_repo, **self._of, private=private, exist_ok=True)
-        state = self.state()
+        refused = None
+        try:
+            self._ask(self._api.create_repo, **self._of, private=private, exist_ok=True)
+        except HubError as error:
+            refused = error
+        state = self.state()  # it may be there all the same: the answer may have been lost
         if state is None:
-            raise HubError(f"{self.repo_id} was made, but is not there", "Try again in a minute.")
+            raise refused or HubError(f"{self.repo_id} was made, and is not there", f"{_AGAIN}.")
         return state
 
     def commit(self, tree: Tree, head: str, message: str) -> str:
@@ -140,7 +145,7 @@ class HubRepository:
         if left:
             raise HubError(
                 f"{self.repo_id} does not hold what was sent: {left}",
-                "Nothing was published. Type the same command again.",
+                f"{_AGAIN}.",
             )
         return made
 
@@ -227,7 +232,6 @@ class HubRepository:
         from huggingface_hub import constants, errors
 
         code = getattr(getattr(error, "response", None), "status_code", None)
-        again = "What was sent is kept: type the same command again"
         if isinstance(error, errors.GatedRepoError):
             what = f"{self.repo_id} is gated, and this login has not been given access"
             hint = f"Ask for access at {self.page}"
@@ -239,17 +243,17 @@ class HubRepository:
             hint = "Give a repository of your own, or a token that may write: hf auth login --force"
         elif code == 412:
             what = f"somebody else wrote to {self.repo_id} at the same time"
-            hint = f"Look at {self.page}/commits/main. {again}, if that is as it should be."
+            hint = f"Look at {self.page}/commits/main. {_AGAIN}, if that is as it should be."
         elif code in _BUSY:
             seconds = _seconds(error.response.headers)  # type: ignore[attr-defined]
             what = f"the Hub is busy: {self.repo_id} is not published yet"
-            hint = f"{again} in {max(seconds / 60, 1):.0f} minutes or more."
+            hint = f"{_AGAIN} in {max(seconds / 60, 1):.0f} minutes or more."
         elif constants.HF_HUB_OFFLINE:
             what = f"{self.repo_id} cannot be reached: HF_HUB_OFFLINE is set"
             hint = "Type the same command again, with HF_HUB_OFFLINE=0 in front."
         else:
             what = f"{self.repo_id}: {' '.join(str(error).split())}"
-            hint = f"{again}."
+            hint = f"{_AGAIN}."
         return HubError(what, hint)
 
 
