@@ -1,15 +1,27 @@
-"""The command `card`."""
+"""The commands `card` and `publish`."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.errors import MissingFileError
+from robomme_interference_data.cards.publish_config import PublishConfig
+from robomme_interference_data.console import (
+    AsJson,
+    SplitFolder,
+    check_output,
+    print_json,
+    say,
+    stoppable,
+)
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
     from robomme_interference_data.cards.publication import Publication
     from robomme_interference_data.files import Files
+    from robomme_interference_data.split import Split
 
 
 def card(
@@ -84,3 +96,108 @@ def _has(files: "Files", path: str) -> bool:
         return files.path(path).is_file()
     except MissingFileError:
         return False
+
+
+@with_settings
+def publish(
+    split: SplitFolder,
+    config: PublishConfig,
+    private: Annotated[
+        bool, typer.Option("--private", help="New repositories are private.")
+    ] = False,
+    to: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write the repositories into, instead of publishing them."),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only tell what would be sent.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Publish a split on the Hub: its demonstrations, then its units and manifests, with cards.
+
+    All hashes and rules are checked first. A version never changes: its tag, such as data-1.0.0,
+    comes last, and is never moved. Stopped at any time, the same command goes on and sends what is
+    missing.
+
+    Examples:
+    ```
+    robomme-interference publish my-split --repo-id my-name/my-split --dry-run
+    robomme-interference publish my-split --repo-id my-name/my-split --license cc-by-4.0
+    robomme-interference publish my-split --repo-id my-name/my-split --version 1.1.0 --yes
+    robomme-interference publish my-split --repo-id my-name/my-split --to export/
+    ```
+    """
+    from robomme_interference_data.cards.checks import check_split
+    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.work_progress import WorkProgress
+
+    opened = load_split(split)
+    with WorkProgress(quiet=as_json) as progress:
+        check_split(opened, progress)
+    if to is not None:
+        _export(opened, config, to, dry_run=dry_run, as_json=as_json)
+    else:
+        _publish(opened, config, private=private, dry_run=dry_run, yes=yes, as_json=as_json)
+
+
+def _export(
+    split: "Split", config: PublishConfig, to: Path, *, dry_run: bool, as_json: bool
+) -> None:
+    from robomme_interference_data.cards.export import exported_tree, write_tree
+    from robomme_interference_data.cards.tree import total_size
+
+    check_output(to.resolve().parent)
+    tree = exported_tree(split, config)
+    written = not dry_run and write_tree(tree, to)
+    told = {"to": str(to), "files": len(tree), "bytes": total_size(tree), "written": written}
+    if as_json:
+        print_json(told)
+    else:
+        done = "would be written" if dry_run else "written" if written else "was there"
+        say(f"{to}: {len(tree):,} files, {total_size(tree):,} bytes; {done}")
+
+
+def _publish(
+    split: "Split",
+    config: PublishConfig,
+    *,
+    private: bool,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    from robomme_interference_data.cards.publish import Publisher
+    from robomme_interference_data.cards.step import step_table
+
+    publisher = Publisher(split, config, private=private, tell=say)
+    steps = publisher.plan()
+    say(step_table(steps).text())
+    if not dry_run and any(step.published is None for step in steps):
+        publisher.check_rights(steps)
+        _ask(yes)
+        with stoppable("What was sent is kept; nothing is a version before its tag is there"):
+            steps = publisher.run(steps)
+    if as_json:
+        print_json([step.as_dict() for step in steps])
+    elif not dry_run:
+        last = steps[-1]
+        say(f"{last.repository.page}/tree/{last.version.tag}")
+        say(f'load_split("{last.repository.repo_id}", revision="{last.version.tag}")')
+
+
+def _ask(yes: bool) -> None:
+    """Ask whether to go on.
+
+    Raises:
+        InvalidOptionError: Nobody is there to answer.
+    """
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise InvalidOptionError(
+            "nobody is there to be asked whether this is to be published",
+            "If it is, type the same command with --yes.",
+        )
+    typer.confirm("Publish this?", abort=True, err=True)

@@ -80,7 +80,7 @@ _GROUPS = {
     ),
     "Rollouts": (("evaluate", evaluating.evaluate), ("merge", evaluating.merge)),
     "Scores": (("score", scoring.score), ("compare", scoring.compare)),
-    "Publish": (("card", publishing.card),),
+    "Publish": (("card", publishing.card), ("publish", publishing.publish)),
 }
 """Commands in the order in which one uses them."""
 

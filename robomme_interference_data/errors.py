@@ -86,6 +86,10 @@ class HubError(InterferenceError, OSError):
     """The Hub refuses a repository, does not know it, or cannot be reached."""
 
 
+class PublishError(InterferenceError, RuntimeError):
+    """Something that cannot be published as it is, or under the version that is asked for."""
+
+
 class FormatError(InterferenceError, ValueError):
     """A file that cannot be read as what it should be, or of an unknown format version."""
 

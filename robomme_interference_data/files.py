@@ -140,6 +140,12 @@ def canonical_json(value: Any) -> str:
     )
 
 
+def indented_json(value: Any) -> str:
+    """Return the JSON text of a value as files have it: indented, with sorted keys, no NaN."""
+    text = json.dumps(value, sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False)
+    return text + "\n"
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object.
 
@@ -156,9 +162,8 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON with sorted keys, atomically."""
-    text = json.dumps(value, sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False)
-    write_text(path, text + "\n")
+    """Write a value as `indented_json`, atomically."""
+    write_text(path, indented_json(value))
 
 
 def write_text(path: Path, text: str) -> None:

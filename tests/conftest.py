@@ -35,6 +35,7 @@ _SET = {
     "HF_HUB_DISABLE_IMPLICIT_TOKEN": "1",
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
+    "HF_HUB_DISABLE_XET": "1",  # a protocol that the server on the loopback interface has not
     "HF_HUB_OFFLINE": "1",  # a test with a server on the loopback interface sets it back
     "HF_LEROBOT_HOME": str(_SCRATCH / "lerobot"),
     "NO_COLOR": "1",
@@ -89,6 +90,37 @@ def _loopback_only() -> Iterator[None]:
         for name in ("connect", "connect_ex"):
             patch.setattr(socket.socket, name, guarded(getattr(socket.socket, name)))
         yield
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A `HubServer` that the Hub's client takes for the Hub, with an empty cache and no login."""
+    from support.hub import running_hub
+
+    with running_hub(tmp_path / "cache", monkeypatch) as server:
+        yield server
+
+
+@pytest.fixture
+def login(hub: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Log in to that Hub as somebody: name, and the rights that `User` has."""
+    from huggingface_hub import constants
+    from support.hub_server import User
+
+    def log_in(name: str, **rights: Any) -> None:
+        hub.tokens[f"hf_{name}"] = User(name, **rights)
+        monkeypatch.setenv("HF_TOKEN", f"hf_{name}")
+        monkeypatch.setattr(constants, "HF_HUB_DISABLE_IMPLICIT_TOKEN", False)
+
+    return log_in
+
+
+@pytest.fixture
+def offline(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Tell the Hub's client from now on that there is no network."""
+    from huggingface_hub import constants
+
+    return lambda: monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
 
 
 @pytest.fixture(scope="session")

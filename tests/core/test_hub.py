@@ -1,11 +1,10 @@
 """Files on a Hub, through the real client and a server on the loopback interface."""
 
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from huggingface_hub import constants
 from support.hub_server import HubServer
 from support.lerobot_layouts import write_lerobot
 
@@ -23,22 +22,6 @@ REPO = "someone/small"
 DATASET = f"datasets/{REPO}"
 FILES = {f"meta/part-{number}.json": b"%d" % number for number in range(4)}
 FILES |= {"README.md": b"read me", "meta/deep/a.parquet": b"a"}
-
-
-@pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
-    with HubServer().running() as server:
-        template = server.endpoint + "/{repo_id}/resolve/{revision}/{filename}"
-        monkeypatch.setattr(constants, "ENDPOINT", server.endpoint)
-        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
-        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-        yield server
-
-
-@pytest.fixture
-def offline(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    return lambda: monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
 
 
 # --- where a location leads ----------------------------------------------------------------------

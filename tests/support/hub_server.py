@@ -1,124 +1,249 @@
-"""A Hub on the loopback interface: what the client asks of it to find and download files."""
+"""A Hub on the loopback interface: all that its client asks to download and to publish.
 
-import hashlib
-import json
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+Answers and rights are the Hub's as its client (huggingface_hub 1.33) knows them, with
+`HF_ENDPOINT`, and `HF_HUB_DISABLE_XET=1` before it is imported. The API is on `127.0.0.1`; large
+files are sent and stored under another hostname, `localhost`, where a token is an error.
+"""
+
+import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import parse_qs, quote, unquote, urlencode
 
-Answer = tuple[int, dict[str, str], Any]
+from support.hub_http import Answer, LoopbackServer, Request
+from support.hub_repositories import GITATTRIBUTES, Blob, Refused, Repository
+
+_REPO = r"(?P<repo>(?:datasets/)?[^/]+/[^/]+?)"
+_API = re.compile(
+    r"/api/(?P<repo>(?:datasets|models)/[^/]+/[^/]+)(?:/(?P<what>[^/]+)/?(?P<rest>.*))?"
+)
+_FILE = re.compile(rf"/{_REPO}/resolve/(?P<revision>[^/]+)/(?P<path>.+)")
+_OBJECTS = re.compile(rf"/{_REPO}\.git/info/lfs/objects/(?P<what>batch|verify)")
+_STORE = re.compile(rf"/store/{_REPO}/(?P<oid>[0-9a-f]{{64}})(?:/(?P<path>.+))?")
+_WRITES = ("auth-check", "commit", "preupload", "tag")
 
 
-class HubServer:
-    """Repositories by id, such as `datasets/someone/small` or `someone/model`.
+@dataclass(frozen=True)
+class User:
+    """Whom a token belongs to: whether it may write, and in the name of which others."""
+
+    name: str
+    write: bool = True
+    orgs: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name, *self.orgs)
+
+
+class HubServer(LoopbackServer):
+    """Repositories by name, such as `datasets/someone/small` or `someone/model`.
 
     Attributes:
-        requests: Every request so far, as `GET /api/datasets/…`.
-        gated: Ids of repositories that answer 403.
-        down: Answer 503 to everything.
+        repositories: All that there are.
+        tokens: Users by token; without a token one may read what is public.
+        gated: Names of repositories whose files only their owner may download.
+        renamed: New names by old ones.
+        page: Entries on a page of a tree.
     """
 
     def __init__(self) -> None:
-        self.requests: list[str] = []
+        super().__init__()
+        self.repositories: dict[str, Repository] = {}
+        self.tokens: dict[str, User] = {}
         self.gated: set[str] = set()
-        self.down = False
-        self._commits: dict[str, dict[str, dict[str, bytes]]] = {}
-        self._refs: dict[str, dict[str, str]] = {}
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
-
-    @property
-    def endpoint(self) -> str:
-        return f"http://127.0.0.1:{self._server.server_address[1]}"
+        self.renamed: dict[str, str] = {}
+        self.page = 1000
 
     def push(self, repo: str, files: Path | dict[str, bytes], ref: str = "main") -> str:
         """Make a commit of a folder's files, let a branch point to it, and return its hash."""
         if isinstance(files, Path):
             found = (path for path in sorted(files.rglob("*")) if path.is_file())
             files = {path.relative_to(files).as_posix(): path.read_bytes() for path in found}
-        sums = {path: _sha1(data) for path, data in files.items()}
-        commit = _sha1(json.dumps(sums, sort_keys=True).encode())
-        self._commits.setdefault(repo, {})[commit] = files
-        self._refs.setdefault(repo, {})[ref] = commit
-        return commit
+        blobs = {path: Blob.of(path, data) for path, data in files.items()}
+        repository = self.repositories.setdefault(repo, Repository(repo))
+        return repository.add(blobs, "Pushed", ref).oid
 
     def downloads(self) -> list[str]:
         """Return the files that were downloaded, in order."""
-        gets = [request for request in self.requests if request.startswith("GET")]
-        return [one.split("/resolve/")[1].split("/", 1)[1] for one in gets if "/resolve/" in one]
+        sent = [one.path for one in self.asked if one.method == "GET" and one.status in (200, 206)]
+        found = (_FILE.fullmatch(path) or _STORE.fullmatch(path) for path in sent)
+        return [unquote(match["path"]) for match in found if match]
 
-    @contextmanager
-    def running(self) -> Iterator["HubServer"]:
-        thread = threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True)
-        thread.start()
+    def uploads(self) -> list[str]:
+        """Return the SHA-256 of the large files that were uploaded, in order."""
+        put = [one.path for one in self.asked if one.method == "PUT" and one.status == 200]
+        return [match["oid"] for match in map(_STORE.fullmatch, put) if match]
+
+    # --- who may ask for what --------------------------------------------------------------------
+
+    def answer(self, request: Request) -> Answer:
+        """Return what the Hub answers."""
         try:
-            yield self
-        finally:
-            self._server.shutdown()
-            self._server.server_close()
-            thread.join()
+            return self._route(request)
+        except Refused as error:
+            told = {"X-Error-Code": error.code, "X-Error-Message": str(error)}
+            told["X-Repo-Commit"] = error.commit
+            headers = {name: text for name, text in told.items() if text}
+            return Answer.json({"error": str(error)}, error.status, headers)
 
-    def answer(self, path: str) -> Answer:  # noqa: PLR0911
-        """Return status, headers and body (bytes, or a value to send as JSON)."""
-        if self.down:
-            return _error(503, "Down")
-        parts = path.strip("/").removeprefix("api/").removeprefix("models/").split("/")
-        named = 3 if parts[0] == "datasets" else 2
-        repo, rest = "/".join(parts[:named]), parts[named:]
-        if repo not in self._commits:
-            return _error(401, "RepoNotFound")
-        if repo in self.gated:
-            return _error(403, "GatedRepo")
-        what, revision, *below = [*rest, "main"] if len(rest) < 2 else rest
-        commit = self._refs[repo].get(unquote(revision), revision)
-        files = self._commits[repo].get(commit)
-        if files is None:
-            return _error(404, "RevisionNotFound")
-        if what == "tree":
-            entries = [
-                {"type": "file", "path": name, "size": len(data), "oid": _sha1(data)}
-                for name, data in sorted(files.items())
-            ]
-            return 200, {}, entries
-        if what != "resolve":
-            return 200, {}, {"id": repo, "sha": commit, "siblings": [], "private": False}
-        data = files.get(unquote("/".join(below)))
-        if data is None:
-            return _error(404, "EntryNotFound", commit)
-        return 200, {"X-Repo-Commit": commit, "ETag": f'"{_sha1(data)}"'}, data
+    def _route(self, request: Request) -> Answer:
+        if match := _STORE.fullmatch(request.path):
+            return self._stored(request, self.repositories[match["repo"]], match)
+        user = self._user(request.token)
+        routes = {_API: self._api, _OBJECTS: self._objects, _FILE: self._file}
+        for pattern, serve in routes.items():
+            if match := pattern.fullmatch(request.path):
+                name = match["repo"].removeprefix("models/")
+                if name in self.renamed:
+                    there = request.target.replace(name, self.renamed[name], 1)
+                    return Answer.json({}, 307, {"Location": there})
+                return serve(request, self._repository(name, user), user, match)
+        return self._account(request, user)
 
-    def _handler(self) -> type[BaseHTTPRequestHandler]:
-        hub = self
+    def _user(self, token: str | None) -> User | None:
+        if token is not None and token not in self.tokens:
+            raise Refused(401, "", "Invalid credentials in Authorization header")
+        return None if token is None else self.tokens[token]
 
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
+    def _repository(self, name: str, user: User | None) -> Repository:
+        found = self.repositories.get(name)
+        if found is None or (found.private and not (user and found.owner in user.names)):
+            raise Refused(404 if user else 401, "RepoNotFound", "Repository not found")
+        return found
 
-            def do_GET(self) -> None:
-                path = urlsplit(self.path).path
-                hub.requests.append(f"{self.command} {path}")
-                status, headers, value = hub.answer(path)
-                data = value if isinstance(value, bytes) else json.dumps(value).encode()
-                self.send_response(status)
-                for name, text in {**headers, "Content-Length": str(len(data))}.items():
-                    self.send_header(name, text)
-                self.end_headers()
-                if self.command == "GET":
-                    self.wfile.write(data)
+    # --- what is served --------------------------------------------------------------------------
 
-            do_HEAD = do_GET
+    def _account(self, request: Request, user: User | None) -> Answer:
+        """Serve what is of no repository: a look at a card, who asks, a new repository."""
+        if request.path == "/api/validate-yaml":
+            content = request.json()["content"]
+            told: dict[str, Any] = {"errors": [], "warnings": []}
+            if not content.startswith("---\n"):
+                told["warnings"].append({"message": "empty or missing yaml metadata in repo card"})
+            elif "\n---\n" not in content:
+                told["errors"].append({"message": "the metadata does not end"})
+            return Answer.json(told, 400 if told["errors"] else 200)
+        if user is None:
+            raise Refused(401, "", "Invalid username or password.")
+        if request.path == "/api/whoami-v2":
+            auth = {"accessToken": {"role": "write" if user.write else "read"}}
+            orgs = [{"name": name} for name in user.orgs]
+            return Answer.json({"type": "user", "name": user.name, "orgs": orgs, "auth": auth})
+        if request.path != "/api/repos/create":
+            raise Refused(404, "", "Not found")
+        asked = request.json()
+        repo_id = f"{asked.get('organization') or user.name}/{asked['name']}"
+        kind = asked.get("type", "model")
+        made = Repository(
+            repo_id if kind == "model" else f"{kind}s/{repo_id}",
+            private=asked.get("visibility") == "private",
+        )
+        _check_write(user, made)
+        told = {"name": repo_id, "url": f"{self.endpoint}/{made.name}"}
+        if made.name in self.repositories:
+            return Answer.json({"error": "You already created this repo", **told}, 409)
+        self.repositories[made.name] = made
+        first = {".gitattributes": Blob(GITATTRIBUTES, large=False)}
+        made.add(first, "initial commit")
+        return Answer.json(told)
 
-            def log_message(self, *_: Any) -> None:
-                pass
+    def _api(
+        self, request: Request, repo: Repository, user: User | None, match: re.Match[str]
+    ) -> Answer:
+        what, rest = match["what"] or "revision", unquote(match["rest"] or "main")
+        if what in _WRITES:
+            _check_write(user, repo)
+        if what == "refs":
+            return Answer.json(repo.refs())
+        if what == "tag":
+            if request.method == "DELETE":
+                repo.untag(rest)
+            else:
+                repo.tag(request.json()["tag"], rest)
+            return Answer.json({})
+        if what == "commit":
+            made = repo.commit(rest, request.body.splitlines()).oid
+            url = f"{self.endpoint}/{repo.name}/commit/{made}"
+            return Answer.json({"success": True, "commitOid": made, "commitUrl": url})
+        if what == "auth-check":
+            return Answer.json({})
+        return self._read(request, repo, what, match["rest"] or "main")
 
-        return Handler
+    def _read(self, request: Request, repo: Repository, what: str, rest: str) -> Answer:
+        revision, _, folder = rest.partition("/")
+        commit = repo.find(unquote(revision))
+        if what == "revision":
+            gated, blobs = repo.name in self.gated, "blobs" in request.query
+            return Answer.json(repo.info(commit, gated=gated, blobs=blobs))
+        if what == "preupload":
+            files = request.json()["files"]
+            modes = [repo.upload_mode(commit, one["path"], one["size"]) for one in files]
+            return Answer.json({"files": modes})
+        if what == "paths-info":
+            known = {entry["path"]: entry for entry in commit.entries()}
+            wanted = parse_qs(request.body.decode()).get("paths", [])
+            return Answer.json([known[path] for path in wanted if path in known])
+        if what != "tree":
+            raise Refused(404, "", "Not found")
+        recursive = request.query.get("recursive", "").lower() == "true"
+        entries = commit.entries(unquote(folder), recursive)
+        first = int(request.query.get("cursor", 0))
+        last, headers = first + self.page, {}
+        if last < len(entries):
+            query = urlencode({**request.query, "cursor": last})
+            headers["Link"] = f'<{self.endpoint}{request.path}?{query}>; rel="next"'
+        return Answer.json(entries[first:last], headers=headers)
+
+    def _file(
+        self, request: Request, repo: Repository, user: User | None, match: re.Match[str]
+    ) -> Answer:
+        """Serve a file, or tell where a large one is."""
+        if repo.name in self.gated and not (user and repo.owner in user.names):
+            raise Refused(403 if user else 401, "GatedRepo", f"Access to {repo.id} is restricted")
+        commit, path = repo.find(unquote(match["revision"])), unquote(match["path"])
+        blob = commit.file(path)
+        headers = {"X-Repo-Commit": commit.oid, "ETag": f'"{blob.etag}"'}
+        if not blob.large:
+            return Answer(blob.data, headers=headers, plain=True)
+        place = f"{self.elsewhere}/store/{repo.name}/{blob.sha256}/{quote(path)}"
+        linked = {"X-Linked-Etag": f'"{blob.sha256}"', "X-Linked-Size": str(len(blob.data))}
+        return Answer(b"", 302, {**headers, **linked, "Location": place})
+
+    def _objects(
+        self, request: Request, repo: Repository, user: User | None, match: re.Match[str]
+    ) -> Answer:
+        """Tell where large files are to be stored, and whether one has come."""
+        _check_write(user, repo)
+        asked, objects = request.json(), f"{repo.name}.git/info/lfs/objects"
+        if match["what"] == "verify":
+            if len(repo.store.get(asked["oid"], b"")) != asked["size"]:
+                raise Refused(400, "", "this file has not come")
+            return Answer.json({})
+        told = []
+        for one in asked["objects"]:
+            told.append({"oid": one["oid"], "size": one["size"]})
+            if one["oid"] not in repo.store:
+                upload = {"href": f"{self.elsewhere}/store/{repo.name}/{one['oid']}"}
+                verify = {"href": f"{self.endpoint}/{objects}/verify"}
+                told[-1]["actions"] = {"upload": upload, "verify": verify}
+        return Answer.json({"transfer": "basic", "objects": told})
+
+    def _stored(self, request: Request, repo: Repository, match: re.Match[str]) -> Answer:
+        """Serve the place of large files: its addresses are secret, and it takes no token."""
+        if request.token is not None or request.host != "localhost":
+            raise Refused(400, "", "Only one auth mechanism allowed")
+        if request.method != "PUT":
+            return Answer(repo.store[match["oid"]], headers={"ETag": f'"{match["oid"]}"'})
+        if Blob(request.body, large=True).sha256 != match["oid"]:
+            raise Refused(400, "", "not the bytes that were announced")
+        repo.store[match["oid"]] = request.body
+        return Answer(b"")
 
 
-def _sha1(data: bytes) -> str:
-    return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()  # as Git names it
-
-
-def _error(status: int, code: str, commit: str = "") -> Answer:
-    return status, {"X-Error-Code": code, "X-Repo-Commit": commit}, {"error": code}
+def _check_write(user: User | None, repo: Repository) -> None:
+    if user is None:
+        raise Refused(401, "", "Invalid username or password.")
+    if not user.write or repo.owner not in user.names:
+        raise Refused(403, "", f"this token may not write to repositories of {repo.owner}")

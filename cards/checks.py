@@ -1,0 +1,72 @@
+"""What has to hold before a split is published: every hash and rule, no leak, LeRobot opens it."""
+
+import logging
+from collections.abc import Sized
+from pathlib import Path
+
+from robomme_interference_data.build_dataset.audit import audit_split
+from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.errors import PublishError
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.split import Split
+from robomme_interference_data.work_progress import WorkProgress
+
+
+def check_split(split: Split, progress: WorkProgress | None = None) -> None:
+    """Check that a split is fit to be published.
+
+    Raises:
+        PublishError: Something is not as recorded or as the rules say, something leaks, or LeRobot
+            cannot open a dataset.
+        MissingExtraError: lerobot is not installed.
+        InterferenceError: The split cannot be read.
+    """
+    require_lerobot()
+    violations = list(verify_split(split, progress=progress))
+    if violations:
+        first = violations[0]
+        raise PublishError(
+            f"{split.location} is not as recorded: {_number(violations, 'violation')}, such as "
+            f"{first.where}: {first.what}",
+            f"List all of them: robomme-interference verify {split.location}",
+        )
+    leaks = audit_split(split).leaks
+    if leaks:
+        raise PublishError(
+            f"{split.location} leaks: {_number(leaks, 'leak')}, such as {leaks[0].kind}: "
+            f"{leaks[0].where}",
+            f"List all of them: robomme-interference audit {split.location}",
+        )
+    for name in split.header.datasets:
+        place = split.place(name)
+        if isinstance(place, LocalFiles):  # one on the Hub was checked when it was published
+            open_with_lerobot(name, place.root)
+
+
+def open_with_lerobot(name: str, root: Path) -> None:
+    """Open a dataset as its users will, and read its first and last frame.
+
+    Raises:
+        PublishError: LeRobot cannot.
+    """
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        dataset = LeRobotDataset(f"local/{name}", root=root, video_backend="pyav")
+        for index in (0, len(dataset) - 1):
+            dataset[index]
+    except Exception as error:
+        raise PublishError(
+            f"LeRobot cannot open {root}: {type(error).__name__}: {error}",
+            "Its files are as recorded: look whether lerobot is of a version that this package "
+            "knows, with robomme-interference doctor",
+        ) from error
+    finally:
+        logging.disable(before)
+
+
+def _number(found: Sized, what: str) -> str:
+    return f"{len(found)} {what}{'s' * (len(found) > 1)}"

@@ -1,0 +1,100 @@
+"""What the repositories of a split hold: its demonstrations, and its units with the manifests."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+from robomme_interference_data.cards.metadata import BUFFERS_FILE
+from robomme_interference_data.cards.tree import Content, Tree
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    IDENTITY_PATH,
+    INDEX_DIR,
+    MANIFEST_PATH,
+    SUMS_PATH,
+)
+from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.files import canonical_json, indented_json
+from robomme_interference_data.records import BufferManifest, ManifestHeader
+from robomme_interference_data.rows import to_dict
+from robomme_interference_data.split import Split
+
+
+def dataset_tree(dataset: Dataset) -> Tree:
+    """Return the files of a dataset: those that its list names, the list, and embeddings.
+
+    Raises:
+        FormatError: The list is not the recorded one.
+        MissingFileError: A file is missing.
+        HubError: The dataset is on the Hub, and cannot be fetched.
+    """
+    sums = dataset.sums()
+    index = [path for path in dataset.files.list(INDEX_DIR) if not _hidden(path)]
+    paths = [*sums, SUMS_PATH, IDENTITY_PATH, *index]
+    dataset.files.fetch(paths)
+    known = {**sums, SUMS_PATH: dataset.identity.sums}
+    return {path: Content(dataset.files.path(path), known.get(path)) for path in paths}
+
+
+def split_tree(split: Split, base: str | None) -> Tree:
+    """Return the files of a split's own repository: its units at the root, and its manifests.
+
+    Args:
+        split: The split.
+        base: Where the demonstrations lie, `namespace/name@commit`; None for a folder beside.
+
+    Raises:
+        HashMismatchError: The rows are not those that the header names.
+        FormatError, MissingFileError, HubError: See `dataset_tree`.
+    """
+    rows = Content(split.files.path(BUFFERS_FILE))
+    if rows.sha256 != split.header.rows:
+        raise HashMismatchError(
+            f"{BUFFERS_FILE} of {split.location} does not have the SHA-256 of {MANIFEST_PATH}",
+            f"Build the manifests again: robomme-interference build manifests {split.location}",
+        )
+    header = indented_json(to_dict(placed(split.header, base))).encode()
+    return {
+        **dataset_tree(split.datasets[DISTRACTORS]),
+        MANIFEST_PATH: Content(header),
+        BUFFERS_FILE: rows,
+    }
+
+
+def placed(header: ManifestHeader, base: str | None) -> ManifestHeader:
+    """Return a header that says where the datasets of a published split lie."""
+    places = {DEMONSTRATIONS: base, DISTRACTORS: "."}
+    datasets = {
+        name: replace(one, place=places.get(name, one.place))
+        for name, one in header.datasets.items()
+    }
+    return replace(header, datasets=datasets)
+
+
+def parts_of_dataset(dataset: Dataset) -> dict[str, str]:
+    """Return what each episode of a dataset holds, wherever it stands in it."""
+    parts = {}
+    for record in dataset.records():
+        told = to_dict(record)
+        del told["episode_index"]
+        parts[f"{dataset.kind} {record.episode_id}"] = canonical_json(told)
+    return parts
+
+
+def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
+    """Return what each buffer holds, wherever the datasets keep its sessions."""
+    parts = {}
+    for manifest in manifests:
+        told = to_dict(manifest)
+        sessions = told.pop("sessions")
+        del told["query"]
+        held = [[one[name] for name in ("role", "source", "repeat", "sha256")] for one in sessions]
+        parts[str(manifest)] = canonical_json([told, held])
+    return parts
+
+
+def _hidden(path: str) -> bool:
+    """Tell whether a file is one that is being made."""
+    return any(part.startswith(".") for part in PurePosixPath(path).parts)

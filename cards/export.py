@@ -1,0 +1,73 @@
+"""Write what would be published into a folder: the split's repository, its demonstrations in it."""
+
+import shutil
+from pathlib import Path
+
+from robomme_interference_data.cards.publish import demonstrations_of, units_of
+from robomme_interference_data.cards.publish_config import PublishConfig
+from robomme_interference_data.cards.tree import Content, Tree
+from robomme_interference_data.constants import DEMONSTRATIONS, IDENTITY_PATH, MANIFEST_PATH
+from robomme_interference_data.errors import PublishError
+from robomme_interference_data.files import LocalFiles, all_files, sha256_file, working
+from robomme_interference_data.split import Split
+
+
+def exported_tree(split: Split, config: PublishConfig) -> Tree:
+    """Return the files of a split's repository, and below `demonstrations/` those of the other one.
+
+    Demonstrations that are only on the Hub are left there.
+
+    Raises:
+        InterferenceError: The split cannot be read.
+    """
+    base = split.header.datasets[DEMONSTRATIONS].place
+    base = base if base and "@" in base else None
+    units = units_of(split, config, base)
+    tree = units.tree(config.wanted or units.own_version)
+    if isinstance(split.place(DEMONSTRATIONS), LocalFiles):
+        goods = demonstrations_of(split, config)
+        files = goods.tree(config.wanted or goods.own_version)
+        tree |= {f"{DEMONSTRATIONS}/{path}": content for path, content in files.items()}
+    return tree
+
+
+def write_tree(tree: Tree, out: Path) -> bool:
+    """Write files into a folder, all of them or none; an earlier export there is replaced.
+
+    Returns:
+        Whether it was written: False if all of it was there.
+
+    Raises:
+        PublishError: The folder holds something else.
+        BuildError: Another process writes it.
+    """
+    there = all_files(out) if out.is_dir() else []
+    ours = {MANIFEST_PATH, IDENTITY_PATH} <= {*there}
+    if (out.exists() and not out.is_dir()) or (there and not ours):
+        raise PublishError(
+            f"{out} is there, and is nothing that was exported", "Give --to another folder."
+        )
+    if there == sorted(tree) and all(_holds(out / path, tree[path]) for path in there):
+        return False
+    out = out.resolve()
+    with working(out) as work:
+        made = work / "made"
+        try:
+            shutil.rmtree(made, ignore_errors=True)
+            for path, content in tree.items():
+                (made / path).parent.mkdir(parents=True, exist_ok=True)
+                if isinstance(content.source, Path):
+                    shutil.copyfile(content.source, made / path)
+                else:
+                    (made / path).write_bytes(content.source)
+            if out.exists():
+                out.rename(work / "before")
+            made.rename(out)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(work, ignore_errors=True)
+    return True
+
+
+def _holds(path: Path, content: Content) -> bool:
+    return path.stat().st_size == content.size and sha256_file(path) == content.sha256

@@ -1,0 +1,165 @@
+"""Publishing when something goes wrong: nothing is half-published, and the same command goes on."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from support.hub_server import HubServer
+from support.publishing import LESSONS, UNITS, files, plain_cards, publish, tags
+from support.splits import GOLDEN
+
+from robomme_interference_data.errors import HubError
+
+
+@pytest.fixture(autouse=True)
+def _somebody(login: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    login("someone")
+    plain_cards(monkeypatch)
+
+
+def whole(hub: HubServer) -> bool:
+    """Whether both repositories hold a version that is what a first, undisturbed try publishes."""
+    for repo_id in (LESSONS, UNITS):
+        head = hub.repositories[f"datasets/{repo_id}"].find().oid
+        if tags(hub, repo_id) != {"data-1.0.0": head, "v3.0": head}:
+            return False
+    return len(files(hub, LESSONS)) == 19 and len(files(hub, UNITS)) == 63
+
+
+STAGES: dict[str, tuple[str, str, int]] = {
+    "first repository": ("POST", "/repos/create", 0),
+    "second repository": ("POST", "/repos/create", 1),
+    "upload modes": ("POST", "/tiny/preupload/", 0),
+    "large files": ("PUT", "/store/datasets/someone/tiny/", 20),
+    "arrival": ("POST", "/tiny.git/info/lfs/objects/verify", 20),
+    "first commit": ("POST", "/commit/", 0),
+    "second commit": ("POST", "/commit/", 1),
+    "tree": ("GET", "/tiny/tree/[0-9a-f]{40}", 1),
+    "tag of LeRobot": ("POST", "/tiny/tag/", 0),
+    "tag": ("POST", "/tiny/tag/", 1),
+}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_try_that_broke_goes_on(hub: HubServer, stage: str) -> None:
+    method, path, after = STAGES[stage]
+    hub.fault(method, path, after=after, status=400)
+    with pytest.raises(HubError, match=UNITS) as caught:
+        publish(GOLDEN)
+    assert "same command" in str(caught.value.hint)
+    assert "data-1.0.0" not in tags(hub, UNITS)
+    publish(GOLDEN)
+    assert whole(hub)
+    assert len(hub.uploads()) == len(set(hub.uploads()))  # no large file is sent twice
+
+
+@pytest.mark.parametrize("stage", ["first repository", "second commit", "tag of LeRobot", "tag"])
+def test_a_lost_answer(hub: HubServer, stage: str) -> None:
+    method, path, after = STAGES[stage]
+    hub.fault(method, path, after=after, lost=True)
+    publish(GOLDEN)
+    assert whole(hub)
+
+
+@pytest.mark.parametrize(
+    ("stage", "status", "headers", "seconds"),
+    [
+        ("first repository", 429, {"Retry-After": "7"}, 7),
+        ("second commit", 429, {"Retry-After": "7"}, 7),
+        ("second commit", 429, {"RateLimit": '"api";r=0;t=55', "Retry-After": "7"}, 55),
+        ("tag of LeRobot", 429, {"RateLimit": '"api";r=3;t=55'}, 10),
+        ("tag", 429, {"RateLimit": '"api";r=0;t=300'}, 300),
+        ("tag", 503, {"Retry-After": "Wed, 21 Oct 2026 07:28:00 GMT"}, 10),
+    ],
+)
+def test_a_busy_hub_is_left_alone_for_as_long_as_it_says(
+    hub: HubServer, stage: str, status: int, headers: dict[str, str], seconds: float
+) -> None:
+    method, path, after = STAGES[stage]
+    hub.fault(method, path, after=after, times=2, status=status, headers=headers)
+    waits: list[float] = []
+    publish(GOLDEN, waits=waits)
+    assert waits == [seconds] * 2
+    assert whole(hub)
+
+
+@pytest.mark.parametrize(
+    ("fault", "waited"),
+    [
+        ({"times": 99, "headers": {"Retry-After": "30"}}, [30.0] * 4),
+        ({"headers": {"Retry-After": "3000"}}, []),
+    ],
+)
+def test_but_not_for_ever(hub: HubServer, fault: dict[str, Any], waited: list[float]) -> None:
+    met = hub.fault("POST", "/tiny/commit/", status=429, **fault)
+    waits: list[float] = []
+    with pytest.raises(HubError, match="busy") as caught:
+        publish(GOLDEN, waits=waits)
+    assert waits == waited
+    assert "minutes" in str(caught.value.hint)
+    assert tags(hub, UNITS) == {}
+    met.times = 0
+    publish(GOLDEN)
+    assert whole(hub)
+    assert len(hub.uploads()) == len(set(hub.uploads()))
+
+
+def test_somebody_else_wrote_meanwhile(hub: HubServer) -> None:
+    other = {"README.md": b"to come", "notes.txt": b"other"}
+    hub.fault("POST", "/tiny/commit/", call=lambda: hub.push(f"datasets/{UNITS}", other))
+    with pytest.raises(HubError, match="somebody else wrote to someone/tiny") as caught:
+        publish(GOLDEN)
+    assert "commits/main" in str(caught.value.hint)
+    assert tags(hub, UNITS) == {}
+    assert files(hub, UNITS) == other
+
+
+def test_two_publish_the_same_at_once(hub: HubServer) -> None:
+    hub.fault("POST", "/tiny/commit/", call=lambda: publish(GOLDEN))
+    publish(GOLDEN)
+    assert whole(hub)
+    assert [one.title for one in hub.repositories[f"datasets/{UNITS}"].commits.values()] == [
+        "initial commit",
+        "Version 1.0.0",
+    ]
+
+
+def test_a_tag_that_came_first(hub: HubServer) -> None:
+    def tagged() -> None:
+        repository = hub.repositories[f"datasets/{UNITS}"]
+        repository.tags["data-1.0.0"] = next(iter(repository.commits))
+
+    hub.fault("POST", "/tiny/tag/", after=1, call=tagged)
+    with pytest.raises(HubError, match=r"data-1\.0\.0 of someone/tiny stands for another commit"):
+        publish(GOLDEN)
+
+
+def test_what_arrived_is_compared(hub: HubServer) -> None:
+    def lose() -> None:
+        repository = hub.repositories[f"datasets/{UNITS}"]
+        head = repository.find()
+        repository.commits[head.oid].files.pop("meta/info.json", None)
+
+    hub.fault("GET", "/tiny/tree/[0-9a-f]{40}", after=1, call=lose)
+    with pytest.raises(HubError, match="does not hold what was sent: .*meta/info.json"):
+        publish(GOLDEN)
+    assert tags(hub, UNITS) == {}
+    publish(GOLDEN)
+    assert whole(hub)
+
+
+def test_a_card_that_the_hub_refuses(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    from robomme_interference_data.cards import render
+
+    card = {"README.md": b"---\nlicense: mit\n", "README-strip.png": b"", "croissant.json": b"{}"}
+    monkeypatch.setattr(render, "split_files", lambda *_: card)
+    with pytest.raises(HubError, match=r"someone/tiny: .*README"):
+        publish(GOLDEN)
+
+
+def test_a_hub_that_is_down(hub: HubServer) -> None:
+    hub.down = True
+    waits: list[float] = []
+    with pytest.raises(HubError, match="busy"):
+        publish(GOLDEN, waits=waits)
+    assert waits == [10.0] * 4
