@@ -30,7 +30,7 @@ FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour
 
 
 def main() -> None:
-    """Build, load, verify, audit, draw, retrieve; the same simulated, then evaluate and score."""
+    """Build, draw, audit, publish, load, retrieve; the same simulated, then evaluate and score."""
     began = time.monotonic()
     DEMO.mkdir(exist_ok=True)
     sample = ["--source sample"]
@@ -38,10 +38,11 @@ def main() -> None:
     run("build demonstrations", *queries, "--split test", f"--out {SPLIT}/demonstrations")
     run("build distractors", *units, f"--out {SPLIT}/distractors")
     run(f"build manifests {SPLIT} --conditions no-history k0 k1 k3 k7 --seed 0")
-    load()
     run(f"show VideoRepick/test/0 k7 --split {SPLIT} --out {DEMO}/strip.png")
     run(f"audit {SPLIT}")
-    run(f"verify {SPLIT}")
+    # As it would be on the Hub, after every hash and rule has been checked.
+    run(f"publish {SPLIT} --repo-id my-name/my-split --to {DEMO}/export")
+    load()
     retrieve(SPLIT, "VideoUnmask/test/0", DEMO / "retrieval.png")
     simulate()
     retrieve(DEMO / "tabletop", "MoveCube/test/0", DEMO / "tabletop_retrieval.png")
@@ -127,8 +128,8 @@ def load() -> None:
     """Load a buffer by its episode id, as a notebook would."""
     from robomme_interference_data import load_buffer
 
-    say('\n>>> buffer = load_buffer("VideoRepick/test/0", "k3", split="demo/split", verify=True)')
-    buffer = load_buffer("VideoRepick/test/0", "k3", split=SPLIT, verify=True)
+    say('\n>>> buffer = load_buffer("VideoRepick/test/0", "k3", split="demo/export", verify=True)')
+    buffer = load_buffer("VideoRepick/test/0", "k3", split=DEMO / "export", verify=True)
     say(f'>>> buffer\n{buffer}\n>>> buffer.goal\n"{buffer.goal}"')
     say(f'>>> buffer.frames("front").shape\n{buffer.frames("front").shape}')
     say(f">>> buffer.states.shape\n{buffer.states.shape}")
