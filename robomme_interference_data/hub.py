@@ -240,6 +240,14 @@ class HubFiles:
             httpx.TransportError,
         ) as error:
             raise self._explain(error, relative) from error
+        except OSError as error:
+            if error.errno is not None:  # the system's word on a file
+                raise
+            raise HubError(
+                f"{relative or 'the repository'} of {self.describe()} did not come whole: "
+                f"{first_line(error)}",
+                "What came whole is kept. Type the same command again.",
+            ) from error
 
     def _explain(self, error: Exception, relative: str | None) -> InterferenceError:
         from huggingface_hub import constants, errors
