@@ -4,19 +4,25 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from huggingface_hub import constants
+from support import worlds
 from support.hub import BASE, SPLIT, push_split, running_hub
 from support.hub_server import HubServer
-from support.splits import GOLDEN
+from support.retrieval import make_index
+from support.splits import GOLDEN, copy_split
 
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.build_dataset.audit import audit_split
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.cli import app
 from robomme_interference_data.errors import FormatError, HubError, MissingFileError
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.run import run_evaluation
+from robomme_interference_data.execution import Serial
 
 QUERY = "MoveCube/test/0"
 VERSION = "data-1.0.0"
@@ -182,3 +188,45 @@ def test_fetch_is_for_repositories_and_mixes_no_splits(
 def test_a_repository_that_is_no_split(hub: HubServer) -> None:
     with pytest.raises(MissingFileError, match="is not a split"):
         load_split(BASE)
+
+
+# --- every command takes a repository -------------------------------------------------------------
+
+
+def test_commands_say_the_same_of_a_repository_as_of_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Any
+) -> None:
+    root = copy_split(tmp_path / "units")
+    make_index(root)
+    commands = (
+        ("list", "{}", "--json"),
+        ("show", QUERY, "k3", "--split", "{}", "--json"),
+        ("retrieve", QUERY, "k3", "--split", "{}", "--json"),
+        ("retrieval-score", "{}", "--json"),
+    )
+    with running_hub(tmp_path / "cache", monkeypatch) as server:
+        push_split(server, root, tmp_path / "work")
+        for command in commands:
+            told = [
+                run(*(word.format(place) for word in command))
+                for place in (root, f"{SPLIT}@{VERSION}")
+            ]
+            assert told[0][0] == told[1][0] == 0, told
+            here, there = (json.loads(out.replace(f'"{SPLIT}"', '"units"')) for _, out, _ in told)
+            assert here == there, command  # but for the split's name
+
+
+def test_a_run_on_a_repository_keeps_its_commit(
+    hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(worlds.SPLIT, str(GOLDEN))
+    config = {"simulator": "support.worlds:World", "families": ("MoveCube",), "episodes": "0"}
+    rows = []
+    for number, split in enumerate((SPLIT, str(GOLDEN))):
+        out = tmp_path / f"run-{number}"
+        settings = RunConfig("replay", Path(split), out, conditions=("k1",), **config)
+        rows.append(run_evaluation(settings, executor=Serial()).rows[0])
+    assert rows[0].revision == rows[1].revision and rows[0].status == rows[1].status
+    header = json.loads((tmp_path / "run-0" / "run.json").read_text(encoding="utf-8"))
+    commit = hub.repositories[f"datasets/{SPLIT}"].find().oid
+    assert header["starts"][0]["settings"]["split"] == f"{SPLIT}@{commit}"
