@@ -1,4 +1,4 @@
-"""Publish with all checks and real cards, after a kill; LeRobot opens what was published."""
+"""Publish with all checks and real cards, and after a kill; LeRobot opens what was published."""
 
 import json
 import os
@@ -10,31 +10,44 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.hub_server import HubServer, User
-from support.publishing import LESSONS, UNITS, files, tags
+from support.hub_server import HubServer
+from support.publishing import LESSONS, UNITS, files, publish, tags
 from support.splits import GOLDEN, contents, stored_frames
 
 from robomme_interference_data import load_split
 from robomme_interference_data.cards.checks import open_with_lerobot
 from robomme_interference_data.errors import PublishError
 
-COMMAND = Path(sys.executable).parent / "robomme-interference"
-ASKED = (COMMAND, "publish", GOLDEN, "--repo-id", UNITS, "--yes", "--json")
+PUBLISH = """
+from support.publishing import publish
+from support.splits import GOLDEN
+
+publish(GOLDEN)
+"""
 
 
-@pytest.fixture
-def publishing(hub: HubServer, tmp_path: Path) -> Callable[[], subprocess.Popen[str]]:
-    """Start the command in a process of its own."""
-    hub.tokens["hf_someone"] = User("someone")
-    own = {"HF_ENDPOINT": hub.endpoint, "HF_TOKEN": "hf_someone", "HF_HUB_OFFLINE": "0"}
-    own |= {"HF_HUB_DISABLE_IMPLICIT_TOKEN": "0", "HF_HOME": str(tmp_path / "home")}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return lambda: subprocess.Popen(ASKED, env=os.environ | own, **pipes)  # type: ignore[call-overload]
+@pytest.fixture(autouse=True)
+def _somebody(login: Callable[..., None]) -> None:
+    login("someone")
 
 
-def test_publish_after_a_kill(
-    hub: HubServer, publishing: Callable[[], subprocess.Popen[str]], tmp_path: Path
+def test_what_was_published_is_opened_by_lerobot(
+    hub: HubServer, run: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
+    code, out, err = run("publish", GOLDEN, "--repo-id", UNITS, "--yes", "--json")
+    assert code == 0, err
+    assert [one["repo_id"] for one in json.loads(out)] == [LESSONS, UNITS]
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    for repo_id, name in ((LESSONS, "demonstrations"), (UNITS, "distractors")):
+        opened = LeRobotDataset(repo_id, root=tmp_path / name, video_backend="pyav")
+        record = next(iter(load_split(GOLDEN).datasets[name].records()))
+        frame = opened[3]["observation.images.front"].numpy().transpose(1, 2, 0)
+        stored = stored_frames(name, record.episode_id, "front")[3]
+        assert np.array_equal(np.round(frame * 255).astype(np.uint8), stored)
+
+
+def test_publish_after_a_kill(hub: HubServer) -> None:
     reached, killed = threading.Event(), threading.Event()
 
     def hold() -> None:
@@ -42,37 +55,23 @@ def test_publish_after_a_kill(
         killed.wait(60)
 
     hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=hold)
-    first = publishing()
-    assert reached.wait(240)
-    first.kill()
-    first.communicate(timeout=60)
+    own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"}
+    own["PYTHONPATH"] = str(GOLDEN.parents[1])
+    with subprocess.Popen([sys.executable, "-c", PUBLISH], env=os.environ | own) as process:
+        came = reached.wait(120)
+        process.kill()
     killed.set()
-    assert tags(hub, UNITS) == {}
+    assert came and tags(hub, UNITS) == {}
+    before = len(hub.uploads())
+    lessons, _ = publish(GOLDEN)
+    assert not lessons.difference
     sent = hub.uploads()
-    second = publishing()
-    out, err = second.communicate(timeout=240)
-    assert second.returncode == 0, err
-    lessons = json.loads(out)[0]
-    assert (lessons["sent_files"], lessons["commit"]) == (0, tags(hub, LESSONS)["data-1.0.0"])
-    again = hub.uploads()[len(sent) :]
-    assert len(sent) > 20 and again and not {*again} & {*sent}
+    assert 20 < before < len(sent) == len(set(sent))  # no large file twice
     for name, repo_id in (("demonstrations", LESSONS), ("distractors", UNITS)):
         held = contents(GOLDEN / name)
         found = files(hub, repo_id, "data-1.0.0")
         assert {path: found[path] for path in held} == held
     assert load_split(UNITS, revision="data-1.0.0").revision == load_split(GOLDEN).revision
-    opened_by_lerobot(tmp_path)
-
-
-def opened_by_lerobot(home: Path) -> None:
-    """LeRobot finds both repositories by name and tag, and its frames are the recorded ones."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    for repo_id, name in ((LESSONS, "demonstrations"), (UNITS, "distractors")):
-        opened = LeRobotDataset(repo_id, root=home / name, video_backend="pyav", return_uint8=True)
-        record = next(iter(load_split(GOLDEN).datasets[name].records()))
-        frame = opened[3]["observation.images.front"].numpy().transpose(1, 2, 0)
-        assert np.array_equal(frame, stored_frames(name, record.episode_id, "front")[3])
 
 
 def test_lerobot_cannot_open_anything(tmp_path: Path) -> None:
