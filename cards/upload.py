@@ -107,10 +107,10 @@ class HubRepository:
             self._ask(self._api.auth_check, **self._of, write=True)
 
     def create(self, private: bool) -> State:
-        """Make it if it is not there; return what it holds then."""
+        """Make it if it is not there, private or as its owner's are; return what it holds then."""
         refused = None
         try:
-            self._ask(self._api.create_repo, **self._of, private=private, exist_ok=True)
+            self._ask(self._api.create_repo, **self._of, private=private or None, exist_ok=True)
         except HubError as error:
             refused = error
         state = self.state()  # it may be there all the same: the answer may have been lost
