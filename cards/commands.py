@@ -1,12 +1,13 @@
-"""The commands `card` and `publish`."""
+"""The commands `card`, `publish` and `publish-results`."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cards.publish_config import PublishConfig
+from robomme_interference_data.cards.publish_config import PublishConfig, VersionConfig
 from robomme_interference_data.console import (
     AsJson,
     SplitFolder,
@@ -16,12 +17,19 @@ from robomme_interference_data.console import (
     stoppable,
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
     from robomme_interference_data.cards.publication import Publication
+    from robomme_interference_data.cards.publishing import Publishing
+    from robomme_interference_data.cards.step import Step
     from robomme_interference_data.files import Files
     from robomme_interference_data.split import Split
+
+Private = Annotated[bool, typer.Option("--private", help="New repositories are private.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only tell what would be sent.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 
 
 def card(
@@ -102,17 +110,13 @@ def _has(files: "Files", path: str) -> bool:
 def publish(
     split: SplitFolder,
     config: PublishConfig,
-    private: Annotated[
-        bool, typer.Option("--private", help="New repositories are private.")
-    ] = False,
+    private: Private = False,
     to: Annotated[
         Path | None,
         typer.Option(help="Folder to write the repositories into, instead of publishing them."),
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only tell what would be sent.")
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    dry_run: DryRun = False,
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Publish a split on the Hub: its demonstrations, then its units and manifests, with cards.
@@ -169,22 +173,78 @@ def _publish(
     as_json: bool,
 ) -> None:
     from robomme_interference_data.cards.publish import Publisher
-    from robomme_interference_data.cards.step import step_table
 
     publisher = Publisher(split, config, private=private, tell=say)
     steps = publisher.plan()
+    done = _carry_out(
+        publisher, steps, lambda: publisher.run(steps), dry_run=dry_run, yes=yes, as_json=as_json
+    )
+    if done and not as_json:
+        last = done[-1]
+        say(f'load_split("{last.repository.repo_id}", revision="{last.version.tag}")')
+
+
+def _carry_out(
+    publishing: "Publishing",
+    steps: "list[Step]",
+    run: "Callable[[], list[Step]]",
+    *,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
+) -> "list[Step]":
+    """Show what is to be done, ask, do it, and tell; return what was done."""
+    from robomme_interference_data.cards.step import step_table
+
     say(step_table(steps).text())
     if not dry_run and any(step.published is None for step in steps):
-        publisher.check_rights(steps)
+        publishing.check_rights(steps)
         _ask(yes)
         with stoppable("What was sent is kept; nothing is a version before its tag is there"):
-            steps = publisher.run(steps)
+            steps = run()
     if as_json:
         print_json([step.as_dict() for step in steps])
     elif not dry_run:
-        last = steps[-1]
-        say(f"{last.repository.page}/tree/{last.version.tag}")
-        say(f'load_split("{last.repository.repo_id}", revision="{last.version.tag}")')
+        say(f"{steps[-1].repository.page}/tree/{steps[-1].version.tag}")
+    return [] if dry_run else steps
+
+
+@with_settings
+def publish_results(
+    run: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    config: VersionConfig,
+    grid: Annotated[
+        Grid, typer.Option(help="Episodes of a complete cell, as for score.")
+    ] = Grid.BENCHMARK,
+    private: Private = False,
+    dry_run: DryRun = False,
+    yes: Yes = False,
+    as_json: AsJson = False,
+) -> None:
+    """Publish the results of a run on the Hub: rows, scores, report and a card.
+
+    Versions are kept as those of a split are. Videos of rollouts stay here.
+
+    Examples:
+    ```
+    robomme-interference publish-results my-run --repo-id my-name/my-results --dry-run
+    robomme-interference publish-results my-run --repo-id my-name/my-results --yes
+    ```
+    """
+    from robomme_interference_data.cards.publish_results import results_of, score_run
+    from robomme_interference_data.cards.publishing import Publishing
+
+    goods = results_of(score_run(run, grid), run, config)
+    publishing = Publishing(config, private=private, tell=say)
+    steps = [publishing.step(goods)]
+    _carry_out(
+        publishing,
+        steps,
+        lambda: [publishing.put(steps[0])],
+        dry_run=dry_run,
+        yes=yes,
+        as_json=as_json,
+    )
 
 
 def _ask(yes: bool) -> None:

@@ -1,4 +1,4 @@
-"""The settings of `publish`."""
+"""The settings of `publish` and `publish-results`."""
 
 from dataclasses import dataclass
 
@@ -9,22 +9,36 @@ from robomme_interference_data.settings import setting
 
 
 @dataclass(frozen=True)
-class PublishConfig:
+class VersionConfig:
+    """As what something is published."""
+
+    repo_id: str = setting(help="Repository, namespace/name.")
+    version: str | None = setting(
+        None, help="Version, such as 1.0.0.", shown="the published one, or the first"
+    )
+    license: str = setting(OTHER, help="Its licence, such as cc-by-4.0; other: the recordings'.")
+
+    def __post_init__(self) -> None:
+        Publication(self.repo_id, "1.0.0" if self.version is None else self.version, self.license)
+
+    @property
+    def wanted(self) -> Version | None:
+        """The version that is asked for, or None."""
+        return None if self.version is None else Version.parse(self.version)
+
+
+@dataclass(frozen=True)
+class PublishConfig(VersionConfig):
     """As what a split is published."""
 
-    repo_id: str = setting(help="Repository of the split, namespace/name.")
     demonstrations_id: str | None = setting(
         None,
         help="Repository of its demonstrations, unless the manifests name a published one.",
         shown="REPO_ID-demonstrations",
     )
-    version: str | None = setting(
-        None, help="Version, such as 1.0.0.", shown="the published one, or the dataset's"
-    )
-    license: str = setting(OTHER, help="Its licence, such as cc-by-4.0; other: the recordings'.")
 
     def __post_init__(self) -> None:
-        self.about(self.repo_id, "1.0.0" if self.version is None else self.version)  # checks them
+        super().__post_init__()
         if self.demonstrations_id is not None:
             check_repo_id(self.demonstrations_id, "--demonstrations-id")
         if self.repo_id == self.demonstrations_id:
@@ -32,11 +46,6 @@ class PublishConfig:
                 f"--repo-id and --demonstrations-id are both {self.repo_id!r}",
                 "Give each a repository of its own.",
             )
-
-    @property
-    def wanted(self) -> Version | None:
-        """The version that is asked for, or None."""
-        return None if self.version is None else Version.parse(self.version)
 
     @property
     def demonstrations(self) -> str:

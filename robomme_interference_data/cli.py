@@ -80,7 +80,11 @@ _GROUPS = {
     ),
     "Rollouts": (("evaluate", evaluating.evaluate), ("merge", evaluating.merge)),
     "Scores": (("score", scoring.score), ("compare", scoring.compare)),
-    "Publish": (("card", publishing.card), ("publish", publishing.publish)),
+    "Publish": (
+        ("card", publishing.card),
+        ("publish", publishing.publish),
+        ("publish-results", publishing.publish_results),
+    ),
 }
 """Commands in the order in which one uses them."""
 

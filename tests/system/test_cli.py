@@ -54,7 +54,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "evaluate", "merge"),
         *("Scores", "score", "compare"),
-        *("Publish", "card", "publish"),
+        *("Publish", "card", "publish", "publish-results"),
     ]
 
 
