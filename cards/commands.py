@@ -168,17 +168,19 @@ def _publish(
     yes: bool,
     as_json: bool,
 ) -> None:
-    from robomme_interference_data.cards.publish import Publisher
+    from robomme_interference_data.cards.publish import SplitPublisher
+    from robomme_interference_data.cards.publisher import Publisher
     from robomme_interference_data.cards.step import step_table
 
-    publisher = Publisher(split, config, private=private, tell=say)
-    steps = publisher.plan()
+    publisher = Publisher(config.wanted, private=private, tell=say)
+    own = SplitPublisher(split, config, publisher)
+    steps = own.plan()
     say(step_table(steps).text())
     if not dry_run and any(step.published is None for step in steps):
         publisher.check_rights(steps)
         _ask(yes)
         with stoppable("What was sent is kept; nothing is a version before its tag is there"):
-            steps = publisher.run(steps)
+            steps = own.run(steps)
     if as_json:
         print_json([step.as_dict() for step in steps])
     elif not dry_run:

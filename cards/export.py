@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from robomme_interference_data.cards.publish import demonstrations_of, units_of
+from robomme_interference_data.cards.goods import demonstrations_of, units_of
 from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.cards.tree import Content, Tree
 from robomme_interference_data.constants import DEMONSTRATIONS, IDENTITY_PATH, MANIFEST_PATH
@@ -23,10 +23,10 @@ def exported_tree(split: Split, config: PublishConfig) -> Tree:
     base = split.header.datasets[DEMONSTRATIONS].place
     base = base if base and "@" in base else None
     units = units_of(split, config, base)
-    tree = units.tree(config.wanted or units.own_version)
+    tree = units.tree(config.wanted or units.first)
     if isinstance(split.place(DEMONSTRATIONS), LocalFiles):
         goods = demonstrations_of(split, config)
-        files = goods.tree(config.wanted or goods.own_version)
+        files = goods.tree(config.wanted or goods.first)
         tree |= {f"{DEMONSTRATIONS}/{path}": content for path, content in files.items()}
     return tree
 

@@ -21,7 +21,7 @@ class Step:
         state: What is there; None if the repository is to be made.
         difference: What has to be sent and removed.
         published: Commit of the version; None as long as it is not there.
-        lerobot: Tag by which LeRobot finds a dataset of its format, such as `v3.0`.
+        lerobot: Tag by which LeRobot finds a dataset of its format, such as `v3.0`; or None.
     """
 
     repository: HubRepository
@@ -30,7 +30,7 @@ class Step:
     state: State | None
     difference: Difference
     published: str | None
-    lerobot: str
+    lerobot: str | None
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values, for JSON."""

@@ -15,8 +15,9 @@ from robomme_interference_data.build_dataset.manifests import (
 )
 from robomme_interference_data.cards import render
 from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.publish import Publisher
+from robomme_interference_data.cards.publish import SplitPublisher
 from robomme_interference_data.cards.publish_config import PublishConfig
+from robomme_interference_data.cards.publisher import Publisher
 from robomme_interference_data.cards.step import Step
 
 UNITS, LESSONS = "someone/tiny", "someone/tiny-demonstrations"
@@ -40,19 +41,20 @@ def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def publisher(
     root: Path, repo_id: str = UNITS, waits: list[float] | None = None, **options: Any
-) -> Publisher:
+) -> SplitPublisher:
     """Return what publishes a split; it waits by writing down for how long."""
     wait = [] if waits is None else waits
     private = options.pop("private", False)
     config = PublishConfig(repo_id, **options)
-    return Publisher(load_split(root), config, private=private, wait=wait.append)
+    made = Publisher(config.wanted, private=private, wait=wait.append)
+    return SplitPublisher(load_split(root), config, made)
 
 
 def publish(root: Path, repo_id: str = UNITS, **options: Any) -> list[Step]:
     """Publish a split; return what became of its repositories."""
     own = publisher(root, repo_id, **options)
     steps = own.plan()
-    own.check_rights(steps)
+    own.publisher.check_rights(steps)
     return own.run(steps)
 
 
