@@ -11,6 +11,8 @@ from robomme_interference_data.cards.versions import Version, versions_of
 from robomme_interference_data.errors import HubError
 
 _TRIES = 5
+_AT_ONCE = 16
+"""Files that are sent at a time: most are small, and wait for answers."""
 _BUSY = (429, 503)
 _AGAIN = "What was sent is kept: type the same command again"
 _LONGEST_WAIT = 330
@@ -102,9 +104,10 @@ class HubRepository:
 
     def check_rights(self, there: bool) -> None:
         """Check that somebody is logged in who may write to it, as far as that can be known."""
-        self._ask(self._api.whoami)
         if there:
             self._ask(self._api.auth_check, **self._of, write=True)
+        else:
+            self._ask(self._api.whoami)
 
     def create(self, private: bool) -> State:
         """Make it if it is not there, private or as its owner's are; return what it holds then."""

@@ -85,7 +85,7 @@ class Commit:
         found = {path: blob.entry(path) for path, blob in files.items()}
         for path in files:
             for parent in map(str, PurePosixPath(path).parents):
-                if parent.startswith(below) and parent not in {".", *found}:
+                if parent != "." and parent.startswith(below) and parent not in found:
                     oid = hashlib.sha1(f"{self.oid} {parent}".encode()).hexdigest()
                     found[parent] = {"type": "directory", "path": parent, "size": 0, "oid": oid}
         if not files and folder:
