@@ -11,9 +11,10 @@ from tokenize import TokenError
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.arrays import write_array
 from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.files import atomic_path, write_array
+from robomme_interference_data.files import atomic_path
 
 _OWN = re.compile(r"[0-9a-f]{64}\.npy")
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
