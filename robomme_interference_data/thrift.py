@@ -46,24 +46,42 @@ class Thrift:
         if depth > _DEEPEST or self._structs_left < 0:
             raise ValueError("its metadata are nested too deeply, or too many")
         found: dict[int, Any] = {}
-        field = 0
-        while head := self._byte():
-            field = field + (head >> 4) if head >> 4 else self._signed()
+        data, at, field = self._data, self.at, 0
+        # Most of a file's metadata is skipped: here, without a call for each byte.
+        while head := data[at]:
+            kind, at = head & 15, at + 1
+            if head >> 4:
+                field += head >> 4
+            else:
+                self.at = at
+                field, at = self._signed(), self.at
             if not 0 <= field < 1 << 15:
                 raise ValueError(f"its metadata have a field {field}")
-            kind, about = head & 15, wanted.get(field)
-            if about is None:
-                self._skip(kind, depth)
-                continue
-            if kind != about[0] or field in found:
-                raise ValueError(f"field {field} of its metadata is of kind {kind}, or there twice")
-            if kind == STRUCT:
-                found[field] = self.struct(about[1] or {}, depth + 1)
-            elif kind == LIST:
-                found[field] = self._structs(about[1] or {}, depth + 1)
+            about = wanted.get(field)
+            if about is not None:
+                if kind != about[0] or field in found:
+                    what = f"field {field} of its metadata is of kind {kind}, or there twice"
+                    raise ValueError(what)
+                self.at = at
+                found[field] = self._value(kind, about[1] or {}, depth)
+                at = self.at
+            elif kind in _NUMBERS:
+                while data[at] > 127:
+                    at += 1
+                at += 1
+            elif kind == _BINARY and data[at] < 128:
+                at += 1 + data[at]
             else:
-                found[field] = self._signed()
+                self.at = at
+                self._skip(kind, depth)
+                at = self.at
+        self.at = at + 1
         return found
+
+    def _value(self, kind: int, wanted: Wanted, depth: int) -> Any:
+        if kind == STRUCT:
+            return self.struct(wanted, depth + 1)
+        return self._structs(wanted, depth + 1) if kind == LIST else self._signed()
 
     def _structs(self, wanted: Wanted, depth: int) -> list[dict[int, Any]]:
         kind, count = self._items()

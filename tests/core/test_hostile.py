@@ -1,0 +1,142 @@
+"""A split from a stranger is data: whatever a file holds, reading it ends, within bounds."""
+
+import json
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.bombs import BOMBS
+from support.hostile import TARGETS, mutated, places
+
+from robomme_interference_data.errors import FormatError
+
+MEGABYTES = 700
+"""What reading a bomb may add to the memory of a process: the largest frame that is read, more than
+once, and the threads of libraries. Each bomb asks for more, or is refused at once."""
+
+_CHILD = """
+import json, resource, sys
+from pathlib import Path
+
+import av, numpy, pyarrow.compute, pyarrow.parquet
+from support.bombs import read
+
+from robomme_interference_data.errors import InterferenceError
+
+def size(field):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(field)).split()[1]) // 1024
+
+limit = size("VmSize") + int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_AS, (limit << 20, limit << 20))
+for line in Path(sys.argv[1]).read_text().splitlines():
+    name, kind, path = json.loads(line)
+    try:
+        read(kind, Path(path))
+        told = "nothing was wrong"
+    except InterferenceError as error:
+        told = error.message
+    print(json.dumps([name, told]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What reading each bomb says, in one process that gets little memory."""
+    folder = tmp_path_factory.mktemp("bombs")
+    lines = []
+    for number, (name, (kind, write)) in enumerate(BOMBS.items()):
+        path = folder / f"{number}"
+        write(path)
+        lines.append(json.dumps([name, kind, str(path)]))
+    (folder / "list").write_text("\n".join(lines))
+    done = subprocess.run(
+        [sys.executable, "-c", _CHILD, str(folder / "list"), str(MEGABYTES)],
+        env={"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return dict(map(json.loads, done.stdout.splitlines()))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("one text many times", "once decoded"),
+        ("many equal numbers", "83,886,080 rows"),
+        ("compressed noughts", "once decoded"),
+        ("a page that lies", "values; 16384 are told"),
+        ("common prefixes", "common prefixes"),
+        ("many row groups", "cannot be read"),
+        ("large metadata", "bytes of metadata"),
+        ("a billion frames", "it declares 1000000000 frames"),
+        ("large frames", "decoding stopped"),
+        ("larger than told", "decoding stopped"),
+        ("a playlist", "no MP4, Matroska or AVI file"),
+        ("a list of files", "no MP4, Matroska or AVI file"),
+        ("long", "at most"),
+        ("deep", "not JSON"),
+        ("deep, but read by Python", "inside each other"),
+        ("sparse", "at most"),
+        ("sparse sums", "at most"),
+        ("sparse rows", "at most"),
+        ("a header alone", "and 0 bytes follow"),
+        ("an archive", "no array"),
+        ("pickled", "its header is"),
+        ("a large image", "an image is damaged"),
+    ],
+)
+def test_a_bomb_is_refused_before_it_goes_off(
+    told: dict[str, str], name: str, message: str
+) -> None:
+    assert message in told[name]
+
+
+def test_every_bomb_has_its_message(told: dict[str, str]) -> None:
+    assert told.keys() == BOMBS.keys()
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_sound_file_is_read(tmp_path: Path, name: str) -> None:
+    target, root = TARGETS[name], places(tmp_path)
+    for data in target.sound(root):
+        assert target(root, data) is None
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
+    tmp_path_factory: pytest.TempPathFactory, name: str
+) -> None:
+    target, root = TARGETS[name], places(tmp_path_factory.mktemp("places"))
+    sound, refused = target.sound(root), []
+
+    @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+    @given(st.integers(0, 2**32))
+    def check(seed: int) -> None:
+        error = target(root, mutated(sound, random.Random(seed)))
+        refused.append(error is not None)
+
+    check()
+    assert any(refused)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_of_a_file_any_part_may_be_missing(tmp_path: Path, name: str) -> None:
+    target, root = TARGETS[name], places(tmp_path)
+    for data in target.sound(root):
+        for share in range(8):
+            target(root, data[: len(data) * share // 8])
+
+
+def test_messages_are_short_and_show_what_a_terminal_would_obey() -> None:
+    error = FormatError.damaged("a\x1b[2Jb", "x" * 10_000 + "\n")
+    assert str(error).startswith(r"a\x1b[2Jb: xxx")
+    assert len(str(error)) < 5_000
+    assert "(10,009 characters)" in str(error)
