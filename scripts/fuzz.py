@@ -187,7 +187,7 @@ def _wait(child: int, pipe: int, progress: mmap.mmap) -> tuple[dict[str, Any] | 
 
 def _atheris(name: str, options: argparse.Namespace) -> tuple[int, int, Counter[str]]:
     """Let atheris look for inputs that reach new lines; after one that ends it, go on."""
-    found, count, started = Counter[str](), 0, time.monotonic()
+    found, count, refused, started = Counter[str](), 0, 0, time.monotonic()
     artifacts = options.out.absolute() / name
     artifacts.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
@@ -201,19 +201,16 @@ def _atheris(name: str, options: argparse.Namespace) -> tuple[int, int, Counter[
             arguments += ["--inputs", str(options.inputs - count), "--seconds", str(int(left))]
             arguments += ["--child", folder, "--out", str(artifacts)]
             done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-            before = count
-            if state.is_file():
-                count += int(state.read_text() or 0)
-                state.unlink()
+            if not state.is_file():
+                raise SystemExit(done.stderr)
+            read = [int(number) for number in state.read_text().split()]
+            state.unlink()
+            count, refused = count + read[0], refused + read[1]
             if done.returncode:
-                told = [
-                    line for line in done.stderr.splitlines() if "ERROR" in line or "==" in line
-                ]
-                found[(told or ["ended"])[0].split("==")[-1].strip()[:120]] += 1
+                lines = [line for line in done.stderr.splitlines() if "ERROR" in line]
+                found[(lines or ["ended"])[0].split("==")[-1].strip()[:120]] += 1
                 (artifacts / f"log-{count}.txt").write_text(done.stderr)
-                if count == before:
-                    raise SystemExit(done.stderr)
-    return count, -1, found
+    return count, refused, found
 
 
 def _atheris_child(options: argparse.Namespace) -> None:
@@ -226,21 +223,18 @@ def _atheris_child(options: argparse.Namespace) -> None:
         sound, read = _place(TARGETS[options.target], work)
         for number, data in enumerate(sound):
             (folder / "corpus" / f"sound-{number}").write_bytes(data)
-        state, count = (folder / "state").open("w"), 0
+        state, count, refused = (folder / "state").open("w"), 0, 0
 
         def one(data: bytes) -> None:
-            nonlocal count
+            nonlocal count, refused
             count += 1
             if count % 100 == 1:
-                os.pwrite(state.fileno(), b"%d" % count, 0)
-            read(data)
+                os.pwrite(state.fileno(), b"%d %d" % (count, refused), 0)
+            refused += read(data) is not None
 
         limits = [f"-runs={options.inputs}", f"-max_total_time={int(options.seconds)}"]
-        limits += [
-            f"-timeout={LONGEST_S}",
-            "-rss_limit_mb=4096",
-            f"-artifact_prefix={options.out}/",
-        ]
+        limits += [f"-timeout={LONGEST_S}", f"-rss_limit_mb={MOST_BYTES >> 20}"]
+        limits += [f"-artifact_prefix={options.out}/"]
         atheris.Setup([sys.argv[0], *limits, str(folder / "corpus")], one)
         atheris.Fuzz()
 
