@@ -11,8 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.bombs import BOMBS
 from support.hostile import TARGETS, mutated, places
+from support.splits import GOLDEN, QUERIES, copy_split, with_sessions
 
+from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.errors import FormatError
+from robomme_interference_data.records import BufferManifest, SessionEntry
+from robomme_interference_data.rows import from_dict, to_dict
 
 MEGABYTES = 700
 """What reading a bomb may add to the memory of a process: the largest frame that is read, more than
@@ -101,6 +106,50 @@ def test_a_bomb_is_refused_before_it_goes_off(
 
 def test_every_bomb_has_its_message(told: dict[str, str]) -> None:
     assert told.keys() == BOMBS.keys()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"repeat": 2**40},
+        {"stop": 2**62},
+        {"start": 0, "stop": 2**18 + 1},
+        {"start": -1},
+        {"repeat": 0},
+    ],
+)
+def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> None:
+    session = to_dict(load_buffer(QUERIES[0], "k1", split=GOLDEN).manifest.sessions[0])
+    assert from_dict(SessionEntry, session, "here")
+    with pytest.raises(FormatError, match="here: .*session span"):
+        from_dict(SessionEntry, session | change, "here")
+
+
+@pytest.mark.parametrize("change", [{"repeat": 2**13}, {"repeat": 1}])
+def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, int]) -> None:
+    manifest = to_dict(load_buffer(QUERIES[0], "k1", split=GOLDEN).manifest)
+    many = [manifest["sessions"][1] | change] * (2**13 // change["repeat"])
+    with pytest.raises(FormatError, match="in .* sessions; expected at most"):
+        from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
+
+
+def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
+    root = copy_split(tmp_path / "split")
+    info = root / "demonstrations/meta/info.json"
+    told = json.loads(info.read_text())
+    told["features"]["observation.images.front"]["shape"] = [4096, 4096, 3]
+    info.write_text(json.dumps(told))
+    buffer = load_buffer(QUERIES[0], "k7", split=root)
+    short = load_buffer(QUERIES[0], "no-history", split=root)
+    assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
+    with pytest.raises(FormatError, match="pixels; the dataset's info.json says 4096×4096"):
+        buffer.frames()
+    assert short.frames().shape == (0, 4096, 4096, 3)
+    many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)
+    held = Buffer(many, buffer.query, load_split(root).datasets)
+    with pytest.raises(FormatError, match="are held at once") as caught:
+        held.frames()
+    assert "stream" in str(caught.value.hint)
 
 
 @pytest.mark.parametrize("name", TARGETS)
