@@ -99,7 +99,8 @@ class IndexHeader:
     def digest(self) -> str:
         """Return what `sha256` must be."""
         fields = {name: one for name, one in to_dict(self).items() if name != "sha256"}
-        return sha256(canonical_json(fields).encode()).hexdigest()
+        text = canonical_json(fields).encode(errors="backslashreplace")  # as files are written
+        return sha256(text).hexdigest()
 
 
 def episode_file(episode_index: int) -> str:

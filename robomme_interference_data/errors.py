@@ -26,7 +26,9 @@ class InterferenceError(Exception):
     """
 
     def __init__(self, message: str, hint: str | None = None):
-        message = _presentable(message)
+        if len(message) > _LONGEST_MESSAGE:
+            message = f"{message[:_LONGEST_MESSAGE]}… ({len(message):,} characters)"
+        message = visible(message)
         super().__init__(message)
         self.message = message
         self.hint = hint or None
@@ -205,10 +207,8 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
     return more + ", ".join(names[:10]) + rest
 
 
-def _presentable(text: str) -> str:
-    """Return text as it can be shown: of bounded length, control characters by their number."""
-    if len(text) > _LONGEST_MESSAGE:
-        text = f"{text[:_LONGEST_MESSAGE]}… ({len(text):,} characters)"
+def visible(text: str) -> str:
+    """Return text with control characters by their number: a terminal would obey them."""
     return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 

@@ -176,6 +176,27 @@ def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
     assert any(refused)
 
 
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("index", b'"two-sums"', b'"\\ud800"'),
+        ("index", b'"size": 3', b'"size": 9999999'),
+        ("record", b'"goal":"', b'"goal":"\\udfff'),
+        ("record", b'"attempt":1', b'"attempt":99999999999999999999'),
+        ("run", b'"episodes": {', b'"episodes": {"MoveCube/val": "0-99999999",'),
+        ("manifest", b'"seed": 0', b'"seed": 99999999999999999999'),
+        ("manifest", b'"seed": 0', b'"seed": ' + b"9" * 5000),
+    ],
+)
+def test_values_that_were_too_much_once(
+    tmp_path: Path, name: str, before: bytes, after: bytes
+) -> None:
+    target, root = TARGETS[name], places(tmp_path)
+    [sound] = target.sound(root)
+    assert before in sound
+    assert isinstance(target(root, sound.replace(before, after, 1)), FormatError)
+
+
 @pytest.mark.parametrize("name", TARGETS)
 def test_of_a_file_any_part_may_be_missing(tmp_path: Path, name: str) -> None:
     target, root = TARGETS[name], places(tmp_path)
