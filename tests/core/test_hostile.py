@@ -197,6 +197,12 @@ def test_values_that_were_too_much_once(
     assert isinstance(target(root, sound.replace(before, after, 1)), FormatError)
 
 
+def test_half_a_character_in_a_header(tmp_path: Path) -> None:
+    target, root = TARGETS["manifest"], places(tmp_path)
+    [sound] = target.sound(root)
+    assert target(root, sound.replace(b'"k7"', b'"\\ud800"')) is None
+
+
 @pytest.mark.parametrize("name", TARGETS)
 def test_of_a_file_any_part_may_be_missing(tmp_path: Path, name: str) -> None:
     target, root = TARGETS[name], places(tmp_path)
