@@ -7,6 +7,7 @@ can wait forever on a damaged file.
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import BinaryIO
 
@@ -189,8 +190,10 @@ class RowSpan:
         return self.stop - self.start
 
     def part(self, start: int, stop: int) -> "RowSpan":
-        """Return rows of the same file, numbered as in the file."""
-        return RowSpan(self.path, start, stop)
+        """Return rows of the same file, numbered as in the file; it is not opened again."""
+        part = copy(self)
+        part.start, part.stop = start, stop
+        return part
 
     @property
     def names(self) -> list[str]:
