@@ -13,7 +13,7 @@ from itertools import groupby, repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.cache import DecodedCache
+from robomme_interference_data.cache import DecodedCache, frames_sha256
 from robomme_interference_data.constants import KEY_FRAMES, STATE
 from robomme_interference_data.dataset import Dataset, camera_feature
 from robomme_interference_data.digest import combine
@@ -332,12 +332,13 @@ class Buffer:
         recorded = None if self._cache is None else self._recorded(entry)
         if self._cache is None or recorded is None:
             return None, None
-        name = recorded[camera_feature(camera)]
+        name = recorded.get(camera_feature(camera), "")
         shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
         return name, self._cache.get(name, shape, verify=self._verified)
 
     def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
-        if self._cache is not None and name is not None:
+        # Under their own digest only: another split may hold the frames that are called so.
+        if self._cache is not None and name is not None and frames_sha256(frames) == name:
             self._cache.put(name, frames)
 
     def _start_reading(

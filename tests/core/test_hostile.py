@@ -6,12 +6,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.bombs import BOMBS
 from support.hostile import TARGETS, mutated, places
-from support.splits import GOLDEN, QUERIES, copy_split, with_sessions
+from support.splits import (
+    GOLDEN,
+    QUERIES,
+    contents,
+    copy_split,
+    expected_frames,
+    with_sessions,
+)
 
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.buffer import Buffer
@@ -131,6 +141,27 @@ def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, 
     many = [manifest["sessions"][1] | change] * (2**13 // change["repeat"])
     with pytest.raises(FormatError, match="in .* sessions; expected at most"):
         from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
+
+
+@pytest.mark.parametrize("called", ["../../written", "/written", "0" * 64, "", "x\0"])
+def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, called: str) -> None:
+    """Else a split could write elsewhere, or give another one its frames."""
+    root = copy_split(tmp_path / "split")
+    path = root / "distractors/meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(path).to_pylist()
+    for row in rows:
+        row["feature_sha256"]["observation.images.front"] = called
+    pq.write_table(pa.Table.from_pylist(rows), path)
+    before = contents(tmp_path)
+    cache = tmp_path / "cache" / "inner"
+    for _ in range(2):
+        buffer = load_buffer(QUERIES[0], "k1", split=root, cache=cache)
+        expected = expected_frames(buffer.manifest.sessions, "front")
+        assert np.array_equal(buffer.frames(), expected)
+        streamed = [chunk.frames["front"] for chunk in buffer.stream(cameras=["front"])]
+        assert np.array_equal(np.concatenate(streamed), expected)
+    assert len(list(cache.iterdir())) == 1  # the lesson, which is called as it should be
+    assert {name for name in contents(tmp_path) if not name.startswith("cache/")} == set(before)
 
 
 def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
