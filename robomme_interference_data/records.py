@@ -29,6 +29,9 @@ _MOST_HISTORY = 1 << 18
 _MOST_SESSIONS = 1 << 12
 """Sessions of a buffer, at most."""
 
+_MOST_GOALS = 1 << 16
+"""Characters of all wordings of a goal, at most: they are shown, and handed to policies."""
+
 
 class Status(StrEnum):
     """How an episode stands after a step.
@@ -81,8 +84,10 @@ class EpisodeRecord:
     lesson_sha256: dict[str, str] | None
 
     def __post_init__(self) -> None:
-        if not self.goals:
-            raise FormatError(f"{self.episode_id} has no goal")
+        if not self.goals or sum(map(len, self.goals)) > _MOST_GOALS:
+            raise FormatError(
+                f"{self.episode_id} has no goal, or one of over {_MOST_GOALS} letters"
+            )
         start = self.exec_start_idx
         fits = start is None or 0 < start < self.length
         if not 0 < self.length <= _MOST_FRAMES or not fits:
