@@ -30,6 +30,7 @@ from robomme_interference_data.constants import (
     MANIFESTS,
     REPORT_PATH,
 )
+from robomme_interference_data.errors import visible
 from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ def verify(
         print_json([vars(violation) for violation in violations])
     else:
         for violation in violations:
-            typer.echo(f"{violation.where}: {violation.what}")
+            typer.echo(visible(f"{violation.where}: {violation.what}"))
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
         say(
             f"{len(violations)} violation{'s' * (len(violations) > 1)}"

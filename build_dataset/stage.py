@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.arrays import write_array
 from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import STATISTICS, ImageStats
@@ -25,7 +26,7 @@ from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.execution import Worker
-from robomme_interference_data.files import canonical_json, write_array, write_json
+from robomme_interference_data.files import canonical_json, write_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import read_header, to_dict

@@ -5,7 +5,6 @@ short is dropped, and only that one. Of a rollout that broke and ran again, the 
 what is finished never runs again. The tables beside it are exported when a run ends.
 """
 
-import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,12 +21,25 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, RunFolderError, first_line
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
-from robomme_interference_data.files import atomic_path, canonical_json, hold, write_json
+from robomme_interference_data.files import (
+    atomic_path,
+    canonical_json,
+    hold,
+    parse_json,
+    read_bytes,
+    write_json,
+)
 from robomme_interference_data.parquet import writing
 from robomme_interference_data.records import FINAL, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
 ERRORS_LOG = "errors.log"
+
+MOST_BYTES = 2 << 30
+"""Bytes of a file of rows, at most: two million rollouts have less."""
+
+_MOST_ROLLOUTS = 1 << 20
+"""Rollouts that all plans of a run ask for, at most: the paper's grid has 25,200."""
 
 
 def clip_name(item: WorkItem) -> str:
@@ -84,6 +96,11 @@ class RunHeader:
     counts: dict[str, int] = field(default_factory=dict)
     starts: tuple[Start, ...] = ()
     merged: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        planned = sum(plan.most for plan in self.plans)
+        if planned > _MOST_ROLLOUTS:
+            raise FormatError(f"plans of {planned} rollouts; expected at most {_MOST_ROLLOUTS}")
 
     @property
     def items(self) -> tuple[WorkItem, ...]:
@@ -226,13 +243,15 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
         return rows
     for number, line in enumerate(whole_lines(path).splitlines(), 1):
         try:
-            row = from_dict(Rollout, json.loads(line), "its fields", strict=True)
+            row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
+            if b"\\u" in line:  # half of a character, which no table can hold
+                canonical_json(to_dict(row)).encode()
             item = WorkItem.of(row)
             if item in rows and is_done(rows[item]):
                 raise ValueError(f"it is a second one of {item}")
             if row.video not in (None, clip_name(item)):  # which would be read and written there
                 raise ValueError(f"video {row.video!r}; expected {clip_name(item)} or null")
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             raise FormatError(
                 f"{path}, line {number} is no row of a rollout: {first_line(error)}",
                 "Remove the line to run that rollout again.",
@@ -258,7 +277,7 @@ def rows_that_count(rollout: NDArray[np.int64], broke: NDArray[np.bool_]) -> NDA
 
 def whole_lines(record: Path) -> bytes:
     """Return a record's bytes, without a last line that a crash cut short."""
-    data = record.read_bytes()
+    data = read_bytes(record, MOST_BYTES)
     return data[: data.rfind(b"\n") + 1]
 
 

@@ -8,7 +8,7 @@ from typing import Self
 
 from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers
+from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
 from robomme_interference_data.records import Rollout
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
@@ -65,7 +65,17 @@ class Plan:
     shard: str = "1/1"
 
     def __post_init__(self) -> None:
-        self.items()
+        # Without a list of the rollouts: in a file, there may be plans of millions.
+        _read_shard(self.shard)
+        in_order(self.conditions)
+        for group, numbers in self.episodes.items():
+            EpisodeId.parse(f"{group}/0")
+            count_numbers(numbers)
+
+    @property
+    def most(self) -> int:
+        """Rollouts of all shards; more, where a number of an episode comes twice."""
+        return len(self.conditions) * sum(map(count_numbers, self.episodes.values()))
 
     def items(self) -> tuple[WorkItem, ...]:
         """Return the rollouts of the shard in canonical order: by episode and condition.
@@ -74,12 +84,7 @@ class Plan:
         conditions over the same episodes. Shards take episodes in turn from the shuffled order:
         no two have one in common, together they are the plan, and they differ by one at most.
         """
-        shard = _SHARD.fullmatch(self.shard)
-        if shard is None or not 1 <= int(shard[1]) <= int(shard[2]):
-            raise InvalidOptionError.expected(
-                "--shard", self.shard, "NUMBER/OF, such as 2/8 for the second of eight"
-            )
-        number, of = int(shard[1]), int(shard[2])
+        number, of = _read_shard(self.shard)
         known = [
             EpisodeId.parse(f"{group}/{index}")
             for group, numbers in self.episodes.items()
@@ -88,6 +93,15 @@ class Plan:
         mine = sorted(sorted(known, key=_lot)[number - 1 :: of])
         names = [one.name for one in in_order(self.conditions)]
         return tuple(WorkItem(name, episode) for episode in mine for name in names)
+
+
+def _read_shard(text: str) -> tuple[int, int]:
+    shard = _SHARD.fullmatch(text)
+    if shard is None or not 1 <= int(shard[1]) <= int(shard[2]):
+        raise InvalidOptionError.expected(
+            "--shard", text, "NUMBER/OF, such as 2/8 for the second of eight"
+        )
+    return int(shard[1]), int(shard[2])
 
 
 def plan_work(

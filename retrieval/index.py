@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.arrays import write_array
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
@@ -52,7 +53,6 @@ from robomme_interference_data.files import (
     sha256_file,
     work_folder,
     working,
-    write_array,
     write_json,
     write_text,
 )

@@ -1,5 +1,6 @@
 """A history buffer: its sessions in order, and their frames when asked for."""
 
+import math
 import os
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -12,11 +13,12 @@ from itertools import groupby, repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.cache import DecodedCache
+from robomme_interference_data.cache import DecodedCache, frames_sha256
 from robomme_interference_data.constants import KEY_FRAMES, STATE
 from robomme_interference_data.dataset import Dataset, camera_feature
 from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import (
+    FormatError,
     HashMismatchError,
     InvalidOptionError,
     MissingExtraError,
@@ -34,6 +36,9 @@ from robomme_interference_data.records import (
 
 _PIECE = 8 * KEY_FRAMES
 """Frames that one thread decodes at a time."""
+
+_MOST_BYTES = 16 << 30
+"""Bytes of frames that are held at once, at most: a short video may hold many large frames."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +175,7 @@ class Buffer:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
-        out = np.empty((len(self), *self.query.dataset.shape(camera)), np.uint8)
+        out = _room(len(self), self.query.dataset.shape(camera))
         self.fetch([camera])
         with ThreadPoolExecutor(self._threads) as pool:
             try:
@@ -327,12 +332,13 @@ class Buffer:
         recorded = None if self._cache is None else self._recorded(entry)
         if self._cache is None or recorded is None:
             return None, None
-        name = recorded[camera_feature(camera)]
+        name = recorded.get(camera_feature(camera), "")
         shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
         return name, self._cache.get(name, shape, verify=self._verified)
 
     def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
-        if self._cache is not None and name is not None:
+        # Under their own digest only: another split may hold the frames that are called so.
+        if self._cache is not None and name is not None and frames_sha256(frames) == name:
             self._cache.put(name, frames)
 
     def _start_reading(
@@ -380,9 +386,20 @@ class Buffer:
                 frames = dataset.iter_frames(entry.episode_index, camera, first, last)
             else:
                 if whole is None:
-                    whole = np.empty((entry.stop - entry.start, *dataset.shape(camera)), np.uint8)
+                    whole = _room(entry.stop - entry.start, dataset.shape(camera))
                     dataset.read_frames(entry.episode_index, camera, entry.start, whole)
                     self._keep(name, whole)
                 frames = iter(whole[stored[0] : stored[-1] + 1])
             for frame, (_, shown) in zip(frames, groupby(stored), strict=True):
                 yield from repeat(frame, len(list(shown)))
+
+
+def _room(frames: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    size = frames * math.prod(shape)
+    if size > _MOST_BYTES:
+        raise FormatError(
+            f"{frames} frames of shape {shape} take {size:,} bytes; at most {_MOST_BYTES:,} are "
+            "held at once",
+            "Take them in chunks, without a cache: buffer.stream(64)",
+        )
+    return np.empty((frames, *shape), np.uint8)

@@ -11,9 +11,10 @@ from tokenize import TokenError
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.arrays import write_array
 from robomme_interference_data.digest import FeatureDigests
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.files import atomic_path, write_array
+from robomme_interference_data.files import atomic_path
 
 _OWN = re.compile(r"[0-9a-f]{64}\.npy")
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
@@ -63,6 +64,8 @@ class DecodedCache:
             verify: Compare the frames with the digest; others count as absent. Not the default:
                 it takes longer than reading them.
         """
+        if not _OWN.fullmatch(f"{sha256}.npy"):
+            return None  # a dataset may call its frames what it likes
         path = self._path(sha256)
         try:
             frames = np.lib.format.open_memmap(path, mode="r")  # type: ignore[no-untyped-call]
@@ -72,7 +75,7 @@ class DecodedCache:
             os.utime(path)
         if frames.shape != shape or frames.dtype != np.uint8:
             return None
-        return None if verify and _sha256(frames) != sha256 else frames
+        return None if verify and frames_sha256(frames) != sha256 else frames
 
     def put(self, sha256: str, frames: NDArray[np.uint8]) -> None:
         """Store frames, unless they alone exceed the bound, and remove the least used ones."""
@@ -108,7 +111,8 @@ class DecodedCache:
             size -= stat.st_size
 
 
-def _sha256(frames: NDArray[np.uint8]) -> str:
+def frames_sha256(frames: NDArray[np.uint8]) -> str:
+    """Return the digest of frames, by which they are kept."""
     digests = FeatureDigests()
     digests.update("frames", frames)
     return digests.current()["frames"]

@@ -27,7 +27,7 @@ from robomme_interference_data.errors import (
     MissingFileError,
     UnknownNameError,
 )
-from robomme_interference_data.files import Files, parse_sums, sha256_file
+from robomme_interference_data.files import Files, read_sums, sha256_file
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.records import DatasetIdentity, EpisodeRecord
@@ -242,7 +242,7 @@ class Dataset:
         path = self.files.path(SUMS_PATH)
         if sha256_file(path) != self.identity.sums:
             raise FormatError.damaged(path, f"not the SHA-256 that {IDENTITY_PATH} says")
-        return parse_sums(path.read_text(encoding="utf-8", errors="replace"), path)
+        return read_sums(path)
 
     def _camera(self, camera: str) -> str:
         name = camera_feature(camera)

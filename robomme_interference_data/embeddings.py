@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.arrays import read_array
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DEMONSTRATIONS,
@@ -34,13 +35,16 @@ from robomme_interference_data.files import (
     Files,
     LocalFiles,
     canonical_json,
-    parse_sums,
+    read_sums,
     sha256_file,
 )
 from robomme_interference_data.rows import read_header, to_dict
 
 CENTRE_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"
+
+_LONGEST = 1 << 14
+"""Values in an embedding, at most: a held frame's is repeated in a buffer; SigLIP's have 1152."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +92,15 @@ class IndexHeader:
     sums: str
     sha256: str = ""
 
+    def __post_init__(self) -> None:
+        if not 0 < self.size <= _LONGEST:
+            raise FormatError(f"size {self.size}; expected 1 to {_LONGEST}")
+
     def digest(self) -> str:
         """Return what `sha256` must be."""
         fields = {name: one for name, one in to_dict(self).items() if name != "sha256"}
-        return sha256(canonical_json(fields).encode()).hexdigest()
+        text = canonical_json(fields).encode(errors="backslashreplace")  # as files are written
+        return sha256(text).hexdigest()
 
 
 def episode_file(episode_index: int) -> str:
@@ -273,24 +282,18 @@ class EmbeddingIndex:
         path = self._path(INDEX_SUMS)
         if sha256_file(path) != self.header.sums:
             raise self._damaged(f"{INDEX_SUMS} does not have the SHA-256 of {INDEX_HEADER}")
-        return parse_sums(path.read_text(encoding="utf-8"), path)
+        return read_sums(path)
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
         path, first = self._path(name), name not in self._checked
         if first and sha256_file(path) != self._sums[name]:
             raise self._damaged(f"{name} does not have the SHA-256 of {INDEX_SUMS}")
         try:
-            array = np.load(path)
-        except (OSError, ValueError, EOFError) as error:
-            raise self._damaged(f"{name} cannot be read: {error}") from None
-        fits = array.ndim == len(shape) and all(
-            side in (-1, found) for side, found in zip(shape, array.shape, strict=True)
-        )
-        if not fits or array.dtype != dtype or (first and not np.isfinite(array).all()):
-            raise self._damaged(
-                f"{name} holds {array.dtype} of shape {array.shape}; expected finite "
-                f"{np.dtype(dtype)} of shape {shape}"
-            )
+            array = read_array(path, dtype, shape)
+        except FormatError as error:
+            raise self._damaged(error.message) from None
+        if first and not np.isfinite(array).all():
+            raise self._damaged(f"{name} holds numbers that are not finite")
         self._checked.add(name)
         return array
 

@@ -5,9 +5,16 @@ do next, with the command to type where there is one. What is said often is said
 constructor of the type.
 """
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, Self
+
+_LONGEST_MESSAGE = 4000
+"""Characters of a message, at most: it may quote a file that somebody else wrote."""
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+"""What a terminal would obey instead of showing it; line breaks and tabs are none of these."""
 
 
 class InterferenceError(Exception):
@@ -19,6 +26,9 @@ class InterferenceError(Exception):
     """
 
     def __init__(self, message: str, hint: str | None = None):
+        if len(message) > _LONGEST_MESSAGE:
+            message = f"{message[:_LONGEST_MESSAGE]}… ({len(message):,} characters)"
+        message = visible(message)
         super().__init__(message)
         self.message = message
         self.hint = hint or None
@@ -195,6 +205,11 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
         return ""
     rest = f", … ({len(names)} in all)" if len(names) > 10 else ""
     return more + ", ".join(names[:10]) + rest
+
+
+def visible(text: str) -> str:
+    """Return text with control characters by their number: a terminal would obey them."""
+    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 
 def first_line(error: BaseException) -> str:

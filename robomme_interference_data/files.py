@@ -4,6 +4,7 @@ import errno
 import fcntl
 import hashlib
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -11,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 from robomme_interference_data.errors import (
     BuildError,
@@ -20,8 +21,16 @@ from robomme_interference_data.errors import (
     MissingFileError,
 )
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+_MOST_JSON = 16 << 20
+"""Bytes of a file of JSON, at most: ours have some thousand, and Python takes forty times as many
+for some values."""
+
+_MOST_SUMS = 64 << 20
+"""Bytes of a list of SHA-256, at most: those of half a million files."""
+
+_DEEPEST = 64
+"""Lists and maps of JSON inside each other, at most: what Python reads, it cannot always show,
+compare or write again."""
 
 
 class Files(Protocol):
@@ -146,19 +155,73 @@ def indented_json(value: Any) -> str:
     return text + "\n"
 
 
+def read_bytes(path: Path, most: int) -> bytes:
+    """Return a file's bytes.
+
+    Raises:
+        FormatError: There are more than `most`.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise FormatError.damaged(path, f"{size:,} bytes; at most {most:,} are read")
+        return file.read()
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object.
 
     Raises:
-        FormatError: The file is not JSON or holds something else.
+        FormatError: The file is not JSON or holds something else, or is too large or deep.
+    """
+    return parse_json(read_bytes(path, _MOST_JSON), path)
+
+
+def parse_json(data: bytes, where: object) -> dict[str, Any]:
+    """Read JSON, which holds an object and neither NaN nor infinite numbers.
+
+    Args:
+        data: UTF-8.
+        where: What is read, for messages.
+
+    Raises:
+        FormatError: It is not JSON or holds something else, or is too deep.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = _JSON.decode(data.decode())
+        if data.count(b"[") + data.count(b"{") > _DEEPEST and _is_deep(value):
+            raise ValueError(f"over {_DEEPEST} lists and maps inside each other")
     except (ValueError, RecursionError) as error:
-        raise FormatError.damaged(path, f"not JSON: {error}") from None
+        raise FormatError.damaged(where, f"not JSON: {error}") from None
     if not isinstance(value, dict):
-        raise FormatError.damaged(path, "no JSON object")
+        raise FormatError.damaged(where, "no JSON object")
     return value
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:80]} is no finite number")
+    return value
+
+
+def _not_finite(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no finite number")
+
+
+_JSON = json.JSONDecoder(parse_float=_finite, parse_constant=_not_finite)
+
+
+def _is_deep(value: Any) -> bool:
+    inside = [value]
+    for _ in range(_DEEPEST):
+        inside = [
+            one
+            for outer in inside
+            for one in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(one, dict | list)
+        ]
+    return bool(inside)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -173,23 +236,6 @@ def write_text(path: Path, text: str) -> None:
     """
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
-
-
-def write_array(path: Path, array: "NDArray[Any]") -> None:
-    """Write an array as `np.save` does, in C order.
-
-    Raises:
-        OSError: As the system says it; from `np.save`, a full disk is an error without a number.
-    """
-    import numpy as np
-
-    with path.open("wb") as file:
-        array = np.asarray(array, order="C")
-        np.lib.format.write_array_header_1_0(  # type: ignore[no-untyped-call]
-            file,
-            np.lib.format.header_data_from_array_1_0(array),  # type: ignore[no-untyped-call]
-        )
-        file.write(array.data)
 
 
 @contextmanager
@@ -223,18 +269,22 @@ def format_sums(root: Path, paths: Iterable[str]) -> str:
     return "".join(f"{sha256_file(root / path)}  {path}\n" for path in sorted(paths))
 
 
-def parse_sums(text: str, path: object) -> dict[str, str]:
-    """Read what `format_sums` wrote: SHA-256 by path.
+def read_sums(path: Path) -> dict[str, str]:
+    """Read a file of what `format_sums` returns: SHA-256 by path.
 
     Raises:
-        FormatError: A line is not such a one.
+        FormatError: A line is not such a one, a path leads elsewhere, or the file is too large.
     """
     sums = {}
-    for line in text.splitlines():
+    try:
+        lines = read_bytes(path, _MOST_SUMS).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise FormatError.damaged(path, error) from None
+    for line in lines:
         digest, gap, name = line.partition("  ")
         if not gap or len(digest) != 64 or not name:
             raise FormatError.damaged(path, f"{line[:80]!r} is no line of SHA-256 and path")
-        sums[name] = digest
+        sums[check_relative(name, str(path))] = digest
     return sums
 
 

@@ -111,7 +111,20 @@ def parse_numbers(text: str) -> tuple[int, ...]:
     Raises:
         InvalidOptionError: The text is something else, or names over a million numbers.
     """
-    numbers: set[int] = set()
+    return tuple(sorted({number for span in _spans(text) for number in span}))
+
+
+def count_numbers(text: str) -> int:
+    """Count what `parse_numbers` would read, without reading it; what comes twice counts twice.
+
+    Raises:
+        InvalidOptionError: As `parse_numbers`.
+    """
+    return sum(map(len, _spans(text)))
+
+
+def _spans(text: str) -> list[range]:
+    spans, count = [], 0
     for part in text.split(","):
         match = _SPAN.fullmatch(part.strip())
         if match is None or int(match[2] or match[1]) < int(match[1]):
@@ -119,14 +132,14 @@ def parse_numbers(text: str) -> tuple[int, ...]:
                 f"{text!r} is not a list of episode numbers: {part.strip()!r}",
                 "Expected numbers and spans with commas between them, such as 0-49 or 0,3,10-12.",
             )
-        span = range(int(match[1]), int(match[2] or match[1]) + 1)
-        if len(numbers) + len(span) > _MOST_NUMBERS:
+        spans.append(range(int(match[1]), int(match[2] or match[1]) + 1))
+        count += len(spans[-1])
+        if count > _MOST_NUMBERS:
             raise InvalidOptionError(
                 f"{text!r} is not a list of episode numbers: over {_MOST_NUMBERS:,} of them",
                 "Give the episodes that there are, such as 0-49.",
             )
-        numbers.update(span)
-    return tuple(sorted(numbers))
+    return spans
 
 
 def format_numbers(numbers: Iterable[int]) -> str:

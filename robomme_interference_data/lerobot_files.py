@@ -4,7 +4,6 @@ The only reader of that layout: history datasets of this package and recordings 
 through it. Tests hold it against lerobot's own.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
@@ -21,17 +20,29 @@ from robomme_interference_data.errors import (
     TruncatedVideoError,
     UnknownNameError,
 )
-from robomme_interference_data.files import Files, read_json
+from robomme_interference_data.files import Files, parse_json, read_bytes, read_json
 from robomme_interference_data.lerobot_layout import (
     VERSIONS,
     EpisodePlace,
     check_info,
     place_episode,
 )
-from robomme_interference_data.parquet import RowSpan, open_parquet, reading
+from robomme_interference_data.parquet import RowSpan, is_plain, open_parquet, read_table, reading
 
 _V21_EPISODES = "meta/episodes.jsonl"
 _V21_TASKS = "meta/tasks.jsonl"
+
+_MOST_LINES = 64 << 20
+"""Bytes of v2.1's per-episode columns, at most: those of half a million episodes."""
+
+_MOST_NUMBERS = 4096
+"""Numbers in a vector of a frame, at most: a held frame's are repeated in a buffer."""
+
+_MOST_BYTES = 1 << 30
+"""Bytes that the per-episode columns may take in all: a million episodes have less."""
+
+_MOST_COLUMNS = 1000
+"""Of v2.1's per-episode columns, at most: each row may name others."""
 
 
 class LeRobotFiles:
@@ -186,7 +197,7 @@ class LeRobotFiles:
         """
         rows = self.rows(index)
         values = rows.vectors(column)
-        if values.shape[1:] != self.shape(column):
+        if values.shape[1:] != self.shape(column) or values.shape[1] > _MOST_NUMBERS:
             raise FormatError.damaged(
                 rows.path,
                 f"{column} of episode {index} has {values.shape[1]} values a frame; info.json "
@@ -231,28 +242,24 @@ class LeRobotFiles:
         tables = []
         for path in paths:
             file = open_parquet(path)
-            names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-            with reading(path):
-                tables.append(file.read(columns=names))
+            told = (field for field in file.schema_arrow if is_plain(field.type))
+            names = [field.name for field in told if not field.name.startswith("stats/")]
+            tables.append(read_table(file, path, names))
+            if sum(table.nbytes for table in tables) > _MOST_BYTES:
+                raise FormatError.damaged(path, f"with others over {_MOST_BYTES:,} bytes")
         with reading(paths[0]):  # files with columns of different types
             return pa.concat_tables(tables)
 
     def _v21_table(self) -> pa.Table:
         rows = list(self._json_lines(_V21_EPISODES))
         names = dict.fromkeys(name for row in rows for name in row)
+        if len(names) > _MOST_COLUMNS:
+            raise FormatError.damaged(self.files.path(_V21_EPISODES), f"{len(names)} columns")
         with reading(self.files.path(_V21_EPISODES)):
             return pa.table({name: [row.get(name) for row in rows] for name in names})
 
     def _json_lines(self, relative: str) -> Iterator[dict[str, Any]]:
         path = self.files.path(relative)
-        with path.open(encoding="utf-8", errors="replace") as lines:
-            for number, line in enumerate(lines, 1):
-                if not line.strip():
-                    continue
-                try:
-                    row = json.loads(line)
-                except (ValueError, RecursionError) as error:
-                    raise FormatError.damaged(f"{path}, line {number}", error) from None
-                if not isinstance(row, dict):
-                    raise FormatError.damaged(f"{path}, line {number}", "no JSON object")
-                yield row
+        for number, line in enumerate(read_bytes(path, _MOST_LINES).splitlines(), 1):
+            if line.strip():
+                yield parse_json(line, f"{path}, line {number}")

@@ -5,8 +5,9 @@ can wait forever on a damaged file.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,8 +19,24 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.files import atomic_path
+from robomme_interference_data.parquet_pages import (
+    MOST_FOOTER,
+    decoded_size,
+    read_chunks,
+)
 
 _IMAGES_AT_ONCE = 8
+
+_MOST_LISTED = 1 << 14
+"""Row groups, columns, and other lists in the metadata, at most: for so many, room is made before
+one is read, and columns that lie in each other so deep take so much of the stack."""
+
+_MOST_ROWS = 1 << 26
+_MOST_VALUES = 1 << 26
+"""Rows of a file and values of a read, at most: a million rows of a run have a third of them."""
+
+_MOST_BYTES = 2 << 30
+"""Bytes that a read, or the images of a row group, may take once decoded."""
 
 
 @contextmanager
@@ -33,7 +50,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except InterferenceError:
         raise
-    except (pa.ArrowException, OSError, UnicodeError, OverflowError) as error:
+    except (pa.ArrowException, OSError, ValueError, OverflowError, RecursionError) as error:
         text = str(error).partition("\n")[0]
         raise FormatError.damaged(path, f"cannot be read: {text}") from None
 
@@ -42,11 +59,80 @@ def open_parquet(path: Path) -> pq.ParquetFile:
     """Open a parquet file for reading piece by piece.
 
     Raises:
-        FormatError: It is not a parquet file.
+        FormatError: It is not a parquet file, or its metadata are too large or contradict each
+            other.
     """
     with reading(path):
-        # Bytes, as pyarrow cannot encode names that are not UTF-8.
-        return pq.ParquetFile(pa.OSFile(os.fsencode(path)), buffer_size=1 << 20)
+        chunks = read_chunks(path)
+        file = pq.ParquetFile(
+            pa.OSFile(os.fsencode(path)),  # as pyarrow cannot encode names that are not UTF-8
+            buffer_size=1 << 20,
+            thrift_string_size_limit=MOST_FOOTER,
+            thrift_container_size_limit=_MOST_LISTED,
+        )
+        told = file.metadata
+        if [len(group) for group in chunks] != [told.num_columns] * told.num_row_groups:
+            raise ValueError("its row groups do not have the columns of its schema")
+        rows = [told.row_group(group).num_rows for group in range(told.num_row_groups)]
+        if min(rows, default=0) < 0 or sum(rows) != told.num_rows:
+            raise ValueError(f"{told.num_rows} rows; its row groups have {sum(rows)}")
+        if told.num_rows > _MOST_ROWS:
+            raise ValueError(f"{told.num_rows:,} rows; at most {_MOST_ROWS:,} are read")
+        _ = file.schema_arrow.names  # which may be no text
+        return file
+
+
+def read_table(
+    file: pq.ParquetFile,
+    path: Path,
+    columns: Sequence[str] | None = None,
+    groups: Sequence[int] | None = None,
+) -> pa.Table:
+    """Return columns of a file, checked value by value: texts are texts, lists lie where they say.
+
+    Args:
+        file: What `open_parquet` returned.
+        path: The file's path.
+        columns: Names of the columns; None for all.
+        groups: Numbers of row groups; None for all.
+
+    Raises:
+        FormatError: They cannot be read, are too large, or of a type that is no text, number,
+            truth value, or list or struct of these.
+    """
+    chosen = range(file.num_row_groups) if groups is None else groups
+    names = None if columns is None else list(columns)
+    with reading(path):
+        for field in file.schema_arrow:
+            if (names is None or field.name in names) and not is_plain(field.type):
+                raise ValueError(f"column {field.name!r} is of type {field.type}")
+        _check_size(file, path, names, chosen)
+        table = file.read_row_groups(list(chosen), columns=names)
+        table.validate(full=True)
+        if len(set(table.column_names)) < table.num_columns:
+            raise ValueError("two columns have the same name")
+    return table
+
+
+def _check_size(
+    file: pq.ParquetFile, path: Path, columns: list[str] | None, groups: Sequence[int]
+) -> None:
+    """Refuse what would take too much memory."""
+    size = values = 0
+    told = [file.metadata.schema.column(number) for number in range(file.metadata.num_columns)]
+    wanted = None if columns is None else tuple(f"{name}." for name in columns)
+    numbers = [n for n, c in enumerate(told) if wanted is None or f"{c.path}.".startswith(wanted)]
+    chunks = read_chunks(path)
+    with path.open("rb") as bare:
+        for group in groups:
+            for number in numbers:
+                chunk, column = chunks[group][number], told[number]
+                values += chunk.values
+                kind, length = column.physical_type, column.length
+                size += decoded_size(bare, chunk, kind, length, _MOST_BYTES)
+                if size > _MOST_BYTES or values > _MOST_VALUES:
+                    what = f"over {_MOST_BYTES:,} bytes or {_MOST_VALUES:,} values once decoded"
+                    raise ValueError(what)
 
 
 @contextmanager
@@ -56,11 +142,27 @@ def writing(path: Path) -> Iterator[BinaryIO]:
         yield file
 
 
+_NUMBERS = (pa.int8(), pa.int16(), pa.int32(), pa.int64(), pa.float16(), pa.float32(), pa.float64())
+_UNSIGNED = (pa.uint8(), pa.uint16(), pa.uint32(), pa.uint64())
+_TEXTS = (pa.string(), pa.large_string(), pa.binary(), pa.large_binary())
+_PLAIN = {pa.null(), pa.bool_(), *_NUMBERS, *_UNSIGNED, *_TEXTS}
+
+
 def is_listed(kind: pa.DataType) -> bool:
     """Tell whether a type is one of Arrow's lists."""
     return bool(
         pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
     )
+
+
+def is_plain(kind: pa.DataType) -> bool:
+    """Tell whether values of a type are texts, numbers, truth values, or made of these."""
+    if pa.types.is_dictionary(kind) or is_listed(kind):
+        return is_plain(kind.value_type)
+    if pa.types.is_struct(kind):
+        named = len({field.name for field in kind}) == kind.num_fields
+        return named and all(is_plain(field.type) for field in kind)
+    return kind in _PLAIN
 
 
 class RowSpan:
@@ -88,8 +190,10 @@ class RowSpan:
         return self.stop - self.start
 
     def part(self, start: int, stop: int) -> "RowSpan":
-        """Return rows of the same file, numbered as in the file."""
-        return RowSpan(self.path, start, stop)
+        """Return rows of the same file, numbered as in the file; it is not opened again."""
+        part = copy(self)
+        part.start, part.stop = start, stop
+        return part
 
     @property
     def names(self) -> list[str]:
@@ -101,10 +205,8 @@ class RowSpan:
         for name in columns or ():
             self._type(name)
         groups, first = self._row_groups()
-        with reading(self.path):
-            return self._file.read_row_groups(groups, columns=columns).slice(
-                self.start - first, len(self)
-            )
+        table = read_table(self._file, self.path, columns, groups)
+        return table.slice(self.start - first, len(self))
 
     def scalars(self, name: str) -> NDArray[np.int64]:
         """Return a column of booleans or integers, or of lists of one such value, `(T,) int64`."""
@@ -153,6 +255,9 @@ class RowSpan:
                 "struct<bytes, path>"
             )
         groups, row = self._row_groups()
+        with reading(self.path):
+            for group in groups:
+                _check_size(self._file, self.path, [name], [group])
         batches = self._file.iter_batches(_IMAGES_AT_ONCE, row_groups=groups, columns=[name])
         with reading(self.path):
             for batch in batches:

@@ -20,6 +20,19 @@ family, material without content, or one that contradicts the lesson. The paper'
 the first two."""
 
 
+_MOST_FRAMES = 1 << 22
+"""Frames of an episode, at most: days at the recorded rate."""
+
+_MOST_HISTORY = 1 << 18
+"""Frames of a buffer, at most: seven hours; the paper's longest have some thousand."""
+
+_MOST_SESSIONS = 1 << 12
+"""Sessions of a buffer, at most."""
+
+_MOST_GOALS = 1 << 16
+"""Characters of all wordings of a goal, at most: they are shown, and handed to policies."""
+
+
 class Status(StrEnum):
     """How an episode stands after a step.
 
@@ -71,10 +84,13 @@ class EpisodeRecord:
     lesson_sha256: dict[str, str] | None
 
     def __post_init__(self) -> None:
-        if not self.goals:
-            raise FormatError(f"{self.episode_id} has no goal")
+        if not self.goals or sum(map(len, self.goals)) > _MOST_GOALS:
+            raise FormatError(
+                f"{self.episode_id} has no goal, or one of over {_MOST_GOALS} letters"
+            )
         start = self.exec_start_idx
-        if self.length < 1 or not (start is None or 0 < start < self.length):
+        fits = start is None or 0 < start < self.length
+        if not 0 < self.length <= _MOST_FRAMES or not fits:
             raise FormatError(
                 f"{self.episode_id} has length {self.length} and exec_start_idx {start}"
             )
@@ -167,10 +183,10 @@ class SessionEntry:
     def __post_init__(self) -> None:
         if self.role not in ROLES:
             raise FormatError(f"session role {self.role!r} is none of {', '.join(ROLES)}")
-        if not 0 <= self.start < self.stop or self.repeat < 1:
+        if not 0 <= self.start < self.stop or self.repeat < 1 or self.num_frames > _MOST_HISTORY:
             raise FormatError(
                 f"session span [{self.start}, {self.stop}) × {self.repeat} of {self.source} is "
-                "empty or negative"
+                f"empty, negative, or of over {_MOST_HISTORY} frames"
             )
 
     @property
@@ -272,6 +288,11 @@ class BufferManifest:
 
     def __post_init__(self) -> None:
         frames = sum(session.num_frames for session in self.sessions)
+        if frames > _MOST_HISTORY or len(self.sessions) > _MOST_SESSIONS:
+            raise FormatError(
+                f"{self}: {frames} frames in {len(self.sessions)} sessions; expected at most "
+                f"{_MOST_HISTORY} in {_MOST_SESSIONS}"
+            )
         if frames != self.history_frames:
             raise FormatError(
                 f"{self}: the sessions hold {frames} frames, history_frames says "

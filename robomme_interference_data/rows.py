@@ -26,6 +26,9 @@ _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
     float: (pa.float64(), (float, int), "a number"),
     bool: (pa.bool_(), (bool,), "true or false"),
 }
+_LARGEST = 1 << 63
+"""No whole number in a table is as large, and none in JSON may be."""
+
 _PARTS = {"family": pa.string(), "split": pa.string(), "index": pa.int64()}
 """Columns that the field `episode_id` has beside its own."""
 
@@ -161,10 +164,15 @@ def _codec_of(hint: Any) -> _Codec:
         return _or_none(_codec(next(part for part in arguments if part is not NoneType)))
     if hint in _SCALARS:
         kind, types, expected = _SCALARS[hint]
-        return _Codec(
-            lambda keys: kind,
-            lambda value: value if type(value) is hint else hint(_of(types, value, expected)),
-        )
+
+        def scalar(value: Any) -> Any:
+            if type(value) is not hint:
+                _of(types, value, expected)
+            if type(value) is int and not -_LARGEST <= value < _LARGEST:
+                raise ValueError(f"a number of {value.bit_length()} bits; expected at most 64")
+            return value if type(value) is hint else hint(value)
+
+        return _Codec(lambda keys: kind, scalar)
     if hint is EpisodeId:
         write = _remembered(lambda value, shared: str(value))
         return _Codec(lambda keys: pa.string(), EpisodeId.parse, write)

@@ -104,7 +104,7 @@ class Split:
         """
         bare = {name: replace(one, place=None) for name, one in self.header.datasets.items()}
         text = canonical_json(to_dict(replace(self.header, datasets=bare)))
-        return sha256(text.encode()).hexdigest()
+        return sha256(text.encode(errors="backslashreplace")).hexdigest()  # as files are written
 
     @property
     def conditions(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from typing import Any, Literal, Self, cast
 
 import pyarrow as pa
 
+from robomme_interference_data.errors import visible
 from robomme_interference_data.rows import arrow_schema, to_dict
 
 Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
@@ -123,7 +124,7 @@ class Table:
             for line in lines
         ]
         text = "\n".join([laid[0], "  ".join("-" * width for width in widths), *laid[1:]])
-        return "\n\n".join(part for part in (self.title, text, self.note) if part)
+        return visible("\n\n".join(part for part in (self.title, text, self.note) if part))
 
 
 def percent(value: float) -> str:

@@ -4,8 +4,8 @@ A LeRobot v3 video file holds many episodes one after the other at a constant fr
 frame is named by its number in the file: its presentation time multiplied by the rate.
 """
 
-from collections.abc import Generator
-from contextlib import closing
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import av
@@ -13,6 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError, MissingFileError, TruncatedVideoError
+from robomme_interference_data.video_boxes import find_container, unreadable
+
+MOST_PIXELS = 1 << 24
+"""Pixels of a frame, at most: twice those of 3840 × 2160."""
+
+_LATEST = 1 << 62
+"""What FFmpeg can seek to, in ticks of a container."""
+
+_DECODERS = (
+    *("libdav1d", "libaom-av1", "av1", "h264", "hevc", "vp8", "vp9", "mpeg4", "mjpeg"),
+    *("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle"),
+)
+"""Decoders that are used, of FFmpeg's hundreds: those of LeRobot's codecs, and lossless ones."""
 
 
 def iter_frames(
@@ -44,7 +57,7 @@ def iter_frames(
         TruncatedVideoError: The file ends before `stop`, or a frame is missing.
     """
     expected = start
-    with closing(_indexed_frames(path, start, fps)) as frames:
+    with closing(_indexed_frames(path, start, fps, shape)) as frames:
         if stop is not None and start >= stop:
             return
         for number, frame in frames:
@@ -53,13 +66,9 @@ def iter_frames(
                     f"{path}: frame {expected} is missing (the next one found is {number})",
                     "The file is damaged: download or build it again.",
                 )
-            image = _to_rgb(frame)
-            if shape is not None and image.shape != shape:
-                raise FormatError(
-                    f"{path}: frames are {image.shape[1]}×{image.shape[0]} pixels; the dataset's "
-                    f"info.json says {shape[1]}×{shape[0]}"
-                )
-            yield image
+            if shape is not None:
+                _check_shape(path, (frame.height, frame.width), shape)
+            yield _to_rgb(path, frame)
             expected += 1
             if expected == stop:
                 return
@@ -71,27 +80,61 @@ def iter_frames(
         )
 
 
-def _to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:
-    # Planar RGB (the lossless codec) is only re-arranged, without the colour converter.
-    return frame.to_ndarray() if frame.format.name == "gbrp" else frame.to_ndarray(format="rgb24")
-
-
-def _indexed_frames(path: Path, start: int, fps: float) -> Generator[tuple[int, av.VideoFrame]]:
-    """Yield `(number, frame)` from frame `start` on."""
+def _to_rgb(path: Path, frame: av.VideoFrame) -> NDArray[np.uint8]:
     try:
-        container = av.open(str(path))
+        # Planar RGB (the lossless codec) is only re-arranged, without the colour converter.
+        planar = frame.format.name == "gbrp"
+        return frame.to_ndarray() if planar else frame.to_ndarray(format="rgb24")
+    except (av.error.FFmpegError, ValueError) as error:
+        raise FormatError.damaged(path, f"a frame has no colours: {error}") from None
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Open a video file and its first video stream, before anything is decoded.
+
+    Raises:
+        MissingFileError: There is no such file.
+        FormatError: It is not a video, or one that declares more than is read.
+    """
+    limits = {"max_pixels": str(MOST_PIXELS)}
+    allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
+    try:
+        kind = find_container(path)
+        container = av.open(str(path), format=kind, options=limits, container_options=allowed)
     except FileNotFoundError:
         raise MissingFileError(f"{path} does not exist") from None
+    except FormatError:
+        raise
     except (av.error.FFmpegError, OSError, ValueError) as error:  # ValueError: a damaged header
-        raise FormatError(f"{path} is not a readable video: {error}") from error
+        raise unreadable(path, error) from error
     with container:
         if not container.streams.video:
             raise FormatError(f"{path} holds no video stream")
         stream = container.streams.video[0]
-        if stream.codec_context is None:  # a header cut short; PyAV would crash the process
-            raise FormatError(f"{path} is not a readable video: its codec is not known")
+        context = stream.codec_context
+        if context is None:  # a header cut short; PyAV would crash the process
+            raise unreadable(path, "its codec is not known")
+        if context.name not in _DECODERS or not stream.time_base:
+            what = f"codec {context.name}, time base {stream.time_base}"
+            raise unreadable(path, what)
+        if context.width * context.height > MOST_PIXELS:
+            raise unreadable(path, f"frames of {context.width}×{context.height} pixels")
+        context.options = limits
         stream.thread_count = 1  # sessions are decoded side by side instead
+        yield container, stream
+
+
+def _indexed_frames(
+    path: Path, start: int, fps: float, shape: tuple[int, ...] | None
+) -> Generator[tuple[int, av.VideoFrame]]:
+    """Yield `(number, frame)` from frame `start` on."""
+    with open_video(path) as (container, stream):
+        if shape is not None:
+            _check_shape(path, (stream.height, stream.width), shape)
         tick = float(stream.time_base) * fps
+        if start / tick >= _LATEST:
+            raise FormatError.damaged(path, f"no video has a frame {start} at {fps:g} Hz")
         try:
             if start > 0:
                 container.seek(round(start / tick), stream=stream, backward=True)
@@ -116,6 +159,14 @@ def _indexed_frames(path: Path, start: int, fps: float) -> Generator[tuple[int, 
                 f"{path}: decoding stopped: {error}",
                 "The file is damaged or incomplete: download or build it again.",
             ) from error
+
+
+def _check_shape(path: Path, found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    if found != shape[:2]:
+        raise FormatError(
+            f"{path}: frames are {found[1]}×{found[0]} pixels; the dataset's info.json says "
+            f"{shape[1]}×{shape[0]}"
+        )
 
 
 def _number(path: Path, frame: av.VideoFrame, tick: float, fps: float) -> int:

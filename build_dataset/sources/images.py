@@ -12,7 +12,8 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, SourceError
+from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
+from robomme_interference_data.video import MOST_PIXELS, open_video
 
 _RGB_FORMATS = (
     *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
@@ -35,15 +36,12 @@ def probe_video(path: Path) -> tuple[float, bool]:
     """
     hint = "Write it again with a constant frame rate, for example with codec ffv1 in a .mkv file."
     try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            if stream.codec_context is None:  # a header cut short; PyAV would crash the process
-                raise ValueError("its codec is not known")
+        with open_video(path) as (_, stream):
             rate = stream.average_rate or stream.base_rate
             lossless = stream.codec.canonical_name in _LOSSLESS_CODECS
             exact = lossless and stream.pix_fmt in _RGB_FORMATS
-    except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
-        raise SourceError(f"{path} is not a readable video: {error}", hint) from None
+    except InterferenceError as error:
+        raise SourceError(error.message, hint) from None
     if not rate:
         raise SourceError(f"{path} does not say its frame rate", hint)
     return float(rate), exact
@@ -133,7 +131,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
     codec.thread_count = 1
     # Without these, a PNG with a broken checksum is decoded as if nothing were wrong.
-    codec.options = {"err_detect": "crccheck+explode"}
+    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MOST_PIXELS)}
     try:
         frames = codec.decode(av.Packet(data)) + codec.decode(None)
     except (av.error.FFmpegError, ValueError) as error:

@@ -22,8 +22,14 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
-from robomme_interference_data.evaluate.log import RunHeader, rows_that_count, whole_lines
-from robomme_interference_data.parquet import open_parquet, reading
+from robomme_interference_data.evaluate.log import (
+    MOST_BYTES,
+    RunHeader,
+    rows_that_count,
+    whole_lines,
+)
+from robomme_interference_data.files import read_bytes
+from robomme_interference_data.parquet import open_parquet, read_table, reading
 from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, read_header
 
@@ -146,13 +152,13 @@ def _encoded(path: Path, column: Any) -> tuple[Codes, Sequence[Any]]:
 def _read_parquet(path: Path, with_system: bool) -> Part:
     with open_parquet(path) as file:
         chosen = _match(path, file.schema_arrow.names, with_system)
-        table = file.read(columns=list(chosen.values()))
+        table = read_table(file, path, list(chosen.values()))
     columns = {name: _encoded(path, table[there]) for name, there in chosen.items()}
     return Part(path, columns, len(table), lambda row: row + 1)
 
 
 def _read_csv(path: Path, with_system: bool) -> Part:
-    data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    data = read_bytes(path, MOST_BYTES).removeprefix(codecs.BOM_UTF8)
     # Decoded here: of a byte that is no text pyarrow would show a traceback of its own.
     text = data.decode()
     csv.field_size_limit(len(data) + 1)

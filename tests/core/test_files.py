@@ -1,12 +1,10 @@
 """Files reached through one place, written whole or not at all."""
 
-import errno
 import json
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,9 +16,9 @@ from robomme_interference_data.files import (
     canonical_json,
     format_sums,
     hold,
-    parse_sums,
+    parse_json,
     read_json,
-    write_array,
+    read_sums,
     write_json,
 )
 
@@ -154,26 +152,39 @@ def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
         "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad  a\n"
         "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855  b\n"
     )
-    assert list(parse_sums(text, "here")) == ["a", "b"]
+    path = tmp_path / "sums"
+    path.write_text(text)
+    assert list(read_sums(path)) == ["a", "b"]
     for damaged in ("abc  a\n", "no sums\n", text.replace("  a", " a")):
+        path.write_text(damaged)
         with pytest.raises(FormatError, match="no line of SHA-256"):
-            parse_sums(damaged, "here")
+            read_sums(path)
+    path.write_text(text.replace("  a", "  ../../a"))
+    with pytest.raises(FormatError, match="leads out"):
+        read_sums(path)
+    path.write_bytes(b"\xff")
+    with pytest.raises(FormatError, match="decode"):
+        read_sums(path)
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-@pytest.mark.parametrize("shape", [(), (0, 3), (5,), (2, 3, 4, 3)])
-def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: Any, shape: Any) -> None:
-    for dtype in (np.uint8, np.float16, np.float32):
-        array = np.ones(shape, dtype, order)
-        write_array(tmp_path / "a.npy", array)
-        np.save(tmp_path / "b.npy", np.asarray(array, order="C"))
-        assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
+@pytest.mark.parametrize(
+    "text", ['{"a": NaN}', '{"a": -Infinity}', '{"a": 1e999}', '{"a": ' + "9" * 5000 + "}", "\xff"]
+)
+def test_json_holds_finite_numbers_alone(text: str) -> None:
+    with pytest.raises(FormatError, match="here: not JSON"):
+        parse_json(text.encode("latin-1"), "here")
 
 
-def test_a_full_disk_is_told_as_the_system_does() -> None:
-    with pytest.raises(OSError, match="No space left") as caught:
-        write_array(Path("/dev/full"), np.zeros(10**6, np.uint8))
-    assert caught.value.errno == errno.ENOSPC
+def test_json_has_a_bounded_depth() -> None:
+    def nested(depth: int) -> bytes:
+        return b'{"a":' + b"[" * (depth - 1) + b"]" * (depth - 1) + b"}"
+
+    assert parse_json(nested(64), "here")
+    for depth in (66, 5_000, 500_000):
+        with pytest.raises(FormatError, match="here: not JSON"):
+            parse_json(nested(depth), "here")
+    many = b'{"a":[' + b"{}," * 1000 + b"{}]}"
+    assert len(parse_json(many, "here")["a"]) == 1001
 
 
 def test_a_lock_is_held_by_one(tmp_path: Path) -> None:

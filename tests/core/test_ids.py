@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from robomme_interference_data import EpisodeId
 from robomme_interference_data.constants import FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
-from robomme_interference_data.ids import format_numbers, parse_numbers
+from robomme_interference_data.ids import count_numbers, format_numbers, parse_numbers
 
 IDS = st.builds(
     EpisodeId,
@@ -72,6 +72,7 @@ def test_numbers_round_trip(numbers: set[int]) -> None:
 )
 def test_numbers(text: str, numbers: tuple[int, ...]) -> None:
     assert parse_numbers(text) == numbers
+    assert count_numbers(text) in (len(numbers), len(numbers) + 1)  # 5 comes twice in one of them
 
 
 @pytest.mark.parametrize(
@@ -80,3 +81,5 @@ def test_numbers(text: str, numbers: tuple[int, ...]) -> None:
 def test_what_is_no_list_of_numbers(text: str) -> None:
     with pytest.raises(InvalidOptionError, match="not a list of episode numbers"):
         parse_numbers(text)
+    with pytest.raises(InvalidOptionError, match="not a list of episode numbers"):
+        count_numbers(text)

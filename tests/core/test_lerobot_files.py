@@ -126,7 +126,8 @@ def test_any_template_is_filled_or_one_clear_error(template: str) -> None:
         ("/etc/passwd", "leads out of it"),
         ("videos/../../outside.mkv", "leads out of it"),
         ("videos/\ud800.mkv", "is no path"),
-        ("x" * 5000, "is too long"),
+        ("x" * 1000, "is too long"),
+        ("{file_index}" * 500, "_path is '"),
         ("linked.mkv", "is a link that leads out of the folder"),
     ],
 )
@@ -154,15 +155,24 @@ def test_a_link_that_goes_round_is_missing(root: Path) -> None:
 INFO = {
     "codebase_version": ("v2.0", ["v3.0"]),
     "features": (None, {"state": "float32"}),
-    "fps": ("10", float("nan"), None),
+    "fps": ("10", float("nan"), None, 1e-300, 1e300),
     "total_episodes": ("3", -1, 2, 10**12),
-    "chunks_size": (0,),
-    "data_path": (None,),
-    "video_path": (7,),
+    "chunks_size": (0, 10**30),
+    "data_path": (None, "{file_index}" * 500),
+    "video_path": (7, "{video_key}" * 500),
 }
 FEATURE = {
     "dtype": (None,),
-    "shape": (None, [100_000, 100_000, 3], [-16, 24, 3], [32, 24, 3], [256], [32, 24, 1]),
+    "shape": (
+        None,
+        [10**4000] * 1000,
+        [1] * 10**6,
+        [100_000, 100_000, 3],
+        [-16, 24, 3],
+        [32, 24, 3],
+        [256],
+        [32, 24, 1],
+    ),
     "info": ("ffv1",),
 }
 

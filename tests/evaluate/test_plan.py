@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import (
+    FormatError,
+    InvalidIdError,
+    InvalidOptionError,
+    UnknownNameError,
+)
+from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.plan import Plan, WorkItem, plan_work, shuffle_work
 from robomme_interference_data.ids import EpisodeId
 
@@ -105,3 +111,21 @@ def test_the_shuffle_depends_on_nothing_but_the_episodes(order: list[int]) -> No
     assert [item.episode.index for item in shuffled] == [1, 9, 5, 0, 8, 10, 6, 3, 2, 7, 11, 4]
     kept = [item for item in shuffled if item.episode.index % 3]
     assert list(shuffle_work(kept)) == kept  # the order of two never depends on a third
+
+
+def test_a_header_plans_no_more_than_can_be_listed() -> None:
+    conditions = tuple(f"k{k}" for k in range(64))
+    plans = tuple(Plan({"MoveCube/test": f"0-{16_000 + n}"}, conditions) for n in range(2))
+    assert plans[0].most == 64 * 16_001
+    assert RunHeader(1, {}, "split", plans[:1]).plans == plans[:1]
+    with pytest.raises(FormatError, match="rollouts; expected at most"):
+        RunHeader(1, {}, "split", plans)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [({"MoveCube/none": "1"}, ["k0"]), ({"MoveCube/test": "x"}, ["k0"]), ({}, ["k0", "k0"])],
+)
+def test_a_plan_that_is_none_is_refused_when_it_is_made(given: tuple[Any, Any]) -> None:
+    with pytest.raises((InvalidIdError, InvalidOptionError)):
+        Plan(given[0], tuple(given[1]))

@@ -19,7 +19,7 @@ from robomme_interference_data.errors import (
     MissingIndexError,
     StaleIndexError,
 )
-from robomme_interference_data.files import format_sums, parse_sums, sha256_file
+from robomme_interference_data.files import format_sums, read_sums, sha256_file
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.selector import Selector
 
@@ -108,7 +108,7 @@ def test_what_something_else_made(whole: Path, factor: float, columns: int, said
     folder = whole / FOLDER
     path, sums, header = folder / episode_file(0), folder / "SHA256SUMS", folder / "index.json"
     np.save(path, np.load(path)[:, :columns] * np.float16(factor))
-    names, before = parse_sums(sums.read_text(), sums), sha256_file(sums)
+    names, before = read_sums(sums), sha256_file(sums)
     sums.write_text(format_sums(folder, names))
     header.write_text(header.read_text().replace(before, sha256_file(sums)))
     with pytest.raises(FormatError, match=said):

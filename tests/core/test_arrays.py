@@ -1,0 +1,71 @@
+"""Arrays in files: as numpy writes them, and nothing else is read."""
+
+import errno
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from robomme_interference_data.arrays import read_array, write_array
+from robomme_interference_data.errors import FormatError
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("shape", [(), (0, 3), (5,), (2, 3, 4, 3)])
+def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: Any, shape: Any) -> None:
+    for dtype in (np.uint8, np.float16, np.float32):
+        array = np.ones(shape, dtype, order)
+        write_array(tmp_path / "a.npy", array)
+        np.save(tmp_path / "b.npy", np.asarray(array, order="C"))
+        assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
+
+
+def test_a_full_disk_is_told_as_the_system_does() -> None:
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_array(Path("/dev/full"), np.zeros(10**6, np.uint8))
+    assert caught.value.errno == errno.ENOSPC
+
+
+@given(st.sampled_from([np.uint8, np.float16, np.float32]), st.data())
+def test_what_is_written_is_read(tmp_path_factory: Any, dtype: Any, data: st.DataObject) -> None:
+    shape = data.draw(hnp.array_shapes(min_dims=1, max_dims=4, min_side=0, max_side=5))
+    array = data.draw(hnp.arrays(dtype, shape, elements=hnp.from_dtype(np.dtype(np.uint8))))
+    path = tmp_path_factory.mktemp("arrays") / "a.npy"
+    write_array(path, array)
+    for wanted in (shape, (-1, *shape[1:])):
+        found = read_array(path, dtype, wanted)
+        assert found.dtype == dtype and found.shape == shape and np.array_equal(found, array)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.ones((2, 8), np.float32), "holds <f4 of shape \\(2, 8\\)"),
+        (np.ones((2, 7), np.float16), "of shape \\(2, 7\\)"),
+        (np.ones(8, np.float16), "of shape \\(8,\\)"),
+        (np.ones((8, 2), np.float16).T, "its header is"),
+        (np.ones((2, 8), ">f2"), "its header is"),
+        (np.zeros((2, 8), [("a", "<f2")]), "its header is"),
+        (np.float16(1), "its header is"),
+        (np.array([[None]]), "its header is"),
+    ],
+)
+def test_other_arrays_are_refused(tmp_path: Path, array: Any, message: str) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, array)
+    with pytest.raises(FormatError, match=message):
+        read_array(path, np.float16, (-1, 8))
+
+
+def test_a_file_is_as_long_as_its_header_says(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    write_array(path, np.ones((2, 8), np.float16))
+    data = path.read_bytes()
+    for wrong in (data[:-1], data + b"\0", data[:128], data[:100], data[:9], b""):
+        path.write_bytes(wrong)
+        with pytest.raises(FormatError, match="a.npy"):
+            read_array(path, np.float16, (-1, 8))

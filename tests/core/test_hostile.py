@@ -1,0 +1,249 @@
+"""A split from a stranger is data: whatever a file holds, reading it ends, within bounds."""
+
+import json
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.bombs import BOMBS
+from support.hostile import TARGETS, mutated, places
+from support.splits import (
+    GOLDEN,
+    QUERIES,
+    contents,
+    copy_split,
+    expected_frames,
+    with_sessions,
+)
+
+from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.records import BufferManifest, SessionEntry
+from robomme_interference_data.rows import from_dict, to_dict
+
+MEGABYTES = 700
+"""What reading a bomb may add to the memory of a process: the largest frame that is read, more than
+once, and the threads of libraries. Each bomb asks for more, or is refused at once."""
+
+_CHILD = """
+import json, resource, sys
+from pathlib import Path
+
+import av, numpy, pyarrow.compute, pyarrow.parquet
+from support.bombs import read
+
+from robomme_interference_data.errors import InterferenceError
+
+def size(field):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(field)).split()[1]) // 1024
+
+limit = size("VmSize") + int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_AS, (limit << 20, limit << 20))
+for line in Path(sys.argv[1]).read_text().splitlines():
+    name, kind, path = json.loads(line)
+    try:
+        read(kind, Path(path))
+        told = "nothing was wrong"
+    except InterferenceError as error:
+        told = error.message
+    print(json.dumps([name, told]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What reading each bomb says, in one process that gets little memory."""
+    folder = tmp_path_factory.mktemp("bombs")
+    lines = []
+    for number, (name, (kind, write)) in enumerate(BOMBS.items()):
+        path = folder / f"{number}"
+        write(path)
+        lines.append(json.dumps([name, kind, str(path)]))
+    (folder / "list").write_text("\n".join(lines))
+    done = subprocess.run(
+        [sys.executable, "-c", _CHILD, str(folder / "list"), str(MEGABYTES)],
+        env={"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return dict(map(json.loads, done.stdout.splitlines()))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("one text many times", "once decoded"),
+        ("many equal numbers", "83,886,080 rows"),
+        ("compressed noughts", "once decoded"),
+        ("a page that lies", "values; 16384 are told"),
+        ("common prefixes", "common prefixes"),
+        ("many row groups", "cannot be read"),
+        ("large metadata", "bytes of metadata"),
+        ("a billion frames", "it declares 1000000000 frames"),
+        ("large frames", "decoding stopped"),
+        ("larger than told", "decoding stopped"),
+        ("a playlist", "no MP4, Matroska or AVI file"),
+        ("a list of files", "no MP4, Matroska or AVI file"),
+        ("long", "at most"),
+        ("deep", "not JSON"),
+        ("deep, but read by Python", "inside each other"),
+        ("sparse", "at most"),
+        ("sparse sums", "at most"),
+        ("sparse rows", "at most"),
+        ("a header alone", "and 0 bytes follow"),
+        ("an archive", "no array"),
+        ("pickled", "its header is"),
+        ("a large image", "an image is damaged"),
+    ],
+)
+def test_a_bomb_is_refused_before_it_goes_off(
+    told: dict[str, str], name: str, message: str
+) -> None:
+    assert message in told[name]
+
+
+def test_every_bomb_has_its_message(told: dict[str, str]) -> None:
+    assert told.keys() == BOMBS.keys()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"repeat": 2**40},
+        {"stop": 2**62},
+        {"start": 0, "stop": 2**18 + 1},
+        {"start": -1},
+        {"repeat": 0},
+    ],
+)
+def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> None:
+    session = to_dict(load_buffer(QUERIES[0], "k1", split=GOLDEN).manifest.sessions[0])
+    assert from_dict(SessionEntry, session, "here")
+    with pytest.raises(FormatError, match="here: .*session span"):
+        from_dict(SessionEntry, session | change, "here")
+
+
+@pytest.mark.parametrize("change", [{"repeat": 2**13}, {"repeat": 1}])
+def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, int]) -> None:
+    manifest = to_dict(load_buffer(QUERIES[0], "k1", split=GOLDEN).manifest)
+    many = [manifest["sessions"][1] | change] * (2**13 // change["repeat"])
+    with pytest.raises(FormatError, match="in .* sessions; expected at most"):
+        from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
+
+
+@pytest.mark.parametrize("called", ["../../written", "/written", "0" * 64, "", "x\0"])
+def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, called: str) -> None:
+    """Else a split could write elsewhere, or give another one its frames."""
+    root = copy_split(tmp_path / "split")
+    path = root / "distractors/meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(path).to_pylist()
+    for row in rows:
+        row["feature_sha256"]["observation.images.front"] = called
+    pq.write_table(pa.Table.from_pylist(rows), path)
+    before = contents(tmp_path)
+    cache = tmp_path / "cache" / "inner"
+    for _ in range(2):
+        buffer = load_buffer(QUERIES[0], "k1", split=root, cache=cache)
+        expected = expected_frames(buffer.manifest.sessions, "front")
+        assert np.array_equal(buffer.frames(), expected)
+        streamed = [chunk.frames["front"] for chunk in buffer.stream(cameras=["front"])]
+        assert np.array_equal(np.concatenate(streamed), expected)
+    assert len(list(cache.iterdir())) == 1  # the lesson, which is called as it should be
+    assert {name for name in contents(tmp_path) if not name.startswith("cache/")} == set(before)
+
+
+def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
+    root = copy_split(tmp_path / "split")
+    info = root / "demonstrations/meta/info.json"
+    told = json.loads(info.read_text())
+    told["features"]["observation.images.front"]["shape"] = [4096, 4096, 3]
+    info.write_text(json.dumps(told))
+    buffer = load_buffer(QUERIES[0], "k7", split=root)
+    short = load_buffer(QUERIES[0], "no-history", split=root)
+    assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
+    with pytest.raises(FormatError, match="pixels; the dataset's info.json says 4096×4096"):
+        buffer.frames()
+    assert short.frames().shape == (0, 4096, 4096, 3)
+    many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)
+    held = Buffer(many, buffer.query, load_split(root).datasets)
+    with pytest.raises(FormatError, match="are held at once") as caught:
+        held.frames()
+    assert "stream" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_sound_file_is_read(tmp_path: Path, name: str) -> None:
+    target, root = TARGETS[name], places(tmp_path)
+    for data in target.sound(root):
+        assert target(root, data) is None
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_damaged_file_ends_in_an_error_or_a_sound_value(
+    tmp_path_factory: pytest.TempPathFactory, name: str
+) -> None:
+    target, root = TARGETS[name], places(tmp_path_factory.mktemp("places"))
+    sound, refused = target.sound(root), []
+
+    @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+    @given(st.integers(0, 2**32))
+    def check(seed: int) -> None:
+        error = target(root, mutated(sound, random.Random(seed)))
+        refused.append(error is not None)
+
+    check()
+    assert any(refused)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("index", b'"two-sums"', b'"\\ud800"'),
+        ("index", b'"size": 3', b'"size": 9999999'),
+        ("record", b'"goal":"', b'"goal":"\\udfff'),
+        ("record", b'"attempt":1', b'"attempt":99999999999999999999'),
+        ("run", b'"episodes": {', b'"episodes": {"MoveCube/val": "0-99999999",'),
+        ("manifest", b'"seed": 0', b'"seed": 99999999999999999999'),
+        ("manifest", b'"seed": 0', b'"seed": ' + b"9" * 5000),
+    ],
+)
+def test_values_that_were_too_much_once(
+    tmp_path: Path, name: str, before: bytes, after: bytes
+) -> None:
+    target, root = TARGETS[name], places(tmp_path)
+    [sound] = target.sound(root)
+    assert before in sound
+    assert isinstance(target(root, sound.replace(before, after, 1)), FormatError)
+
+
+def test_half_a_character_in_a_header(tmp_path: Path) -> None:
+    target, root = TARGETS["manifest"], places(tmp_path)
+    [sound] = target.sound(root)
+    assert target(root, sound.replace(b'"k7"', b'"\\ud800"')) is None
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_of_a_file_any_part_may_be_missing(tmp_path: Path, name: str) -> None:
+    target, root = TARGETS[name], places(tmp_path)
+    for data in target.sound(root):
+        for share in range(8):
+            target(root, data[: len(data) * share // 8])
+
+
+def test_messages_are_short_and_show_what_a_terminal_would_obey() -> None:
+    error = FormatError.damaged("a\x1b[2Jb", "x" * 10_000 + "\n")
+    assert str(error).startswith(r"a\x1b[2Jb: xxx")
+    assert len(str(error)) < 5_000
+    assert "(10,009 characters)" in str(error)

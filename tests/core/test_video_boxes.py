@@ -1,0 +1,108 @@
+"""What video files declare is bounded before FFmpeg sees them; sound ones are let through."""
+
+import struct
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from support.splits import GOLDEN
+
+from robomme_interference_data.errors import FormatError, InterferenceError
+from robomme_interference_data.video import iter_frames
+from robomme_interference_data.video_boxes import find_container
+
+VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
+
+
+def box(kind: bytes, *parts: bytes) -> bytes:
+    body = b"".join(parts)
+    return struct.pack(">I", 8 + len(body)) + kind + body
+
+
+def table(kind: bytes, *numbers: int) -> bytes:
+    """A table after its version and flags."""
+    return box(kind, bytes(4), *(struct.pack(">I", number) for number in numbers))
+
+
+def video(path: Path, *boxes: bytes) -> Path:
+    path.write_bytes(box(b"ftyp", b"isom", bytes(4)) + b"".join(boxes))
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "a.avi"])
+@pytest.mark.parametrize("fragmented", [False, True])
+def test_what_writers_make_is_read(tmp_path: Path, name: str, fragmented: bool) -> None:
+    flags = {"movflags": "frag_keyframe+empty_moov"} if fragmented and name[2] == "m" else {}
+    with av.open(str(tmp_path / name), "w", options=flags) as container:
+        stream = container.add_stream("mjpeg", rate=10)
+        stream.pix_fmt, stream.height, stream.width = "yuvj444p", 16, 32
+        for _ in range(20):
+            image = av.VideoFrame.from_ndarray(np.zeros((16, 32, 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(image))
+        container.mux(stream.encode(None))
+    found = {".mp4": "mp4", ".mov": "mp4", ".mkv": "matroska", ".avi": "avi"}
+    assert find_container(tmp_path / name) == found[(tmp_path / name).suffix]
+    assert len(list(iter_frames(tmp_path / name, 0, None, 10, (16, 32, 3)))) == 20
+
+
+@pytest.mark.parametrize(
+    ("boxes", "said"),
+    [
+        ([box(b"moov", table(b"stsz", 100, 1 << 23))], "declares 8388608 frames"),
+        ([box(b"moov", table(b"stz2", 8, 1 << 23))], "declares 8388608 frames"),
+        ([table(b"trun", 1 << 22), table(b"trun", 1 << 22)], "declares 8388608 frames"),
+        ([box(b"free", table(b"stsz", 100, 1 << 23))], "declares 8388608 frames"),
+        ([box(b"moov", table(b"stsz", 1, 1 << 20), table(b"elst", 9))], "and 9 edits"),
+        ([table(b"stco", 1 << 16), table(b"stsc", 1, 1, 1 << 17, 1)], "pieces of up to 131072"),
+        ([table(b"stsc", 1 << 23)], "too many tables"),
+        ([box(b"moov", table(b"elst", 0) * (1 << 18))], "too many tables"),
+        ([box(b"moov", box(b"cmov"))], "is compressed"),
+        ([box(b"moof") * (1 << 18)], "parts"),
+    ],
+)
+def test_what_declares_too_much(tmp_path: Path, boxes: list[bytes], said: str) -> None:
+    with pytest.raises(FormatError, match=said):
+        find_container(video(tmp_path / "a.mp4", *boxes))
+
+
+def test_what_hides_behind_a_wrong_size_is_looked_at(tmp_path: Path) -> None:
+    hidden = table(b"stsz", 100, 1 << 23)
+    for size in (0, 3, 1 << 30):
+        wrong = struct.pack(">I", size) + b"moov" + hidden
+        with pytest.raises(FormatError, match="declares"):
+            find_container(video(tmp_path / "a.mp4", wrong))
+
+
+def test_frames_themselves_are_not_looked_at(tmp_path: Path) -> None:
+    looks_like = box(b"mdat", table(b"stsz", 100, 1 << 23))
+    assert find_container(video(tmp_path / "a.mp4", looks_like)) == "mp4"
+    large = struct.pack(">I4sQ", 1, b"mdat", 16 + 8) + b"stsz" + bytes(4)
+    assert find_container(video(tmp_path / "a.mp4", large)) == "mp4"
+
+
+def test_a_cut_video_is_an_error_wherever_it_is_cut(tmp_path: Path) -> None:
+    data = VIDEO.read_bytes()
+    for length in range(0, len(data) - 70, 311):
+        (tmp_path / "a.mp4").write_bytes(data[:length])
+        with pytest.raises(InterferenceError):
+            list(iter_frames(tmp_path / "a.mp4", 0, 49, 10, (32, 32, 3)))
+
+
+@pytest.mark.parametrize(
+    "start", [b"#EXTM3U\n", b"ffconcat version 1.0\n", b"GIF89a", b"%!PS", b""]
+)
+def test_other_formats_of_ffmpeg_are_left_aside(tmp_path: Path, start: bytes) -> None:
+    (tmp_path / "a.mp4").write_bytes(start + bytes(100))
+    with pytest.raises(FormatError, match="no MP4, Matroska or AVI file"):
+        find_container(tmp_path / "a.mp4")
+
+
+def test_a_codec_that_is_not_used_is_not_decoded(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("mpeg2video", rate=25)
+        stream.pix_fmt, stream.height, stream.width = "yuv420p", 16, 32
+        container.mux(stream.encode(av.VideoFrame(32, 16, "yuv420p")))
+        container.mux(stream.encode(None))
+    with pytest.raises(InterferenceError, match="not a readable video"):
+        list(iter_frames(tmp_path / "a.mkv", 0, None, 25))

@@ -1,0 +1,245 @@
+"""Readers as targets for bytes that anybody may have written, and how such bytes are made.
+
+A target takes the bytes of one file, puts it in its place among sound ones, and reads it. It comes
+back, or raises an `InterferenceError`; anything else is a finding.
+"""
+
+import io
+import random
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from support.recordings import encode_image
+from support.splits import GOLDEN
+
+from robomme_interference_data import load_split
+from robomme_interference_data.arrays import read_array
+from robomme_interference_data.build_dataset.sources.images import decode_image
+from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
+from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.embeddings import EmbeddingIndex
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate.log import read_run
+from robomme_interference_data.evaluate.score.sources import read_part
+from robomme_interference_data.files import LocalFiles, read_sums
+from robomme_interference_data.video import iter_frames
+
+_VIDEO = "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
+_ROWS = "demonstrations/data/chunk-000/file-000.parquet"
+_EPISODES = "demonstrations/meta/episodes/chunk-000/file-000.parquet"
+_MOST_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        path: Where its file lies in a folder of `places`.
+        read: Reads all there, given that folder.
+        seeds: Of sound files, besides the one that lies there.
+    """
+
+    path: str
+    read: Callable[[Path], object]
+    seeds: Callable[[bytes], list[bytes]] = lambda sound: []
+
+    def __call__(self, root: Path, data: bytes) -> InterferenceError | None:
+        """Read given bytes; return the error that they end in, if any."""
+        (root / self.path).write_bytes(data)
+        try:
+            self.read(root)
+        except InterferenceError as error:
+            assert len(str(error)) < 10_000
+            return error
+        return None
+
+    def sound(self, root: Path) -> list[bytes]:
+        """Return the bytes of sound files, given a folder in which all are sound."""
+        kept = (root / self.path).read_bytes()
+        return [kept, *self.seeds(kept)]
+
+
+def places(root: Path) -> Path:
+    """Make a folder in which every target finds its file and what it reads beside it; all sound."""
+    shutil.copytree(GOLDEN, root / "split")
+    shutil.copytree(GOLDEN.parent / "index/golden/index", root / "split/distractors/index")
+    shutil.copytree(GOLDEN.parent / "run", root / "run")
+    (root / "single").mkdir()
+    np.save(root / "single/a.npy", np.ones((3, 8), np.float16))
+    image = encode_image(np.arange(8 * 6 * 3, dtype=np.uint8).reshape(8, 6, 3), "png")
+    (root / "single/a.png").write_bytes(image)
+    shutil.copy(GOLDEN / "demonstrations/meta/SHA256SUMS", root / "single")
+    return root
+
+
+def _header(root: Path) -> None:
+    split = load_split(root / "split")
+    assert len(split.revision) == 64
+    assert split.datasets.keys() == split.header.datasets.keys()
+
+
+def _buffers(root: Path) -> None:
+    split = load_split(root / "split")
+    split.datasets = _sound_datasets(root)
+    assert len(split.families) <= len(split.episode_ids)
+    for manifest in list(split.manifests())[-1:]:
+        buffer = split.load(manifest.episode_id, manifest.condition)
+        assert len(buffer) == len(buffer.session_index) == manifest.history_frames
+
+
+@cache
+def _sound_datasets(root: Path) -> dict[str, Dataset]:
+    """Return datasets of which no file but what is asked of them is read again."""
+    names = ("demonstrations", "distractors")
+    return {name: Dataset(LocalFiles(root / "split" / name)) for name in names}
+
+
+def _dataset(root: Path) -> None:
+    dataset = Dataset(LocalFiles(root / "split/demonstrations"))
+    for index, record in zip(range(_MOST_LISTED), dataset.records(), strict=False):
+        assert dataset.index_of(record.episode_id) in range(len(dataset))
+        assert dataset.lerobot.place(index).length == record.length
+    for camera in dataset.cameras:
+        [frame] = dataset.iter_frames(0, camera, 0, 1)
+        assert frame.shape == dataset.shape(camera)
+
+
+def _rows(root: Path) -> None:
+    dataset = _sound_datasets(root)["demonstrations"]
+    values = dataset.read_vectors(0, "observation.state", 0, 48)
+    assert values.shape == (48, 8)
+    dataset.lerobot.rows(0).table()
+
+
+def _video(root: Path) -> None:
+    path = root / "split" / _VIDEO
+    count = 0
+    for frame in iter_frames(path, 0, 49, 10, (32, 32, 3)):
+        assert frame.shape == (32, 32, 3) and frame.dtype == np.uint8
+        count += 1
+    assert count == 49
+    [_] = iter_frames(path, 30, 31, 10, (32, 32, 3))
+
+
+def _array(root: Path) -> None:
+    found = read_array(root / "single/a.npy", np.float16, (-1, 8))
+    assert found.dtype == np.float16 and found.shape[1:] == (8,)
+
+
+def _index(root: Path) -> None:
+    dataset = _sound_datasets(root)["distractors"]
+    index = EmbeddingIndex(dataset.files, dataset.revision, "thumbnail")
+    assert index.span(0, 0, 1).shape == (1, index.header.size)
+    index.check({index: 32 for index in range(len(dataset))})
+
+
+def _run(root: Path) -> None:
+    header, rows = read_run(root / "run")
+    assert header.planned >= 0 and sum(header.counts.values()) == len(rows)
+
+
+def _record(root: Path) -> None:
+    path = root / "run" / RUN_RECORD
+    with suppress(InterferenceError):  # which is told again below
+        read_part(path, True)
+    read_run(root / "run")
+
+
+def _image(root: Path) -> None:
+    image = decode_image((root / "single/a.png").read_bytes())
+    assert image.ndim == 3 and image.shape[2] == 3
+
+
+def rewritten(data: bytes) -> list[bytes]:
+    """Return a parquet file as others would write it: what is compressed hides all behind it."""
+    table = pq.read_table(pa.BufferReader(data))
+    ways: list[dict[str, Any]] = [
+        {"compression": "none"},
+        {"compression": "none", "use_dictionary": False, "store_schema": False},
+        {"compression": "none", "data_page_version": "2.0", "row_group_size": 7},
+    ]
+    found = []
+    for way in ways:
+        written = io.BytesIO()
+        pq.write_table(table, written, **way)
+        found.append(written.getvalue())
+    return found
+
+
+TARGETS = {
+    "manifest": Target("split/manifests/manifest.json", _header),
+    "buffers": Target("split/manifests/buffers.parquet", _buffers, rewritten),
+    "info": Target("split/demonstrations/meta/info.json", _dataset),
+    "identity": Target("split/demonstrations/meta/interference.json", _dataset),
+    "episodes": Target(f"split/{_EPISODES}", _dataset, rewritten),
+    "rows": Target(f"split/{_ROWS}", _rows, rewritten),
+    "video": Target(f"split/{_VIDEO}", _video),
+    "array": Target("single/a.npy", _array),
+    "image": Target("single/a.png", _image),
+    "sums": Target("single/SHA256SUMS", lambda root: read_sums(root / "single/SHA256SUMS")),
+    "index": Target("split/distractors/index/thumbnail/index.json", _index),
+    "run": Target(f"run/{RUN_HEADER}", _run),
+    "record": Target(f"run/{RUN_RECORD}", _record),
+}
+"""All readers of what strangers write, by name."""
+
+
+_NUMBERS = [0, 1, 127, 128, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1]
+_JSON = [
+    *(b"null", b"true", b"-1", b"1e999", b"NaN", b"9" * 30, b"9" * 5000, b'""', b"[]", b"{}"),
+    *(b'"../../etc/passwd"', b'"\\u0000"', b'"\\ud800"', b"[" * 200, b'"{x.__class__}"', b"0.5"),
+]
+
+
+def mutated(sound: list[bytes], draw: random.Random) -> bytes:
+    """Return a sound file with one to six things wrong in it."""
+    data = bytearray(draw.choice(sound))
+    for _ in range(draw.randint(1, 6)):
+        place = draw.randrange(len(data) + 1)
+        _WAYS[draw.randrange(len(_WAYS))](data, place, draw)
+    return bytes(data[: 1 << 20])
+
+
+def _flip(data: bytearray, place: int, draw: random.Random) -> None:
+    if data:
+        data[place % len(data)] ^= 1 << draw.randrange(8)
+
+
+def _byte(data: bytearray, place: int, draw: random.Random) -> None:
+    if data:
+        data[place % len(data)] = draw.choice((0, 1, 0x7F, 0x80, 0xFF, draw.randrange(256)))
+
+
+def _number(data: bytearray, place: int, draw: random.Random) -> None:
+    size, order = draw.choice((2, 4, 8)), draw.choice(("little", "big"))
+    value = draw.choice(_NUMBERS) & ((1 << 8 * size) - 1)
+    data[place : place + size] = value.to_bytes(size, order)  # type: ignore[arg-type]
+
+
+def _cut(data: bytearray, place: int, draw: random.Random) -> None:
+    del data[place : place + draw.choice((1, 4, 16, 256, len(data)))]
+
+
+def _copy(data: bytearray, place: int, draw: random.Random) -> None:
+    start = draw.randrange(len(data) + 1)
+    data[place:place] = data[start : start + draw.choice((1, 8, 64, 1024))]
+
+
+def _value(data: bytearray, place: int, draw: random.Random) -> None:
+    """Put another value of JSON where one stands."""
+    start = data.find(b":", place) + 1
+    stops = [at for at in (data.find(end, start) for end in (b",", b"}", b"\n")) if at >= 0]
+    if start and stops:
+        data[start : min(stops)] = draw.choice(_JSON)
+
+
+_WAYS = (_flip, _flip, _byte, _byte, _number, _number, _cut, _copy, _value, _value)
