@@ -76,7 +76,7 @@ ELSEWHERE = (
     "simulate ",  # a renderer
     "--source ",  # recordings, or a renderer
     "retrieval_rollouts.csv",  # the released rows
-    "fetch ",  # a Hub
+    "my-units",  # recordings, of which it is made
 )
 """What marks command lines of the pages that need what is not at hand: they are parsed alone."""
 
@@ -86,6 +86,7 @@ BEFORE = {
         f"evaluate --policy replay:{name} --split my-split --out runs/{name}"
         for name in ("window", "framesamp")
     ],
+    "publish.md": ["evaluate --policy replay --split my-split --out my-run --episodes 0"],
 }
 """Runs that pages speak of without making them."""
 
@@ -98,9 +99,13 @@ def test_the_commands_of_the_pages_run(
     tiny_split: Path,
     tmp_path: Path,
     run: Any,
+    login: Any,
+    hub: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """On the golden split, in a world without a renderer, in this process."""
+    """On the golden split, in a world without a renderer, in this process, logged in to a Hub."""
+    login("my-name")
+    push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
     for name in ("my-split", "S"):
         (tmp_path / name).symlink_to(own_split)
     monkeypatch.chdir(tmp_path)
@@ -112,6 +117,8 @@ def test_the_commands_of_the_pages_run(
         given = given.replace("RouteStick", "PatternLock").replace("VideoUnmask/", "VideoRepick/")
         if given.startswith("evaluate "):
             given += " --simulator support.worlds:World"
+        if given.startswith("publish") and "--dry-run" not in given:
+            given += " --yes"
         code, out, err = run(*shlex.split(given))
         assert code == 0, f"{line}\n{out}\n{err}"
 
