@@ -26,6 +26,24 @@ publish(GOLDEN)
 """
 
 
+LOAD = """
+import json, sys
+from datasets import load_dataset
+
+for name in ("buffers", "episodes"):
+    [(split, rows)] = load_dataset(sys.argv[1], name).items()
+    print(json.dumps([name, split, rows["episode_id"][:2], len(rows)]))
+"""
+
+
+def elsewhere(hub: HubServer, *arguments: str) -> subprocess.Popen[str]:
+    """Run Python in a process that takes the server for the Hub from its beginning."""
+    own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"}
+    own["PYTHONPATH"] = str(GOLDEN.parents[1])
+    command = [sys.executable, "-c", *arguments]
+    return subprocess.Popen(command, env=os.environ | own, stdout=subprocess.PIPE, text=True)
+
+
 @pytest.fixture(autouse=True)
 def _somebody(login: Callable[..., None]) -> None:
     login("someone")
@@ -55,9 +73,7 @@ def test_publish_after_a_kill(hub: HubServer) -> None:
         killed.wait(60)
 
     hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=hold)
-    own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"}
-    own["PYTHONPATH"] = str(GOLDEN.parents[1])
-    with subprocess.Popen([sys.executable, "-c", PUBLISH], env=os.environ | own) as process:
+    with elsewhere(hub, PUBLISH) as process:
         came = reached.wait(120)
         process.kill()
     killed.set()
@@ -72,6 +88,16 @@ def test_publish_after_a_kill(hub: HubServer) -> None:
         found = files(hub, repo_id, "data-1.0.0")
         assert {path: found[path] for path in held} == held
     assert load_split(UNITS, revision="data-1.0.0").revision == load_split(GOLDEN).revision
+
+
+def test_its_tables_are_loaded_by_name(hub: HubServer) -> None:
+    publish(GOLDEN)
+    with elsewhere(hub, LOAD, UNITS) as process:
+        out, _ = process.communicate(timeout=120)
+    assert [json.loads(line) for line in out.splitlines()] == [
+        ["buffers", "test", ["VideoRepick/test/0"] * 2, 15],
+        ["episodes", "train", ["VideoRepick/train/0", "VideoPlaceOrder/train/0"], 17],
+    ]
 
 
 def test_lerobot_cannot_open_anything(tmp_path: Path) -> None:
