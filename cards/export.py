@@ -3,13 +3,24 @@
 import shutil
 from pathlib import Path
 
+from robomme_interference_data.cards import render
 from robomme_interference_data.cards.publish import demonstrations_of, units_of
 from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.cards.tree import Content, Tree
-from robomme_interference_data.constants import DEMONSTRATIONS, IDENTITY_PATH, MANIFEST_PATH
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    IDENTITY_PATH,
+    INDEX_DIR,
+    MANIFEST_PATH,
+    MANIFESTS,
+)
 from robomme_interference_data.errors import PublishError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file, working
 from robomme_interference_data.split import Split
+
+_CARD = (render.README, render.STRIP, render.CROISSANT)
+_OURS = {"data", "meta", "videos", INDEX_DIR, MANIFESTS, DEMONSTRATIONS, *_CARD}
+"""What stands at the root of an export."""
 
 
 def exported_tree(split: Split, config: PublishConfig) -> Tree:
@@ -42,11 +53,7 @@ def write_tree(tree: Tree, out: Path) -> bool:
         BuildError: Another process writes it.
     """
     there = all_files(out) if out.is_dir() else []
-    ours = {MANIFEST_PATH, IDENTITY_PATH} <= {*there}
-    if (out.exists() and not out.is_dir()) or (there and not ours):
-        raise PublishError(
-            f"{out} is there, and is nothing that was exported", "Give --to another folder."
-        )
+    _check_ours(out, there)
     if there == sorted(tree) and all(_holds(out / path, tree[path]) for path in there):
         return False
     out = out.resolve()
@@ -67,6 +74,21 @@ def write_tree(tree: Tree, out: Path) -> bool:
             shutil.rmtree(made, ignore_errors=True)
         shutil.rmtree(work, ignore_errors=True)
     return True
+
+
+def _check_ours(out: Path, there: list[str]) -> None:
+    """Check that a folder holds an earlier export and nothing else, or nothing.
+
+    Raises:
+        PublishError: It holds something else, such as a `.git`, or is no folder.
+    """
+    ours = {MANIFEST_PATH, IDENTITY_PATH} <= {*there}
+    others = [path for path in there if path.split("/")[0] not in _OURS]
+    if others or (there and not ours) or (out.exists() and not out.is_dir()):
+        what = f", but {others[0]}" if others else ""
+        raise PublishError(
+            f"{out} is there, and is nothing that was exported{what}", "Give --to another folder."
+        )
 
 
 def _holds(path: Path, content: Content) -> bool:

@@ -68,13 +68,17 @@ def test_a_second_time_changes_nothing(tmp_path: Path) -> None:
     assert contents(tmp_path / "out") == before
 
 
-@pytest.mark.parametrize("other", ["file", "folder"])
+@pytest.mark.parametrize("other", ["file", "split", ".git/config", "LICENSE"])
 def test_what_is_something_else_is_kept(tmp_path: Path, other: str) -> None:
     out = tmp_path / "out"
-    if other == "folder":
+    if other == "split":
         copy_split(out)
-    else:
+    elif other == "file":
         out.write_bytes(b"mine")
+    else:
+        export(GOLDEN, out, version="1.0.1")
+        (out / other).parent.mkdir(exist_ok=True)
+        (out / other).write_bytes(b"mine")
     before = contents(tmp_path)
     with pytest.raises(PublishError, match="nothing that was exported"):
         export(GOLDEN, out)
