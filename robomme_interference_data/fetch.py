@@ -1,5 +1,6 @@
 """Bring a split from the Hub to this machine, or the part of it that some buffers need."""
 
+import filecmp
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -110,10 +111,10 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
     if to is None:
         return
     for part in parts:
-        for path, size in part.sizes.items():
+        for path in part.sizes:
             if part.folder or path != MANIFEST_PATH:
-                _copy(part.files.path(path), to / part.folder / path, size)
-    _copy(header, to / MANIFEST_PATH, header.stat().st_size)
+                _copy(part.files.path(path), to / part.folder / path)
+    _copy(header, to / MANIFEST_PATH)
 
 
 def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
@@ -162,7 +163,7 @@ def _paths(
         yield from (f"{folder}/{name}" for name in own)
 
 
-def _copy(source: Path, target: Path, size: int) -> None:
-    if not target.is_file() or target.stat().st_size != size:
+def _copy(source: Path, target: Path) -> None:
+    if not target.is_file() or not filecmp.cmp(source, target, shallow=False):
         with atomic_path(target) as partial:
             shutil.copyfile(source, partial)
