@@ -5,7 +5,8 @@ Each area has its own commands file; only this one sees all of them.
 
 import os
 import sys
-from typing import Any
+from importlib import metadata
+from typing import Annotated, Any
 
 import typer
 
@@ -87,6 +88,23 @@ _GROUPS = {
     ),
 }
 """Commands in the order in which one uses them."""
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"robomme-interference {metadata.version('robomme-interference-data')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
+    ] = False,
+) -> None:
+    pass
+
 
 for _commands in _GROUPS.values():
     for _name, _command in _commands:

@@ -65,6 +65,24 @@ def test_manifests() -> None:
 
 
 @pytest.mark.slow
+def test_hub(tiny_split: Path) -> None:
+    options = ("--queries", "9", "--units", "9", "--latency", "1")
+    loading, metadata, fetching, publishing = printed("hub", "--split", tiny_split, *options)
+    # Numbers and a video of eight sessions: the Hub tells where a file is, then sends it.
+    assert [row["requests for files"] for row in loading] == ["32", "32"]
+    assert [row["requests again"] for row in loading] == ["0", "0"]
+    (ratio,) = [row["× spans"] for row in loading if row["× spans"]]
+    assert float(ratio) > 1  # a file is more than the packets in it
+    tables = [row for row in metadata if "/episodes/" in row["file"]]
+    assert all(0 < float(row["statistics"]) < float(row["kB"]) for row in tables)
+    # Numbers and two videos of each of 18 episodes.
+    assert {row["files of episodes"] for row in fetching} == {"54"}
+    # A commit a repository; nothing is sent the second time.
+    assert [row["commits"] for row in publishing] == ["2", "0", "3"]
+    assert publishing[1]["bytes sent"] == "0"
+
+
+@pytest.mark.slow
 def test_policies(tiny_split: Path) -> None:
     split = ("--split", tiny_split, "--episode", "MoveCube/test/0")
     feeding, decoding = printed("policies", "--lesson", "10", *split)

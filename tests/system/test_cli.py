@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from itertools import takewhile
 from pathlib import Path
@@ -21,6 +22,7 @@ from robomme_interference_data import load_split
 from robomme_interference_data.cli import app
 from robomme_interference_data.rows import to_dict
 
+ROOT = Path(__file__).parents[2]
 EPISODE = QUERIES[1]
 SCRIPT = Path(sys.executable).with_name("robomme-interference")
 
@@ -56,6 +58,11 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
         *("Scores", "score", "compare"),
         *("Publish", "card", "publish", "publish-results"),
     ]
+
+
+def test_the_version_is_that_of_the_project_file(run: Run) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert run("--version") == (0, f"robomme-interference {project['version']}\n", "")
 
 
 GROUPS = ("Data", "Look", "Retrieval", "Rollouts", "Scores", "Publish")

@@ -1,23 +1,16 @@
-"""The distribution holds what the folders hold, and imports go one way."""
+"""Imports go one way, dependencies are pinned, and no file names what it may not."""
 
 import ast
 import re
 import subprocess
 import sys
-import tarfile
-import tomllib
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
-
-ROOT = Path(__file__).parents[2]
-CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-PACKAGE = "robomme_interference_data"
-MAPPING: dict[str, str] = CONFIG["tool"]["setuptools"]["package-dir"]
+from support.package import CONFIG, HEAVY, MAPPING, PACKAGE, ROOT, committable, module_files
 
 # Who may import whom (docs/architecture.md). cli.py may import every area's commands, and
 # anything inside functions.
@@ -29,20 +22,6 @@ MAY_IMPORT = {
     "evaluate": {"core", "simulators", "retrieval", "evaluate"},
     "cards": {"core", "build_dataset", "retrieval", "evaluate", "cards"},
 }
-
-HEAVY = ("torch", "lerobot", "h5py", "matplotlib", "datasets", "pandas", "mani_skill", "sapien")
-HEAVY += ("transformers", "scipy", "jinja2", "gymnasium", "cv2")
-
-
-def module_files() -> dict[str, Path]:
-    """All files of the package by their path in an installed copy."""
-    found = {}
-    for package, folder in MAPPING.items():
-        for path in sorted((ROOT / folder).rglob("*")):
-            relative = path.relative_to(ROOT / folder)
-            if path.is_file() and "__pycache__" not in relative.parts:
-                found[f"{package.replace('.', '/')}/{relative.as_posix()}"] = path
-    return found
 
 
 def area_of(name: str) -> str:
@@ -142,54 +121,6 @@ def test_the_core_needs_no_heavy_library() -> None:
     assert done.stdout == f"{len(names)} []\n"
 
 
-BUILD = """
-import sys
-from setuptools import build_meta
-build = build_meta.build_sdist if sys.argv[1] == "sdist" else build_meta.build_wheel
-print(build(sys.argv[2]))
-"""
-
-
-def build(kind: str, tree: Path, out: Path) -> Path:
-    done = subprocess.run(
-        [sys.executable, "-c", BUILD, kind, str(out)],
-        cwd=tree,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return out / done.stdout.splitlines()[-1]
-
-
-def test_the_wheel_holds_every_file_and_one_top_level_name(tmp_path: Path) -> None:
-    expected = module_files()
-    tree = tmp_path / "tree"
-    for path in [*expected.values(), *(ROOT / name for name in ("pyproject.toml", "LICENSE"))]:
-        target = tree / path.relative_to(ROOT)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(path.read_bytes())
-    (tree / "README.md").write_bytes((ROOT / "README.md").read_bytes())
-
-    sdist = build("sdist", tree, tmp_path)
-    with tarfile.open(sdist) as archive:
-        archive.extractall(tmp_path / "unpacked", filter="data")
-    (unpacked,) = (tmp_path / "unpacked").iterdir()
-    for path in expected.values():
-        assert (unpacked / path.relative_to(ROOT)).is_file(), f"{path} is not in the sdist"
-
-    # From the unpacked sdist, as an installer without wheels would.
-    wheel = build("wheel", unpacked, tmp_path)
-    with zipfile.ZipFile(wheel) as archive:
-        names = [name for name in archive.namelist() if ".dist-info/" not in name]
-        assert sorted(names) == sorted(expected)
-        for name, path in expected.items():
-            assert archive.read(name) == path.read_bytes()
-        info = wheel.name.split("-py3")[0] + ".dist-info"
-        assert archive.read(f"{info}/top_level.txt").decode().split() == [PACKAGE]
-        assert f"{info}/licenses/LICENSE" in archive.namelist()
-
-
 def pins() -> dict[str, str]:
     found = {}
     for line in (ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines():
@@ -225,15 +156,11 @@ def test_only_one_opencv_is_pinned() -> None:
 
 def text_files() -> Iterator[tuple[str, str]]:
     """Every file that is or could be committed, as text."""
-    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    for name in filter(None, done.stdout.split("\0")):
-        path = ROOT / name
-        if path.is_file():
-            try:
-                yield name, path.read_text(encoding="utf-8")
-            except UnicodeDecodeError:
-                continue  # a picture or a recording
+    for name in committable():
+        try:
+            yield name, (ROOT / name).read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue  # a picture or a recording
 
 
 def test_no_file_names_a_package_registry() -> None:

@@ -1,0 +1,259 @@
+"""What it costs to load a buffer from the Hub, to fetch a whole split, and to publish one.
+
+The Hub is a server on the loopback interface (tests/support/hub_server.py), every answer of which
+takes longer by a latency; its client is the real one, in fresh processes, whose imports are left
+out, with empty caches. The split of which a buffer is loaded has real videos; the whole one that is
+fetched and published is made up: the number of its files counts, not their size.
+"""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+from statistics import median
+
+import pyarrow.parquet as pq
+from files import packet_bytes
+from load import choose_buffer, demo_split, spans_of
+from loopback_hub import Hub, Run, running
+from made_split import write_split
+from timing import machine, megabytes, positive, table
+
+from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
+from robomme_interference_data.cards.publish import Publisher
+from robomme_interference_data.cards.publish_config import PublishConfig
+from robomme_interference_data.constants import ACTION, EPISODES_PATH, STATE
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.fetch import FetchConfig, fetch, plan_fetch
+
+CONDITIONS = ("k0", "k1", "k3", "k7")
+REAL, WHOLE, PLAIN = "someone/real", "someone/whole", "someone/plain"
+VERSION = "data-1.0.0"
+SPAN_FILES = re.compile(r"/(data|videos)/")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--split", type=Path, help="split to load a buffer of; by default that of make demo"
+    )
+    parser.add_argument("--queries", type=positive, default=450, help="of the made-up split")
+    parser.add_argument("--units", type=positive, default=450, help="of the made-up split")
+    parser.add_argument("--latency", type=positive, default=50, help="of every answer, ms")
+    parser.add_argument("--rounds", type=positive, default=1, help="repetitions")
+    options = parser.parse_args()
+    try:
+        require_lerobot()
+        real = options.split or demo_split()
+        with running(options.latency / 1000) as (hub, folder):
+            print(machine("huggingface-hub"), end="\n\n", flush=True)
+            made = folder / "split"
+            write_split(made, options.queries, options.units, CONDITIONS)
+            published = time_publishing(hub, made, options)
+            hub.run(publish, real, REAL)
+            print(time_loading(hub, real, made, options), end="\n\n", flush=True)
+            print(metadata_table(made, options), end="\n\n", flush=True)
+            print(time_fetching(hub, options), end="\n\n", flush=True)
+            print(published)
+    except InterferenceError as error:
+        sys.exit(str(error))
+
+
+# --- one buffer ----------------------------------------------------------------------------------
+
+
+def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) -> str:
+    """Load one buffer of each split into an empty cache, and again; return the table."""
+    rows = []
+    for name, repo, root in (("real videos", REAL, real), ("made up", WHOLE, made)):
+        split = load_split(root)
+        buffer = choose_buffer(split, None, None)
+        wanted = (repo, str(buffer.episode_id), buffer.condition)
+        runs = []
+        for _ in range(options.rounds):
+            hub.fresh_cache()
+            runs.append(hub.run(first_frame, *wanted))
+            again = hub.run(first_frame, *wanted)
+        last = runs[-1].asked
+        files = [one for one in last if SPAN_FILES.search(one.path)]
+        bytes_of_files = sum(one.sent for one in files)
+        ratio = f"{bytes_of_files / span_bytes(buffer, root):.2f}" if repo == REAL else ""
+        rows.append(
+            [
+                f"{name}, {len(split):,} buffers",
+                f"{len(last) - len(files)}",
+                f"{(runs[-1].received - bytes_of_files) / 1e3:,.0f}",
+                f"{len(files)}",
+                megabytes(bytes_of_files),
+                ratio,
+                f"{median(run.seconds for run in runs):.1f}",
+                f"{len(again.asked)}",
+                f"{again.seconds:.1f}",
+            ]
+        )
+    title = (
+        f"One buffer under {buffer.condition}, front camera, {len(buffer.sessions)} sessions: "
+        "metadata (headers, manifests, episode tables; aim ≤ 300 kB), files of its sessions and how "
+        "many times the bytes of its spans they are (aim ≤ 1.1), seconds to the first frame, into "
+        f"an empty cache and again; {_rounds(options)}."
+    )
+    columns = ("<split", ">requests for metadata", ">kB", ">requests for files", ">MB", ">× spans")
+    columns += (">s", ">requests again", ">s again")
+    return table(title, columns, rows)
+
+
+def first_frame(repo: str, episode: str, condition: str) -> None:
+    """Load a buffer and decode its first frame."""
+    buffer = load_buffer(episode, condition, split=repo, revision=VERSION, cameras=["front"])
+    next(iter(buffer.stream(1, cameras=("front",))))
+
+
+def span_bytes(buffer: Buffer, root: Path) -> int:
+    """Return the bytes of the front video packets and the numbers of a buffer's spans."""
+    split = load_split(root)
+    inside = sum(packet_bytes(span) for span in spans_of(buffer, split))
+    for session in buffer.sessions:
+        entry, dataset = session.entry, split.datasets[session.entry.dataset]
+        for feature in {STATE, ACTION} & dataset.features.keys():
+            numbers = dataset.read_vectors(entry.episode_index, feature, entry.start, entry.stop)
+            inside += numbers.nbytes
+    return inside
+
+
+def metadata_table(made: Path, options: argparse.Namespace) -> str:
+    """Tell what the metadata of the made-up split consists of; return the table."""
+    rows = []
+    for path in sorted(made.glob("manifests/*")):
+        rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size), ""])
+    for folder in sorted(one.parent.parent for one in made.glob("*/meta/info.json")):
+        for path in (folder / EPISODES_PATH, *sorted(folder.glob("meta/in*.json"))):
+            within = statistics_bytes(path) if path.suffix == ".parquet" else 0
+            cells = [_kilobytes(path.stat().st_size), _kilobytes(within) if within else ""]
+            rows.append([path.relative_to(made).as_posix(), *cells])
+    title = (
+        f"Metadata that a buffer needs of the made-up split, {options.queries:,} demonstrations "
+        f"and {options.units:,} units, and how much of it LeRobot's statistics of each episode are."
+    )
+    return table(title, ("<file", ">kB", ">statistics"), rows)
+
+
+def statistics_bytes(path: Path) -> int:
+    """Return how much of an episode table LeRobot's statistics of every episode take."""
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    columns = map(group.column, range(group.num_columns))
+    return sum(c.total_compressed_size for c in columns if c.path_in_schema.startswith("stats/"))
+
+
+# --- a whole split -------------------------------------------------------------------------------
+
+
+def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
+    """Fetch the made-up split by both ways in turn; return the table."""
+    ways = {"robomme-interference fetch": fetch_whole, "snapshot_download": snapshot}
+    runs: dict[str, list[Run]] = {name: [] for name in ways}
+    for number in range(options.rounds):
+        for name in ways if number % 2 == 0 else reversed(ways):
+            hub.fresh_cache()
+            runs[name].append(hub.run(ways[name], WHOLE))
+    ours, plain = runs.values()
+    ratio = median(a.seconds / b.seconds for a, b in zip(ours, plain, strict=True))
+    rows = [
+        [
+            name,
+            f"{sum(bool(SPAN_FILES.search(one.path)) and one.sent > 0 for one in run[-1].asked):,}",
+            f"{len(run[-1].asked):,}",
+            megabytes(run[-1].received),
+            f"{median(one.seconds for one in run):.1f}",
+            f"{ratio:.2f}" if run is ours else "",
+            "≤ 1.1" if run is ours else "",
+        ]
+        for name, run in runs.items()
+    ]
+    title = (
+        f"The made-up split of {options.queries:,} queries × {len(CONDITIONS)} conditions, fetched "
+        f"whole into an empty cache; {_rounds(options)}."
+    )
+    columns = ("<way", ">files of episodes", ">requests", ">MB", ">s", ">ratio", ">aim")
+    return table(title, columns, rows)
+
+
+def fetch_whole(repo: str) -> None:
+    """Fetch a split as the command does."""
+    fetch(plan_fetch(load_split(repo, revision=VERSION), FetchConfig()))
+
+
+def snapshot(repo: str) -> None:
+    """Download the repositories of a split with the Hub's client alone."""
+    from huggingface_hub import snapshot_download
+
+    for name in (f"{repo}-demonstrations", repo):
+        snapshot_download(name, repo_type="dataset", revision=VERSION)
+
+
+# --- publish -------------------------------------------------------------------------------------
+
+
+def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
+    """Publish the made-up split twice, and upload its files plainly; return the table."""
+    hub.fresh_cache()
+    first, again = (hub.run(publish, made, WHOLE) for _ in range(2))
+    plain = hub.run(upload_plainly, made, PLAIN)
+    rows = [
+        [
+            name,
+            f"{sum(one.method == 'PUT' for one in run.asked):,}",
+            f"{sum('/commit/' in one.path for one in run.asked)}",
+            f"{len(run.asked):,}",
+            f"{run.sent:,}",
+            f"{run.seconds:.1f}",
+            "" if run is again else f"{run.seconds / plain.seconds:.2f}",
+            aim,
+        ]
+        for name, run, aim in (
+            ("publish", first, ""),
+            ("publish again", again, "no bytes"),
+            ("upload_folder", plain, ""),
+        )
+    ]
+    files = 3 * (options.queries + options.units)
+    title = (
+        f"The made-up split published, {files:,} files of episodes, without the checks before; "
+        "each once."
+    )
+    columns = ("<way", ">large files", ">commits", ">requests", ">bytes sent", ">s", ">ratio")
+    return table(title, (*columns, ">aim"), rows)
+
+
+def publish(root: Path, repo: str) -> None:
+    """Publish a split as the command does, without its checks."""
+    publisher = Publisher(load_split(root), PublishConfig(repo))
+    publisher.run(publisher.plan())
+
+
+def upload_plainly(root: Path, repo: str) -> None:
+    """Upload the datasets and manifests of a split with the Hub's client alone."""
+    from huggingface_hub import HfApi
+
+    api, kind = HfApi(), {"repo_type": "dataset"}
+    for name in (f"{repo}-demonstrations", repo):
+        api.create_repo(name, **kind)
+    for folder, name, inside in (
+        ("demonstrations", f"{repo}-demonstrations", None),
+        ("distractors", repo, None),
+        ("manifests", repo, "manifests"),
+    ):
+        api.upload_folder(repo_id=name, folder_path=root / folder, path_in_repo=inside, **kind)
+
+
+def _kilobytes(size: float) -> str:
+    return f"{size / 1e3:,.1f}"
+
+
+def _rounds(options: argparse.Namespace) -> str:
+    return f"medians of {options.rounds} rounds; latency {options.latency} ms"
+
+
+if __name__ == "__main__":
+    main()
