@@ -202,8 +202,8 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
         sessions = {one.name: one.sessions(material) for one in reversed(plan.conditions)}
         for condition in plan.conditions:
             entries = sessions[condition.name]
-            placed = place_sessions(entries)
-            frames = placed[-1].stop if placed else 0
+            lessons = place_sessions(entries, "lesson")
+            frames = sum(one.num_frames for one in entries)
             _check_length(plan, record, condition, frames)
             yield BufferManifest(
                 episode_id=record.episode_id,
@@ -215,9 +215,9 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
                 simulator=record.simulator,
                 exact=record.exact
                 and not (lossy and any((one.dataset, one.source) in lossy for one in entries)),
-                lesson_frames=lesson_frames(placed, 0, frames),
+                lesson_frames=lesson_frames(lessons, 0, frames),
                 history_frames=frames,
-                lesson_share=lesson_share(placed, 0, frames),
+                lesson_share=lesson_share(lessons, 0, frames),
                 query=place,
                 sessions=entries,
             )

@@ -228,10 +228,11 @@ class Session:
         return self.entry.source
 
 
-def place_sessions(entries: Sequence[SessionEntry]) -> tuple[Session, ...]:
-    """Return sessions in their places, one after the other."""
+def place_sessions(entries: Sequence[SessionEntry], role: str | None = None) -> tuple[Session, ...]:
+    """Return sessions in their places, one after the other: all, or those of a role."""
     stops = [0, *accumulate(entry.num_frames for entry in entries)]
-    return tuple(map(Session, stops, stops[1:], entries))
+    placed = zip(stops, stops[1:], entries, strict=False)
+    return tuple(Session(*one) for one in placed if role in (None, one[2].role))
 
 
 @dataclass(frozen=True)
