@@ -95,9 +95,9 @@ def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) 
         )
     title = (
         f"One buffer under {buffer.condition}, front camera, {len(buffer.sessions)} sessions: "
-        "metadata (headers, manifests, episode tables; aim ≤ 300 kB), files of its sessions and how "
-        "many times the bytes of its spans they are (aim ≤ 1.1), seconds to the first frame, into "
-        f"an empty cache and again; {_rounds(options)}."
+        "metadata (headers, manifests, episode tables; aim ≤ 300 kB), files of its sessions, how "
+        "many times the bytes of its spans they are (aim ≤ 1.1), and seconds to the first frame, "
+        f"into an empty cache and again; {_rounds(options)}."
     )
     columns = ("<split", ">requests for metadata", ">kB", ">requests for files", ">MB", ">× spans")
     columns += (">s", ">requests again", ">s again")
