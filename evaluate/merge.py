@@ -52,7 +52,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
 
     Raises:
         RunFolderError: A folder holds no run, or another one than the first; `out` is taken.
-        FormatError: Files of a run are damaged.
+        FormatError: Files of a run are damaged, or links that lead out of its folder.
     """
     folders, target = [Path(folder) for folder in shards], Path(out)
     runs = [read_run(folder) for folder in folders]
