@@ -14,6 +14,7 @@ from robomme_interference_data.evaluate.log import (
     read_run,
 )
 from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.records import TIMING_COLUMNS, Rollout
 from robomme_interference_data.rows import to_dict
 
@@ -51,7 +52,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
 
     Raises:
         RunFolderError: A folder holds no run, or another one than the first; `out` is taken.
-        FormatError: Files of a run are damaged.
+        FormatError: Files of a run are damaged, or links that lead out of its folder.
     """
     folders, target = [Path(folder) for folder in shards], Path(out)
     runs = [read_run(folder) for folder in folders]
@@ -78,13 +79,15 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         starts=tuple(start for header in headers for start in header.starts),
         merged=tuple(folder.name for folder in folders),
     )
+    videos = [(folder, row.video) for row, folder in found.values() if row.video]
+    # Nothing that a link stands for comes along.
+    taken = {name: LocalFiles(at).path(name) for at, name in videos if (at / name).exists()}
+    logs = [LocalFiles(at).path(ERRORS_LOG) for at in folders if (at / ERRORS_LOG).exists()]
     with open_log(target, first.identity, first.split) as log:
         log.write_all(row for row, _ in found.values())
-        for row, folder in found.values():
-            if row.video is not None and (folder / row.video).exists():
-                (target / row.video).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(folder / row.video, target / row.video)
-        logs = [folder / ERRORS_LOG for folder in folders if (folder / ERRORS_LOG).exists()]
+        for name, path in taken.items():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target / name)
         if logs:
             (target / ERRORS_LOG).write_bytes(b"".join(path.read_bytes() for path in logs))
         log.end(joined)

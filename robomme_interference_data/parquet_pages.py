@@ -1,8 +1,8 @@
 """What columns of a parquet file take once they are decoded, told before pyarrow reads them.
 
 pyarrow allocates what the header of a page says, and as many values as it tells, whatever the
-file's metadata say of them: from a hundred bytes, sixteen gigabytes. So the headers are read here
-first. pyarrow's own view of the metadata is left aside: it ends the process where they are damaged.
+file's metadata say of them: of 287 bytes, it made 4 GB. So the headers are read here first.
+pyarrow's own view of the metadata is left aside: it ends the process where they are damaged.
 `parquet.thrift` of the format's project describes both.
 """
 

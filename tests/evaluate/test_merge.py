@@ -89,6 +89,11 @@ def test_videos_come_along(tmp_path: Path) -> None:
     assert row.video is not None
     here, there = (tmp_path / name / row.video for name in ("a", "merged"))
     assert here.read_bytes() == there.read_bytes()
+    here.unlink()
+    here.symlink_to(__file__)
+    with pytest.raises(FormatError, match="link that leads out"):
+        merge_runs([tmp_path / "a"], tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_other_runs_and_taken_folders_are_refused(tmp_path: Path) -> None:

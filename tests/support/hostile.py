@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +202,10 @@ _JSON = [
 
 def mutated(sound: list[bytes], draw: random.Random) -> bytes:
     """Return a sound file with one to six things wrong in it."""
-    data = bytearray(draw.choice(sound))
+    chosen = draw.choice(sound)
+    if chosen[:4] == b"PAR1" and draw.random() < 0.3:
+        return _with_other_values(chosen, draw)
+    data = bytearray(chosen)
     for _ in range(draw.randint(1, 6)):
         place = draw.randrange(len(data) + 1)
         _WAYS[draw.randrange(len(_WAYS))](data, place, draw)
@@ -240,6 +243,68 @@ def _value(data: bytearray, place: int, draw: random.Random) -> None:
     stops = [at for at in (data.find(end, start) for end in (b",", b"}", b"\n")) if at >= 0]
     if start and stops:
         data[start : min(stops)] = draw.choice(_JSON)
+
+
+_TEXTS = ("", "x", "../../x", "/x", "\0", "\x1b[2J", "x" * 70_000, "MoveCube/test/0", "lesson")
+
+
+@lru_cache
+def _table(data: bytes) -> pa.Table:
+    """Read a table; its columns may be empty anywhere."""
+    table = pq.read_table(pa.BufferReader(data))
+    fields = [(field.name, _with_gaps(field.type)) for field in table.schema]
+    return pa.Table.from_pylist(table.to_pylist(), pa.schema(fields))
+
+
+def _with_gaps(kind: pa.DataType) -> pa.DataType:
+    if pa.types.is_struct(kind):
+        return pa.struct([(field.name, _with_gaps(field.type)) for field in kind])
+    return pa.list_(_with_gaps(kind.value_type)) if pa.types.is_list(kind) else kind
+
+
+def _with_other_values(data: bytes, draw: random.Random) -> bytes:
+    """Return a parquet file with other values, rows, types or columns: itself, it is sound."""
+    table = _table(data)
+    for _ in range(draw.randint(1, 3)):
+        way, place = draw.randrange(6), draw.randrange(table.num_columns)
+        name, column = table.column_names[place], table.column(place)
+        values = column.to_pylist()
+        if way == 0:
+            table = table.remove_column(place)
+        elif way == 1:
+            table = table.set_column(place, name, pa.nulls(len(table), column.type))
+        elif way == 2:
+            other = draw.choice(([0] * len(table), ["x"] * len(table), [[1.5]] * len(table)))
+            table = table.set_column(place, name, pa.array(other))
+        elif way == 3:
+            rows = [draw.randrange(len(table)) for _ in range(draw.randint(1, 9))]
+            table = table.take(rows)
+        else:
+            row = draw.randrange(len(values))
+            values[row] = _other(values[row], draw)
+            with suppress(pa.ArrowException, OverflowError):
+                table = table.set_column(place, name, pa.array(values, column.type))
+        if not table.num_columns:
+            break
+    written = io.BytesIO()
+    pq.write_table(table, written)
+    return written.getvalue()
+
+
+def _other(value: Any, draw: random.Random) -> Any:
+    """Return another value of the same kind, or none."""
+    if isinstance(value, dict) and value:
+        name = draw.choice(list(value))
+        return value | {name: _other(value[name], draw)}
+    if isinstance(value, list) and value:
+        place = draw.randrange(len(value))
+        changed = [*value[:place], _other(value[place], draw), *value[place + 1 :]]
+        return draw.choice((changed, [], value * draw.choice((2, 9, 600))))
+    if isinstance(value, str):
+        return draw.choice((*_TEXTS, None))
+    if isinstance(value, float):
+        return draw.choice((0.0, -1.0, 1e308, float("nan"), float("inf"), None))
+    return draw.choice((*_NUMBERS[:-1], -1, -(2**63), True, None))
 
 
 _WAYS = (_flip, _flip, _byte, _byte, _number, _number, _cut, _copy, _value, _value)
