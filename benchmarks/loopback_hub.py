@@ -53,6 +53,7 @@ class Hub:
         os.environ |= {
             "HF_ENDPOINT": server.endpoint,
             "HF_HOME": str(folder / "home"),
+            "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0",
             "HF_HUB_DISABLE_PROGRESS_BARS": "1",
             "HF_HUB_DISABLE_TELEMETRY": "1",
             "HF_HUB_DISABLE_XET": "1",
