@@ -5,6 +5,7 @@ and its identity in `meta/interference.json`.
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cached_property
 
 import numpy as np
@@ -58,6 +59,8 @@ class Dataset:
 
     def __init__(self, files: Files):
         self.files = files
+        with suppress(MissingFileError):  # which is told below, as what it means
+            files.fetch((INFO_PATH, IDENTITY_PATH, EPISODES_PATH))
         self.lerobot = LeRobotFiles(files, [EPISODES_PATH])
         try:
             path = files.path(IDENTITY_PATH)
