@@ -47,8 +47,12 @@ def test_wrong_bytes_of_the_right_length(hub: HubServer, path: str) -> None:
 @pytest.mark.parametrize("path", [ROWS, VIDEO])
 @pytest.mark.parametrize(
     "what",
-    [{"drop": 100, "times": 50}, {"cut": 40, "times": 50}, {"status": 500, "times": 50}],
-    ids=["dropped", "truncated", "500"],
+    [
+        # The client tries again for some seconds.
+        pytest.param({"drop": 100, "times": 50}, id="dropped", marks=pytest.mark.slow),
+        pytest.param({"cut": 40, "times": 50}, id="truncated"),
+        pytest.param({"status": 500, "times": 50}, id="500"),
+    ],
 )
 def test_what_does_not_come_whole(hub: HubServer, path: str, what: dict[str, Any]) -> None:
     fault = hub.fault("GET", path, **what)

@@ -184,6 +184,7 @@ def test_a_process_that_was_killed(simulator: RoboMMESimulator) -> None:
         assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
 
+@pytest.mark.slow
 def test_a_hang_is_ended(robomme_python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RoboMMESimulator(robomme_python, answer_s=8) as simulator:
         simulator.reset(f"MoveCube/test/{HANGS}")

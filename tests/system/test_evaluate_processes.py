@@ -134,6 +134,7 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
     assert ended(out) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_simulator_that_hangs_or_takes_its_process_along_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "VideoRepick-0").write_text("die")
     (tmp_path / "MoveCube-0").write_text("hang")

@@ -49,6 +49,7 @@ def _somebody(login: Callable[..., None]) -> None:
     login("someone")
 
 
+@pytest.mark.slow
 def test_what_was_published_is_opened_by_lerobot(
     hub: HubServer, run: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
@@ -65,6 +66,7 @@ def test_what_was_published_is_opened_by_lerobot(
         assert np.array_equal(np.round(frame * 255).astype(np.uint8), stored)
 
 
+@pytest.mark.slow
 def test_publish_after_a_kill(hub: HubServer) -> None:
     reached, killed = threading.Event(), threading.Event()
 
@@ -90,6 +92,7 @@ def test_publish_after_a_kill(hub: HubServer) -> None:
     assert load_split(UNITS, revision="data-1.0.0").revision == load_split(GOLDEN).revision
 
 
+@pytest.mark.slow
 def test_its_tables_are_loaded_by_name(hub: HubServer) -> None:
     publish(GOLDEN)
     with elsewhere(hub, LOAD, UNITS) as process:
