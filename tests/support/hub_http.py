@@ -6,6 +6,7 @@ import re
 import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -146,7 +147,7 @@ class Fault:
 _NONE = Fault("", "")
 
 
-class LoopbackServer:
+class LoopbackServer(ABC):
     """Answers requests one at a time, however many come; `answer` says what.
 
     Attributes:
@@ -192,8 +193,9 @@ class LoopbackServer:
         self._faults.append(Fault(method, path, **what))
         return self._faults[-1]
 
+    @abstractmethod
     def answer(self, request: Request) -> Answer:
-        raise NotImplementedError
+        """Return what is answered."""
 
     @contextmanager
     def running(self) -> Iterator[Self]:
