@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 from statistics import median
 
-import pyarrow.parquet as pq
 from files import packet_bytes
 from load import choose_buffer, demo_split, spans_of
 from loopback_hub import Hub, Run, running
@@ -23,7 +22,7 @@ from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.cards.publish import Publisher
 from robomme_interference_data.cards.publish_config import PublishConfig
-from robomme_interference_data.constants import ACTION, EPISODES_PATH, STATE
+from robomme_interference_data.constants import ACTION, RECORDS_PATH, STATE
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.fetch import FetchConfig, fetch, plan_fetch
 
@@ -126,24 +125,15 @@ def metadata_table(made: Path, options: argparse.Namespace) -> str:
     """Tell what the metadata of the made-up split consists of; return the table."""
     rows = []
     for path in sorted(made.glob("manifests/*")):
-        rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size), ""])
+        rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
     for folder in sorted(one.parent.parent for one in made.glob("*/meta/info.json")):
-        for path in (folder / EPISODES_PATH, *sorted(folder.glob("meta/in*.json"))):
-            within = statistics_bytes(path) if path.suffix == ".parquet" else 0
-            cells = [_kilobytes(path.stat().st_size), _kilobytes(within) if within else ""]
-            rows.append([path.relative_to(made).as_posix(), *cells])
+        for path in (folder / RECORDS_PATH, *sorted(folder.glob("meta/in*.json"))):
+            rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
     title = (
         f"Metadata that a buffer needs of the made-up split, {options.queries:,} demonstrations "
-        f"and {options.units:,} units, and how much of it LeRobot's statistics of each episode are."
+        f"and {options.units:,} units."
     )
-    return table(title, ("<file", ">kB", ">statistics"), rows)
-
-
-def statistics_bytes(path: Path) -> int:
-    """Return how much of an episode table LeRobot's statistics of every episode take."""
-    group = pq.ParquetFile(path).metadata.row_group(0)
-    columns = map(group.column, range(group.num_columns))
-    return sum(c.total_compressed_size for c in columns if c.path_in_schema.startswith("stats/"))
+    return table(title, ("<file", ">kB"), rows)
 
 
 # --- a whole split -------------------------------------------------------------------------------

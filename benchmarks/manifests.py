@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from hashlib import sha256
 from itertools import batched
 from pathlib import Path
 from statistics import median
@@ -29,7 +30,6 @@ from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
-    EPISODES_PATH,
     FAMILIES,
     FPS,
     FRONT,
@@ -37,6 +37,7 @@ from robomme_interference_data.constants import (
     INFO_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
+    RECORDS_PATH,
     STATE,
     UNIT_FRAMES,
     WRIST,
@@ -139,8 +140,7 @@ def write_dataset(root: Path, kind: str, count: int) -> None:
     write_json(root / INFO_PATH, info)
     identity = identity_of(records, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
-    path = root / EPISODES_PATH
-    path.parent.mkdir(parents=True)
+    path = root / RECORDS_PATH
     pq.write_table(to_table(records, arrow_schema(EpisodeRecord, sorted(SHAPES))), path)
 
 
@@ -149,7 +149,7 @@ def made_up(kind: str, index: int) -> EpisodeRecord:
     units = kind == DISTRACTORS
     number, family = divmod(index, len(FAMILIES))
     name = EpisodeId(FAMILIES[family], "train" if units else "test", number)
-    digests = {feature: f"{index:064x}" for feature in SHAPES}
+    digests = {name: sha256(f"{kind} {index} {name}".encode()).hexdigest() for name in SHAPES}
     lesson = 50 + 13 * index % 700
     return EpisodeRecord(
         episode_index=index,

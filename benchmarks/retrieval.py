@@ -34,8 +34,8 @@ from robomme_interference_data.build_dataset.manifests import (
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
-    EPISODES_DIR,
     INFO_PATH,
+    RECORDS_PATH,
 )
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import LocalFiles, read_json, write_json
@@ -134,7 +134,7 @@ def index_table(
     """Time the index of some units against decoding, and against the forward pass."""
     root = folder / DISTRACTORS
     shutil.copytree(split / DISTRACTORS, root, ignore=shutil.ignore_patterns("index"))
-    (path,) = (root / EPISODES_DIR).rglob("*.parquet")
+    path = root / RECORDS_PATH
     few = pq.read_table(path).slice(0, options.units)
     pq.write_table(few, path)
     write_json(root / INFO_PATH, read_json(root / INFO_PATH) | {"total_episodes": len(few)})

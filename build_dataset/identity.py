@@ -2,9 +2,9 @@
 
 LeRobot 0.6 offers no way to hand per-episode columns to its writer, but reads any that stand in
 `meta/episodes`: `LeRobotDatasetMetadata.filter_episodes` can select by them. So they are added
-there, not in a file of their own. LeRobot's tools that merge datasets or change their features and
-tasks carry them along; those that delete episodes or split a dataset drop them, and refuse the
-lossless codec.
+there. LeRobot's tools that merge datasets or change their features and tasks carry them along;
+those that delete episodes or split a dataset drop them, and refuse the lossless codec. What loading
+reads is a copy of that table without LeRobot's statistics, which are most of its bytes.
 """
 
 import hashlib
@@ -27,6 +27,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFESTS,
+    RECORDS_PATH,
     REPORT_PATH,
     STATS_PATH,
     SUMS_PATH,
@@ -120,7 +121,7 @@ def complete_dataset(
 
 
 def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
-    """Rewrite meta/episodes as one file with our columns after LeRobot's."""
+    """Rewrite meta/episodes as one file with our columns after LeRobot's, and its lean copy."""
     paths = sorted((root / EPISODES_DIR).rglob("*.parquet"))
     table = pa.concat_tables([open_parquet(path).read() for path in paths]).combine_chunks()
     table = table.sort_by("episode_index")
@@ -134,8 +135,14 @@ def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
             table = table.append_column(field, own[field.name])
     for path in paths:
         path.unlink()
-    # The file is read whole: of over a hundred columns, what helps to skip rows is a burden.
-    with writing(paths[0]) as file:
+    _write_table(paths[0], table)
+    lean = [name for name in table.column_names if not name.startswith("stats/")]
+    _write_table(root / RECORDS_PATH, table.select(lean))
+
+
+def _write_table(path: Path, table: pa.Table) -> None:
+    """Write a table that is read whole: of over a hundred columns, what skips rows is a burden."""
+    with writing(path) as file:
         pq.write_table(
             table.replace_schema_metadata(None),
             file,

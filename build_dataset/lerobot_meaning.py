@@ -13,12 +13,14 @@ from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
     INFO_PATH,
+    RECORDS_PATH,
     STATS_PATH,
     TASKS_PATH,
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import read_json
+from robomme_interference_data.lerobot_files import LeRobotFiles
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""
@@ -31,6 +33,7 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
         InterferenceError: A file cannot be read.
     """
     yield from _info(dataset)
+    yield from _lean_copy(dataset)
     tasks = dataset.lerobot.tasks
     if list(tasks.values()) != list(range(len(tasks))):
         yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
@@ -66,6 +69,17 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
         except InterferenceError as error:
             yield place.data, error.message
         first += record.length
+
+
+def _lean_copy(dataset: Dataset) -> Iterator[tuple[str, str]]:
+    """Check that what is read of an episode is what LeRobot's own table says."""
+    table = LeRobotFiles(dataset.files).table
+    if dataset.lerobot.table.column_names != table.column_names:
+        yield RECORDS_PATH, f"does not have the columns of {EPISODES_DIR}, without statistics"
+        return
+    for name in table.column_names:
+        if dataset.lerobot.table[name] != table[name]:
+            yield RECORDS_PATH, f"column {name} is not that of {EPISODES_DIR}"
 
 
 def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:

@@ -18,7 +18,7 @@ from robomme_interference_data.cards.metadata import BUFFERS, BUFFERS_FILE, EPIS
 from robomme_interference_data.cards.publication import HUB, OTHER, Publication
 from robomme_interference_data.cards.responsible import origin, responsible
 from robomme_interference_data.cards.results import ResultsFacts
-from robomme_interference_data.constants import EPISODES_PATH, SUMS_PATH
+from robomme_interference_data.constants import RECORDS_PATH, SUMS_PATH
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.files import sha256_file
 from robomme_interference_data.records import BufferManifest, EpisodeRecord
@@ -220,11 +220,11 @@ def _format(path: str) -> str:
 
 def _episodes_file(facts: DatasetFacts, about: Publication) -> dict[str, Any]:
     """Return the table of episodes, which is one file."""
-    digest = facts.dataset.sums().get(EPISODES_PATH)
+    digest = facts.dataset.sums().get(RECORDS_PATH)
     if digest is None:
         where = facts.dataset.files.describe()
-        raise FormatError.damaged(where, f"{EPISODES_PATH} is not in {SUMS_PATH}")
-    return _file(about, EPISODES_PATH, digest)
+        raise FormatError.damaged(where, f"{RECORDS_PATH} is not in {SUMS_PATH}")
+    return _file(about, RECORDS_PATH, digest)
 
 
 def _size(facts: DatasetFacts) -> str:

@@ -4,12 +4,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.constants import EPISODES_DIR, MANIFEST_ROWS, MANIFESTS
+from robomme_interference_data.constants import MANIFEST_ROWS, MANIFESTS
 
 BUFFERS, EPISODES, ROLLOUTS = "buffers", "episodes", "rollouts"
 """Names under which `datasets.load_dataset` gives the tables."""
 
-EPISODES_FILES = f"{EPISODES_DIR}/**/*.parquet"
 BUFFERS_FILE = f"{MANIFESTS}/{MANIFEST_ROWS}"
 
 _TAGS = ("robotics", "robot-memory", "RoboMME", "RoboMME-Interference")

@@ -21,7 +21,6 @@ from robomme_interference_data.cards.metadata import (
     BUFFERS,
     BUFFERS_FILE,
     EPISODES,
-    EPISODES_FILES,
     config,
     front_matter,
 )
@@ -40,6 +39,7 @@ from robomme_interference_data.constants import (
     FPS,
     MAX_STEPS,
     POSITION_LIMIT,
+    RECORDS_PATH,
     UNIT_FRAMES,
     UNIT_MIN_RAW_FRAMES,
     UNIT_STRIDE,
@@ -168,7 +168,7 @@ def _demonstrations_text(facts: DatasetFacts, about: Publication) -> tuple[str, 
         about,
         f"RoboMME-Interference demonstrations: {about.name}",
         facts.frames,
-        [config(EPISODES, facts.split_name, EPISODES_FILES, default=True)],
+        [config(EPISODES, facts.split_name, RECORDS_PATH, default=True)],
         facts.repositories,
         ("LeRobot",),
     )
@@ -208,7 +208,7 @@ def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
         sum(one.frames for one in units.values()),
         [
             config(BUFFERS, facts.split_name, BUFFERS_FILE, default=True),
-            config(EPISODES, facts.units_split, EPISODES_FILES),
+            config(EPISODES, facts.units_split, RECORDS_PATH),
         ],
         facts.repositories,
         ("LeRobot",),

@@ -66,14 +66,14 @@ STATE = "observation.state"
 ACTION = "action"
 CAMERA_PREFIX = "observation.images."
 
-# --- paths inside a dataset (LeRobot v3 layout, plus our three files in meta/) ------------------
+# --- paths inside a dataset (LeRobot v3 layout, plus our four files in meta/) ------------------
 
 INFO_PATH = "meta/info.json"
 TASKS_PATH = "meta/tasks.parquet"
 STATS_PATH = "meta/stats.json"
 EPISODES_DIR = "meta/episodes"
-EPISODES_PATH = f"{EPISODES_DIR}/chunk-000/file-000.parquet"
 IDENTITY_PATH = "meta/interference.json"
+RECORDS_PATH = "meta/interference.parquet"
 REPORT_PATH = "meta/build_report.json"
 SUMS_PATH = "meta/SHA256SUMS"
 INDEX_DIR = "index"

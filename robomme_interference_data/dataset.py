@@ -1,7 +1,8 @@
 """A dataset of history sessions: demonstrations or distractor units, on disk or on the Hub.
 
-A LeRobot dataset in which every episode has files of its own, with our columns in `meta/episodes`
-and its identity in `meta/interference.json`.
+A LeRobot dataset in which every episode has files of its own, with our columns in `meta/episodes`,
+a lean copy of that table in `meta/interference.parquet`, and its identity in
+`meta/interference.json`.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import (
     ACTION,
     CAMERA_PREFIX,
-    EPISODES_PATH,
     IDENTITY_PATH,
     INFO_PATH,
+    RECORDS_PATH,
     STATE,
     SUMS_PATH,
 )
@@ -60,8 +61,8 @@ class Dataset:
     def __init__(self, files: Files):
         self.files = files
         with suppress(MissingFileError):  # which is told below, as what it means
-            files.fetch((INFO_PATH, IDENTITY_PATH, EPISODES_PATH))
-        self.lerobot = LeRobotFiles(files, [EPISODES_PATH])
+            files.fetch((INFO_PATH, IDENTITY_PATH, RECORDS_PATH))
+        self.lerobot = LeRobotFiles(files, [RECORDS_PATH])
         try:
             path = files.path(IDENTITY_PATH)
         except MissingFileError:

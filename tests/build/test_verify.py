@@ -30,6 +30,7 @@ from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.files import sha256_file
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
+RECORDS = "distractors/meta/interference.parquet"
 DATA = "distractors/data/chunk-000/file-003.parquet"
 FRONT = "videos/observation.images.front"
 VIDEO = f"distractors/{FRONT}/chunk-000/file-003.mp4"
@@ -126,7 +127,9 @@ def _expect_of_header(root: Path) -> None:
     assert told or load_split(root).revision != load_split(GOLDEN).revision
 
 
-@pytest.mark.parametrize("path", [EPISODES, DATA, VIDEO, ROWS, "distractors/meta/tasks.parquet"])
+@pytest.mark.parametrize(
+    "path", [EPISODES, RECORDS, DATA, VIDEO, ROWS, "distractors/meta/tasks.parquet"]
+)
 def test_missing_and_cut_files(own_split: Path, path: str) -> None:
     file = own_split / path
     file.write_bytes(file.read_bytes()[:-9])
@@ -191,18 +194,22 @@ def test_links_that_lead_nowhere(own_split: Path) -> None:
         (DATA, first_changed("index", 5), "index of episode 3"),
         (DATA, first_changed("frame_index", 1), "holds 32 rows of episode 3"),
         (DATA, first_changed("episode_index", 4), "episode 3"),
-        (EPISODES, first_changed("dataset_from_index", 7), "dataset_from_index"),
-        (EPISODES, first_changed("dataset_to_index", 7), "dataset_to_index"),
-        (EPISODES, first_changed(f"{FRONT}/to_timestamp", 1.0), "to_timestamp"),
-        (EPISODES, first_changed(f"{FRONT}/from_timestamp", 0.5), "from_timestamp"),
-        (EPISODES, first_changed(f"{FRONT}/file_index", 1), "is shared by"),
-        (EPISODES, first_changed("data/file_index", 1), "is shared by episodes"),
-        (EPISODES, first_changed("tasks", ["another"]), "tasks of"),
-        (EPISODES, first_changed("goals", ["another"]), "revision is"),
-        (EPISODES, first_changed("length", 31), "holds 31 frames, not 32"),
-        (EPISODES, first_changed("exec_start_idx", 7), "exec_start_idx is 7"),
-        (EPISODES, first_changed("seed", 1), "revision is"),
-        (EPISODES, lambda t: t.drop_columns(["feature_sha256"]), "feature_sha256 is missing"),
+        (RECORDS, first_changed("dataset_from_index", 7), "dataset_from_index"),
+        (RECORDS, first_changed("dataset_to_index", 7), "dataset_to_index"),
+        (RECORDS, first_changed(f"{FRONT}/to_timestamp", 1.0), "to_timestamp"),
+        (RECORDS, first_changed(f"{FRONT}/from_timestamp", 0.5), "from_timestamp"),
+        (RECORDS, first_changed(f"{FRONT}/file_index", 1), "is shared by"),
+        (RECORDS, first_changed("data/file_index", 1), "is shared by episodes"),
+        (RECORDS, first_changed("tasks", ["another"]), "tasks of"),
+        (RECORDS, first_changed("goals", ["another"]), "revision is"),
+        (RECORDS, first_changed("length", 31), "holds 31 frames, not 32"),
+        (RECORDS, first_changed("exec_start_idx", 7), "exec_start_idx is 7"),
+        (RECORDS, first_changed("seed", 1), "revision is"),
+        (RECORDS, lambda t: t.drop_columns(["feature_sha256"]), "feature_sha256 is missing"),
+        (RECORDS, lambda t: t.slice(1), "does not list the episodes"),
+        (RECORDS, lambda t: t.drop_columns(["dataset_from_index"]), "does not have the columns of"),
+        (EPISODES, first_changed("dataset_from_index", 7), "dataset_from_index is not that of"),
+        (EPISODES, first_changed("tasks", ["another"]), "tasks is not that of"),
         (EPISODES, lambda t: t.slice(1), "does not list the episodes"),
         (
             "distractors/meta/tasks.parquet",

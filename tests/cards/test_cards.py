@@ -15,7 +15,7 @@ from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.cards import citation
 from robomme_interference_data.cards.metadata import size_category
 from robomme_interference_data.cards.render import CROISSANT, README, STRIP, split_files
-from robomme_interference_data.constants import EPISODES_PATH
+from robomme_interference_data.constants import RECORDS_PATH
 
 NAMES = ("demonstrations", "split", "results")
 ROOT = Path(__file__).parents[2]
@@ -102,8 +102,8 @@ def test_configs(
     ("tree", "name", "split", "file"),
     [
         ("split", "buffers", "test", "manifests/buffers.parquet"),
-        ("split", "episodes", "train", EPISODES_PATH),
-        ("demonstrations", "episodes", "test", EPISODES_PATH),
+        ("split", "episodes", "train", RECORDS_PATH),
+        ("demonstrations", "episodes", "test", RECORDS_PATH),
     ],
 )
 def test_load_dataset_gives_the_rows(

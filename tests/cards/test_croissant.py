@@ -11,7 +11,7 @@ from support.cards import OF_SPLIT
 from robomme_interference_data.cards.columns import columns_of
 from robomme_interference_data.cards.croissant import as_bytes
 from robomme_interference_data.cards.render import CROISSANT
-from robomme_interference_data.constants import EPISODES_PATH
+from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.files import sha256_file
 from robomme_interference_data.records import BufferManifest, EpisodeRecord, Rollout
 from robomme_interference_data.rows import arrow_schema
@@ -71,7 +71,7 @@ def test_the_reference_library_finds_no_fault(published: Path, name: str) -> Non
 
 def test_the_reference_library_reads_the_rows(published: Path) -> None:
     root = published / "split"
-    files = {path: root / path for path in ("manifests/buffers.parquet", EPISODES_PATH)}
+    files = {path: root / path for path in ("manifests/buffers.parquet", RECORDS_PATH)}
     dataset = read(root / CROISSANT, files)
     table = pq.read_table(root / "manifests" / "buffers.parquet")
     rows = list(dataset.records("buffers"))
@@ -79,7 +79,7 @@ def test_the_reference_library_reads_the_rows(published: Path) -> None:
     conditions = [row["buffers/condition"].decode() for row in rows]
     assert conditions == table["condition"].to_pylist()
     episodes = [row["episodes/episode_id"].decode() for row in dataset.records("episodes")]
-    assert episodes == pq.read_table(root / EPISODES_PATH)["episode_id"].to_pylist()
+    assert episodes == pq.read_table(root / RECORDS_PATH)["episode_id"].to_pylist()
 
 
 # --- columns --------------------------------------------------------------------------------------

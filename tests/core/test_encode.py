@@ -74,7 +74,7 @@ def test_file_layout(tmp_path: Path) -> None:
 def test_the_same_frames_give_the_same_bytes_and_nothing_is_printed(
     tmp_path: Path, codec: Codec, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    # LeRobot leaves FFmpeg's own callback behind, which prints; a test before this may have used it.
+    # LeRobot, if a test before this used it, leaves FFmpeg's own callback behind, which prints.
     av.logging.set_level(av.logging.get_level())
     images = noise(2, 10, 64, 66)
     one, two = tmp_path / "one.mp4", tmp_path / "two.mp4"

@@ -147,7 +147,7 @@ def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, 
 def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, called: str) -> None:
     """Else a split could write elsewhere, or give another one its frames."""
     root = copy_split(tmp_path / "split")
-    path = root / "distractors/meta/episodes/chunk-000/file-000.parquet"
+    path = root / "distractors/meta/interference.parquet"
     rows = pq.read_table(path).to_pylist()
     for row in rows:
         row["feature_sha256"]["observation.images.front"] = called

@@ -48,7 +48,7 @@ def test_a_buffer_is_the_one_on_disk(hub: HubServer) -> None:
 def test_no_more_is_downloaded_than_the_buffer_needs(hub: HubServer) -> None:
     buffer = load_buffer(QUERY, "k1", split=SPLIT, revision=VERSION, cameras=["front"])
     found = set(hub.downloads())
-    small = {"meta/info.json", "meta/interference.json", "meta/episodes/chunk-000/file-000.parquet"}
+    small = {"meta/info.json", "meta/interference.json", "meta/interference.parquet"}
     numbers = {0} | {entry.episode_index for entry in buffer.manifest.sessions[1:]}
     assert {path for path in found if "/observation.images.wrist/" in path} == set()
     assert {path for path in found if path.startswith("meta/")} == small

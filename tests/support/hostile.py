@@ -34,7 +34,7 @@ from robomme_interference_data.video import iter_frames
 
 _VIDEO = "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _ROWS = "demonstrations/data/chunk-000/file-000.parquet"
-_EPISODES = "demonstrations/meta/episodes/chunk-000/file-000.parquet"
+_EPISODES = "demonstrations/meta/interference.parquet"
 _MOST_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
 
 

@@ -13,9 +13,9 @@ from robomme_interference_data.build_dataset.identity import identity_of
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
-    EPISODES_PATH,
     IDENTITY_PATH,
     INFO_PATH,
+    RECORDS_PATH,
 )
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.files import LocalFiles, write_json
@@ -69,8 +69,7 @@ def write_metadata(root: Path, kind: str, records: Iterable[EpisodeRecord]) -> D
     write_json(root / INFO_PATH, info)
     identity = identity_of(listed, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
-    path = root / EPISODES_PATH
-    path.parent.mkdir(parents=True)
+    path = root / RECORDS_PATH
     pq.write_table(to_table(listed, arrow_schema(EpisodeRecord, sorted(SHAPES))), path)
     return Dataset(LocalFiles(root))
 
