@@ -69,6 +69,7 @@ _GROUPS = {
         ("fetch", commands.fetch),
     ),
     "Look": (
+        ("conditions", commands.list_conditions),
         ("list", commands.list_buffers),
         ("show", commands.show),
         ("simulate", simulating.simulate),

@@ -60,6 +60,33 @@ def list_buffers(
     typer.echo(table.text())
 
 
+def list_conditions(as_json: AsJson = False) -> None:
+    """List the kinds of conditions: what history each gives a query, and what it asks.
+
+    Examples:
+    ```
+    robomme-interference conditions
+    robomme-interference build manifests my-split --conditions no-history k0 k7 before-k7 held-k7
+    ```
+    """
+    from robomme_interference_data.conditions import KINDS
+    from robomme_interference_data.constants import MAX_K
+    from robomme_interference_data.tables import Table
+
+    table = Table.make(
+        "conditions",
+        "Conditions",
+        "condition sessions asks needs",
+        ((kind.pattern, kind.holds, kind.asks, " ".join(kind.needs)) for kind in KINDS.values()),
+        f"n: 0 to {MAX_K}. units: of other families, the same ones for every kind. needs: datasets "
+        "beside demonstrations and distractors.",
+    )
+    if as_json:
+        print_json(table.records())
+    else:
+        typer.echo(table.text())
+
+
 def show(
     episode: QueryName,
     condition: ConditionName,

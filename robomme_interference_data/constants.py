@@ -86,6 +86,11 @@ PAPER_ENCODER = "google/siglip-so400m-patch14-384"
 
 DEMONSTRATIONS = "demonstrations"
 DISTRACTORS = "distractors"
+RAW_DISTRACTORS = "distractors-raw"
+"""The same episodes as the distractors', 256 frames at full rate."""
+CONTRADICTIONS = "contradictions"
+DATASETS = (DEMONSTRATIONS, DISTRACTORS, RAW_DISTRACTORS, CONTRADICTIONS)
+"""Names of a split's datasets, which are their kinds; it may lack the last two."""
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"

@@ -77,6 +77,23 @@ class UnitPool:
             )
         return list(islice(self._units(query, others), k))
 
+    def draw_own(self, query: EpisodeId, k: int) -> list[EpisodeId]:
+        """Draw `k` distinct units of the query's own family, none of the query; nested in `k`.
+
+        They follow one another in the family's order, and queries begin seven units apart.
+
+        Raises:
+            PoolTooSmallError: The family has fewer than `k`.
+        """
+        units = [one for one in self._families.get(query.family, []) if one != query]
+        if k > len(units):
+            raise PoolTooSmallError(
+                f"{query} needs {k} units of its own family; the pool has {len(units)} others",
+                f"Build distractors from more episodes of {query.family}, or plan a smaller k.",
+            )
+        first = 7 * query.index + self._offset("own", query.split, query.family)
+        return [units[(first + place) % len(units)] for place in range(k)]
+
     def _units(self, query: EpisodeId, others: dict[str, list[EpisodeId]]) -> Iterator[EpisodeId]:
         """Yield all units of other families for a query, in buffer order."""
         largest = max(map(len, others.values()), default=0)

@@ -20,6 +20,9 @@ _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
 class EpisodeId:
     """The name of an episode, `<Family>/<split>/<index>`, e.g. `VideoRepick/test/7`.
 
+    A fourth part, `VideoRepick/test/7/2`, is for the same scene played with answer 2 instead of its
+    own: a contradicting lesson.
+
     Ids sort by family (the nine of the benchmark first, in the paper's order, then others by
     name), split and index as a number: the canonical order of everything that is written.
 
@@ -27,6 +30,7 @@ class EpisodeId:
         family: Task family: a letter, then letters, digits, `_`, `.` or `-`.
         split: `train`, `val` or `test`.
         index: Number of the episode within family and split, from 0.
+        answer: Number of the answer that it is played with, from 0; None for its own.
 
     Raises:
         InvalidIdError: A part is not as described.
@@ -35,6 +39,7 @@ class EpisodeId:
     family: str
     split: str
     index: int
+    answer: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.family, str) or not _FAMILY.fullmatch(self.family):
@@ -48,10 +53,12 @@ class EpisodeId:
                 f"{self.split!r} is not a split; expected one of {', '.join(SPLITS)}",
                 nearest(str(self.split), SPLITS),
             )
-        if type(self.index) is not int or not 0 <= self.index < 10**18:
-            raise InvalidIdError(
-                f"{self.index!r} is not an episode index", "Indices are numbers from 0 on."
-            )
+        numbers = {"episode index": self.index}
+        if self.answer is not None:
+            numbers["answer"] = self.answer
+        for what, number in numbers.items():
+            if type(number) is not int or not 0 <= number < 10**18:
+                raise InvalidIdError(f"{number!r} is not an {what}", "Those are numbers from 0 on.")
 
     @classmethod
     def parse(cls, text: "str | EpisodeId") -> Self:
@@ -63,21 +70,28 @@ class EpisodeId:
         if isinstance(text, cls):
             return text
         parts = text.split("/") if isinstance(text, str) else []
-        if len(parts) != 3 or not _INDEX.fullmatch(parts[2]):
+        if len(parts) not in (3, 4) or not all(map(_INDEX.fullmatch, parts[2:])):
             raise InvalidIdError(
                 f"{text!r} is not an episode id",
                 "Expected <Family>/<split>/<index>, for example VideoRepick/test/7.",
             )
-        return cls(parts[0], parts[1], int(parts[2]))
+        return cls(parts[0], parts[1], *map(int, parts[2:]))
 
     def __str__(self) -> str:
-        return f"{self.family}/{self.split}/{self.index}"
+        own = f"{self.family}/{self.split}/{self.index}"
+        return own if self.answer is None else f"{own}/{self.answer}"
 
     @property
-    def sort_key(self) -> tuple[int, str, int, int]:
+    def scene(self) -> "EpisodeId":
+        """The same scene with its own answer."""
+        return EpisodeId(self.family, self.split, self.index)
+
+    @property
+    def sort_key(self) -> tuple[int, str, int, int, int]:
         """Key of the canonical order."""
         rank = _FAMILY_RANK.get(self.family, len(FAMILIES))
-        return (rank, self.family, SPLITS.index(self.split), self.index)
+        answer = -1 if self.answer is None else self.answer
+        return (rank, self.family, SPLITS.index(self.split), self.index, answer)
 
     def __lt__(self, other: "EpisodeId") -> bool:
         return self.sort_key < other.sort_key

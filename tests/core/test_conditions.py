@@ -1,6 +1,7 @@
 """Conditions are values: names, order, and the sessions that their rules give."""
 
 import pickle
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,9 +13,11 @@ from robomme_interference_data import EpisodeId
 from robomme_interference_data.conditions import (
     DEFAULT_CONDITIONS,
     KINDS,
+    datasets_of,
     in_order,
     parse_condition,
 )
+from robomme_interference_data.constants import DATASETS, DISTRACTORS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
 from robomme_interference_data.records import SessionEntry
 
@@ -25,20 +28,29 @@ def entry(role: str, number: int) -> SessionEntry:
 
 
 class Material:
-    def lesson(self) -> SessionEntry:
-        return entry("lesson", 99)
+    """Sessions whose numbers say what they are."""
 
-    def units(self, k: int) -> Sequence[SessionEntry]:
-        return [entry("distractor", number) for number in range(k)]
+    def lesson(self, part: str = "lesson") -> SessionEntry:
+        return entry("lesson", {"lesson": 99, "first": 91, "second": 92, "last": 90}[part])
+
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
+        first = 0 if dataset == DISTRACTORS else 100
+        return [entry("distractor", first + number) for number in range(k)]
+
+    def own_units(self, k: int) -> Sequence[SessionEntry]:
+        return [entry("distractor", 200 + number) for number in range(k)]
+
+    def contradiction(self) -> SessionEntry:
+        return entry("contradiction", 98)
+
+
+def numbers(name: str) -> list[int]:
+    return [one.source.index for one in parse_condition(name).sessions(Material())]
 
 
 def test_the_papers_conditions() -> None:
     assert DEFAULT_CONDITIONS == ("no-history", "k0", "k1", "k3", "k7")
-    found = {
-        name: [one.source.index for one in parse_condition(name).sessions(Material())]
-        for name in DEFAULT_CONDITIONS
-    }
-    assert found == {
+    assert {name: numbers(name) for name in DEFAULT_CONDITIONS} == {
         "no-history": [],
         "k0": [99],
         "k1": [99, 0],
@@ -47,10 +59,38 @@ def test_the_papers_conditions() -> None:
     }
 
 
-@given(st.integers(0, 63))
-def test_names(k: int) -> None:
-    condition = parse_condition(f"k{k}")
-    assert (condition.name, condition.k, str(condition)) == (f"k{k}", k, f"k{k}")
+def test_those_beyond_the_paper() -> None:
+    assert {kind.name: numbers(f"{kind.name}-k3") for kind in list(KINDS.values())[2:]} == {
+        "before": [0, 1, 2, 99],
+        "middle": [0, 1, 99, 2],
+        "held": [99, 90, 90, 90],
+        "same": [99, 200, 201, 202],
+        "parts": [91, 0, 1, 2, 92],
+        "raw": [99, 100, 101, 102],
+        "absent": [0, 1, 2],
+        "stale": [98, 99, 0, 1, 2],
+        "misled": [98, 0, 1, 2],
+    }
+    assert numbers("middle-k1") == [0, 99]
+    assert numbers("misled-k0") == [98]
+
+
+@given(st.sampled_from([kind for kind in KINDS if kind != "no-history"]), st.integers(0, 63))
+def test_more_sessions_are_only_added(kind: str, k: int) -> None:
+    """Whatever comes more, the lesson stays as it is: conditions of a kind differ by units."""
+    name = "k" if kind == "k" else f"{kind}-k"
+    fewer, more = (Counter(numbers(f"{name}{count}")) for count in (k, min(k + 1, 63)))
+    assert fewer <= more
+    assert (more - fewer).total() == (k < 63)
+
+
+@given(st.sampled_from(list(KINDS)), st.integers(0, 63))
+def test_names(kind: str, k: int) -> None:
+    name = {"no-history": kind, "k": f"k{k}"}.get(kind, f"{kind}-k{k}")
+    condition = parse_condition(name)
+    counted = 0 if kind == "no-history" else k
+    assert (condition.name, condition.k, str(condition)) == (name, counted, name)
+    assert condition.kind is KINDS[kind]
     assert parse_condition(condition) is condition
     assert pickle.loads(pickle.dumps(condition)) == condition
 
@@ -59,6 +99,7 @@ def test_names(k: int) -> None:
     "given",
     [
         *("", "k", "k64", "k-1", "k03", "K3", "3", "nohistory", "no-history-k0", "x-k3", " k3"),
+        *("before", "before-k64", "before-k03", "k-k3", "before-3", "Before-k3"),
         *(3, None, b"k3"),
     ],
 )
@@ -68,13 +109,24 @@ def test_what_is_no_condition(given: Any) -> None:
 
 
 def test_order() -> None:
-    names = [one.name for one in in_order(["k7", "k10", "no-history", "k0"])]
-    assert names == ["no-history", "k0", "k7", "k10"]
+    given = ["k7", "stale-k0", "k10", "before-k1", "no-history", "k0"]
+    names = [one.name for one in in_order(given)]
+    assert names == ["no-history", "k0", "k7", "k10", "before-k1", "stale-k0"]
     for names in ([], ["k1", "k1"]):
         with pytest.raises(InvalidOptionError, match="expected some, each once"):
             in_order(names)
 
 
+def test_what_a_split_must_hold() -> None:
+    def needed(*names: str) -> tuple[str, ...]:
+        return datasets_of(map(parse_condition, names))
+
+    assert needed("no-history", "before-k3") == ("demonstrations", "distractors")
+    assert needed("misled-k0", "k0", "raw-k1") == DATASETS
+    assert DATASETS == ("demonstrations", "distractors", "distractors-raw", "contradictions")
+
+
 def test_the_registry() -> None:
-    assert list(KINDS) == ["no-history", "k"]
-    assert all(kind.name == name for name, kind in KINDS.items())
+    kinds = "no-history k before middle held same parts raw absent stale misled"
+    assert list(KINDS) == kinds.split()
+    assert all(kind.name == name and kind.holds and kind.asks for name, kind in KINDS.items())

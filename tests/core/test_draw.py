@@ -24,6 +24,7 @@ from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
 from robomme_interference_data.ids import EpisodeId
 
+parse = EpisodeId.parse
 GOLDEN = Path(__file__).parents[1] / "golden" / f"draws_rule_{RULE_VERSION}.json"
 
 NOMINAL = dict.fromkeys(FAMILIES, 100)
@@ -74,10 +75,58 @@ def golden_draws() -> list[dict[str, Any]]:
     ]
 
 
+def golden_own_draws() -> list[dict[str, Any]]:
+    return [
+        {
+            "pool": NOMINAL,
+            "seed": seed,
+            "query": query,
+            "own": list(map(str, UnitPool(units_of(NOMINAL), seed).draw_own(parse(query), 7))),
+        }
+        for seed, query in (
+            (0, "VideoRepick/test/7"),
+            (0, "MoveCube/train/3"),
+            (1, "MoveCube/val/0"),
+        )
+    ]
+
+
 def test_golden_draws_never_change() -> None:
+    draws = golden_draws() + golden_own_draws()
     if os.environ.get("UPDATE_GOLDEN") and not GOLDEN.exists():
-        GOLDEN.write_text(json.dumps(golden_draws(), indent=1) + "\n")
-    assert golden_draws() == json.loads(GOLDEN.read_text())
+        GOLDEN.write_text(json.dumps(draws, indent=1) + "\n")
+    assert draws == json.loads(GOLDEN.read_text())
+
+
+# --- units of the query's own family ---------------------------------------------------------
+
+
+@given(st.integers(0, 200), st.integers(0, 63), st.integers(0, 3), st.randoms())
+def test_own_units(index: int, k: int, seed: int, order: random.Random) -> None:
+    units = units_of(NOMINAL)
+    query = EpisodeId("PatternLock", "train", index)
+    drawn = UnitPool(units, seed).draw_own(query, k)
+    assert drawn == UnitPool(units, seed).draw_own(query, 63)[:k]
+    assert {one.family for one in drawn} <= {"PatternLock"}
+    assert query not in drawn
+    assert len(set(drawn)) == k
+    order.shuffle(units)
+    assert drawn == UnitPool(units, seed).draw_own(query, k)
+
+
+def test_own_units_are_used_alike() -> None:
+    pool = UnitPool(units_of(NOMINAL))
+    uses = Counter(unit for query in queries(50) for unit in pool.draw_own(query, 7))
+    assert set(uses.values()) == {3, 4}  # 350 of each family's 100
+
+
+def test_too_few_own_units() -> None:
+    pool = UnitPool(units_of(SMALL))
+    assert len(pool.draw_own(parse("VideoUnmask/test/0"), 3)) == 3
+    with pytest.raises(PoolTooSmallError, match="needs 4 units of its own family; the pool has 3"):
+        pool.draw_own(parse("VideoUnmask/test/0"), 4)
+    with pytest.raises(PoolTooSmallError, match="the pool has 0"):
+        pool.draw_own(parse("MoveCube/train/0"), 1)
 
 
 @pytest.mark.parametrize("hash_seed", ["0", "1", "4242"])
@@ -90,8 +139,9 @@ def test_golden_draws_in_other_processes(hash_seed: str) -> None:
         "for case in json.load(sys.stdin):\n"
         "    names = {f'{f}/train/{i}' for f, n in case['pool'].items() for i in range(n)}\n"
         "    pool = UnitPool(map(EpisodeId.parse, names), case['seed'])\n"
-        "    units = pool.draw(EpisodeId.parse(case['query']), len(case['units']))\n"
-        "    assert [str(unit) for unit in units] == case['units'], case\n"
+        "    name, draw = ('own', pool.draw_own) if 'own' in case else ('units', pool.draw)\n"
+        "    units = draw(EpisodeId.parse(case['query']), len(case[name]))\n"
+        "    assert [str(unit) for unit in units] == case[name], case\n"
         "print('all as before')\n"
     )
     done = subprocess.run(

@@ -16,6 +16,7 @@ IDS = st.builds(
     st.sampled_from(FAMILIES) | st.from_regex(r"[A-Za-z][A-Za-z0-9_.-]{0,8}", fullmatch=True),
     st.sampled_from(SPLITS),
     st.integers(0, 10**18 - 1),
+    st.none() | st.integers(0, 10**18 - 1),
 )
 
 
@@ -28,7 +29,15 @@ def test_round_trip(episode: EpisodeId) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        *("", "MoveCube", "MoveCube/test", "MoveCube/test/1/2", "MoveCube/test/01", "/test/1"),
+        *(
+            "",
+            "MoveCube",
+            "MoveCube/test",
+            "MoveCube/test/1/2/3",
+            "MoveCube/test/01",
+            "MoveCube/test/1/",
+            "/test/1",
+        ),
         *("MoveCube/test/-1", "MoveCube/test/1.0", "MoveCube/test/", "MoveCube/tset/1"),
         *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣"),
         *("MoveCube/test/1234567890123456789", "../test/1"),
@@ -46,6 +55,18 @@ def test_indices_are_numbers(index: object) -> None:
         EpisodeId("MoveCube", "test", index)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("answer", [-1, 10**18, True, "3", 1.0])
+def test_answers_are_numbers(answer: object) -> None:
+    with pytest.raises(InvalidIdError, match="is not an answer"):
+        EpisodeId("MoveCube", "test", 1, answer)  # type: ignore[arg-type]
+
+
+def test_the_scene_of_another_answer() -> None:
+    assert EpisodeId.parse("MoveCube/test/1/2") == EpisodeId("MoveCube", "test", 1, 2)
+    assert str(EpisodeId("MoveCube", "test", 1, 0)) == "MoveCube/test/1/0"
+    assert EpisodeId("MoveCube", "test", 1, 2).scene == EpisodeId("MoveCube", "test", 1)
+
+
 def test_a_slip_in_the_split_is_offered() -> None:
     with pytest.raises(InvalidIdError) as caught:
         EpisodeId.parse("MoveCube/tset/1")
@@ -54,7 +75,8 @@ def test_a_slip_in_the_split_is_offered() -> None:
 
 def test_canonical_order() -> None:
     texts = [
-        *("VideoRepick/train/0", "VideoRepick/test/2", "VideoRepick/test/10"),
+        *("VideoRepick/train/0", "VideoRepick/test/2", "VideoRepick/test/2/0"),
+        *("VideoRepick/test/2/1", "VideoRepick/test/10"),
         *("RouteStick/train/0", "AFamily/val/0", "Other/train/1"),
     ]
     ids = [EpisodeId.parse(text) for text in texts]
