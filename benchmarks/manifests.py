@@ -20,12 +20,8 @@ import pyarrow.parquet as pq
 from timing import in_fresh_process, machine, megabytes, peak_memory, positive, table
 
 from robomme_interference_data.build_dataset.identity import identity_of
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    planned_buffers,
-    write_manifests,
-)
+from robomme_interference_data.build_dataset.manifests import planned_buffers, write_manifests
+from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DEMONSTRATIONS,
@@ -45,9 +41,10 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.records import BufferManifest, EpisodeRecord, SpanDigests
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
+_SPANS = ("first", "second", "last", "query")
 SHAPES = {FRONT: (256, 256, 3), WRIST: (256, 256, 3), STATE: (8,)}
 CONDITIONS = ("no-history", "k0", "k1", "k2", "k3", "k4", "k5", "k6", "k7", "k15")
 
@@ -149,6 +146,7 @@ def made_up(kind: str, index: int) -> EpisodeRecord:
     units = kind == DISTRACTORS
     number, family = divmod(index, len(FAMILIES))
     name = EpisodeId(FAMILIES[family], "train" if units else "test", number)
+    spans = {name: sha256(f"{index} {name}".encode()).hexdigest() for name in _SPANS}
     digests = {name: sha256(f"{kind} {index} {name}".encode()).hexdigest() for name in SHAPES}
     lesson = 50 + 13 * index % 700
     return EpisodeRecord(
@@ -162,7 +160,7 @@ def made_up(kind: str, index: int) -> EpisodeRecord:
         exec_start_idx=None if units else lesson,
         exact=True,
         feature_sha256=digests,
-        lesson_sha256=None if units else digests,
+        span_sha256=None if units else SpanDigests(**spans),
     )
 
 

@@ -6,15 +6,17 @@ from dataclasses import asdict, dataclass, field
 from statistics import mean
 from typing import Any
 
+from robomme_interference_data.conditions import KINDS, Kind, parse_condition
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
+    CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
     MANIFEST_PATH,
 )
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.records import BufferManifest, EpisodeRecord, SessionEntry
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
 
@@ -24,8 +26,8 @@ class Leak:
     """Material in a buffer or pool that tells more, or other, than a distractor may.
 
     Attributes:
-        kind: `same family`, `repeated unit`, `not a train episode`, `same scene` or
-            `identical frames`.
+        kind: `same family`, `other family`, `repeated unit`, `not a train episode`, `same scene`
+            or `identical frames`.
         where: The buffer or the episodes.
     """
 
@@ -106,21 +108,34 @@ def audit_split(split: Split) -> Audit:
             raise FormatError.damaged(path, f"{manifest.condition} is not among its conditions")
         places = audit.places.setdefault(manifest.condition, {})
         drawn: Counter[EpisodeId] = Counter()
+        kind = parse_condition(manifest.condition).kind
         for session in manifest.sessions:
             where = f"{manifest}: {session.source}"
-            own = session.role == "lesson" and session.source == manifest.episode_id
+            own = _of_the_query(session, manifest, kind)
             if session.source.split != "train" and not own:  # whatever its role
                 audit.leaks.append(Leak("not a train episode", where))
             if session.role != "distractor":
                 continue
-            if manifest.episode_id.family in (session.family, session.source.family):
-                audit.leaks.append(Leak("same family", where))
+            same = manifest.episode_id.family in (session.family, session.source.family)
+            if same != kind.own_family:
+                audit.leaks.append(Leak("same family" if same else "other family", where))
             if session.source in drawn:
                 audit.leaks.append(Leak("repeated unit", where))
             uses[session.source] = uses.get(session.source, 0) + 1
             drawn[session.source] += 1
             places.setdefault(drawn.total(), Counter())[session.family] += 1
     return audit
+
+
+def _of_the_query(session: SessionEntry, manifest: BufferManifest, kind: Kind) -> bool:
+    """Whether a session shows the query's own scene, as its kind of condition says it may."""
+    role, source = session.role, session.source
+    if role == "contradiction":
+        return CONTRADICTIONS in kind.needs and (
+            source.answer is not None and source.scene == manifest.episode_id
+        )
+    held = role == "filler" and kind is KINDS["held"]
+    return (role == "lesson" or held) and source == manifest.episode_id
 
 
 def _pool_leaks(units: Sequence[EpisodeRecord], queries: Sequence[EpisodeRecord]) -> Iterator[Leak]:

@@ -258,14 +258,5 @@ def _write(
 
 def _placed(record: EpisodeRecord, index: int, features: Collection[str]) -> EpisodeRecord:
     """Return a record at its place in a dataset with these features."""
-
-    def only(digests: dict[str, str]) -> dict[str, str]:
-        return {name: digest for name, digest in digests.items() if name in features}
-
-    lesson = record.lesson_sha256
-    return replace(
-        record,
-        episode_index=index,
-        feature_sha256=only(record.feature_sha256),
-        lesson_sha256=lesson and only(lesson),
-    )
+    kept = {name: digest for name, digest in record.feature_sha256.items() if name in features}
+    return replace(record, episode_index=index, feature_sha256=kept)

@@ -25,9 +25,11 @@ from robomme_interference_data.console import (
     stoppable,
 )
 from robomme_interference_data.constants import (
+    CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
     MANIFESTS,
+    RAW_DISTRACTORS,
     REPORT_PATH,
 )
 from robomme_interference_data.errors import visible
@@ -104,10 +106,43 @@ def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
         _build(plan_build(DISTRACTORS, config), config.out, config.workers, as_json=as_json)
 
 
+@app.command(name=RAW_DISTRACTORS)
+@with_settings
+def raw_distractors(config: BuildConfig, as_json: AsJson = False) -> None:
+    """Build distractor units at full rate, for raw-k<n>: the first 256 raw frames of each episode.
+
+    Take the episodes of the distractors: a buffer's units must all be there.
+
+    Example:
+    ```
+    robomme-interference build distractors-raw --source tabletop --out S/distractors-raw
+    ```
+    """
+    with stoppable(_KEPT):
+        _build(plan_build(RAW_DISTRACTORS, config), config.out, config.workers, as_json=as_json)
+
+
+@app.command()
+@with_settings
+def contradictions(config: BuildConfig, as_json: AsJson = False) -> None:
+    r"""Build contradicting lessons, for stale-k<n> and misled-k<n>: another answer, the same scene.
+
+    Take the query episodes. Only tabletop can play them: elsewhere, scene and answer come together.
+
+    Example:
+    ```
+    robomme-interference build contradictions --source tabletop --split test --episodes 0-4 \
+        --out S/contradictions
+    ```
+    """
+    with stoppable(_KEPT):
+        _build(plan_build(CONTRADICTIONS, config), config.out, config.workers, as_json=as_json)
+
+
 @app.command()
 @with_settings
 def manifests(
-    split: Annotated[Path, typer.Argument(help="Folder with both datasets.")],
+    split: Annotated[Path, typer.Argument(help="Folder with the datasets.")],
     config: PlanConfig,
     as_json: AsJson = False,
 ) -> None:
@@ -118,21 +153,25 @@ def manifests(
     robomme-interference build manifests my-split --conditions no-history k0 k1 k3 k7 --seed 0
     ```
     """
-    with stoppable("Both datasets are kept"):
+    with stoppable("The datasets are kept"):
         _plan(split, config, as_json=as_json)
 
 
 @app.command(name="all")
 @with_settings
 def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
-    """Build demonstrations, distractors and manifests from the same sources.
+    r"""Build demonstrations, distractors and manifests from the same sources.
+
+    Conditions that need further datasets get them.
 
     Filters choose the query episodes; the units are of all families' train episodes, or of those
     that --unit-episodes names.
 
-    Example:
+    Examples:
     ```
     robomme-interference build all --source robomme-h5:recordings/ --out my-split
+    robomme-interference build all --source tabletop --split test --out my-split \
+        --conditions no-history k0 k7 before-k7 held-k7 stale-k0
     ```
     """
     with stoppable(_KEPT):
@@ -186,11 +225,8 @@ def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
 
 
 def _plan(split: Path, config: PlanConfig, *, as_json: bool, base: "Files | None" = None) -> None:
-    from robomme_interference_data.build_dataset.manifests import (
-        in_folder,
-        plan_manifests,
-        write_manifests,
-    )
+    from robomme_interference_data.build_dataset.manifests import write_manifests
+    from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 

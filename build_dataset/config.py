@@ -8,13 +8,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, in_order
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, datasets_of, in_order
 from robomme_interference_data.constants import (
+    CONTRADICTIONS,
     DEMONSTRATIONS,
     DISTRACTORS,
     POSITION_LIMIT,
     SPLITS,
     UNIT_FRAMES,
+    UNITS,
 )
 from robomme_interference_data.errors import InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId, parse_numbers
@@ -88,7 +90,9 @@ class PlanConfig:
     """Which buffers to plan."""
 
     conditions: tuple[str, ...] = setting(
-        DEFAULT_CONDITIONS, help="Conditions to plan buffers for: no-history, k0 to k63."
+        DEFAULT_CONDITIONS,
+        help="Conditions to plan buffers for, such as no-history k0 k7 before-k7; all kinds: "
+        "robomme-interference conditions.",
     )
     seed: int = setting(0, help="Seed of the draw.")
     position_limit: str = setting(
@@ -101,7 +105,7 @@ class BuildPlan:
     """A `BuildConfig` whose sources are open; or made without one.
 
     Attributes:
-        kind: `demonstrations` or `distractors`.
+        kind: Name of the dataset in a split, such as `demonstrations`.
         sources: Where to read.
         tasks: The episodes to store: number of the source, and episode.
         cameras: Cameras to store; None for all.
@@ -120,17 +124,20 @@ class BuildPlan:
 
 
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
-    """Plan both datasets of a split, and check all that can be known before anything is read.
+    """Plan the datasets of a split, and check all that can be known before anything is read.
 
     Raises:
         PoolTooSmallError: Even if every train episode yielded a unit, there were too few.
         InvalidIdError, InvalidOptionError, SourceError: As `plan_build` and `in_order`.
         BuildError: Something else lies where one of the outputs is to be.
     """
-    queries = plan_build(DEMONSTRATIONS, config)
     every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    plans = {DEMONSTRATIONS: queries, DISTRACTORS: plan_build(DISTRACTORS, every)}
-    _check_plans((episode.id for _, episode in queries.tasks), plans, config.out, plan)
+    plans = {
+        name: plan_build(name, every if name in UNITS else config)
+        for name in datasets_of(in_order(plan.conditions))
+    }
+    queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
+    _check_plans(queries, plans, config.out, plan)
     return plans
 
 
@@ -188,16 +195,21 @@ class _Unread:
     query: EpisodeId
     pool: "UnitPool"
 
-    def lesson(self) -> SessionEntry:
-        return self._entry("lesson", DEMONSTRATIONS, self.query)
+    def lesson(self, part: str = "lesson") -> SessionEntry:
+        return _unread("lesson", self.query)
 
-    def units(self, k: int) -> Sequence[SessionEntry]:
-        return [
-            self._entry("distractor", DISTRACTORS, unit) for unit in self.pool.draw(self.query, k)
-        ]
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
+        return [_unread("distractor", unit) for unit in self.pool.draw(self.query, k)]
 
-    def _entry(self, role: str, kind: str, source: EpisodeId) -> SessionEntry:
-        return SessionEntry(role, source.family, source, kind, "", 0, 0, UNIT_FRAMES, 1, "")
+    def own_units(self, k: int) -> Sequence[SessionEntry]:
+        return [_unread("distractor", unit) for unit in self.pool.draw_own(self.query, k)]
+
+    def contradiction(self) -> SessionEntry:
+        return _unread("contradiction", self.query)
+
+
+def _unread(role: str, source: EpisodeId) -> SessionEntry:
+    return SessionEntry(role, source.family, source, "", "", 0, 0, UNIT_FRAMES, 1, "")
 
 
 def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
@@ -231,14 +243,16 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         for text in config.source
     )
     for text, source in zip(config.source, sources, strict=True):
-        if kind == DISTRACTORS and not source.whole:
+        if kind in UNITS and not source.whole:
             raise InvalidOptionError(
                 f"{text} plays demonstrations only, and distractor units need whole episodes",
                 "Build the two datasets apart, the distractors from RoboMME's own training "
                 "recordings: robomme-interference build distractors --source robomme-h5:FOLDER",
             )
-    split = config.split or ("train" if kind == DISTRACTORS else None)
+    split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
+    if kind == CONTRADICTIONS:
+        tasks = tuple((number, sources[number].contradict(one)) for number, one in tasks)
     return BuildPlan(
         kind=kind,
         sources=sources,

@@ -2,19 +2,15 @@
 
 A demonstration is every raw frame of the demonstration section and then the first live
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
-32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote). Nothing is
-read beyond the last frame that is needed.
+32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw one all
+256 of them. Nothing is read beyond the last frame that is needed.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 
 from robomme_interference_data.build_dataset.sources.base import Frame
-from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
-    DISTRACTORS,
-    UNIT_MIN_RAW_FRAMES,
-    UNIT_STRIDE,
-)
+from robomme_interference_data.constants import CONTRADICTIONS, DEMONSTRATIONS, UNITS, Unit
 from robomme_interference_data.errors import SourceError
 
 
@@ -45,24 +41,25 @@ def cut_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
     raise NothingToStore("no live observation after the demonstration")
 
 
-def cut_unit(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield the 32 frames of a distractor unit.
+def cut_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
+    """Yield the frames of a unit.
 
     Raises:
-        NothingToStore: The episode has fewer than 249 raw frames: it is not padded.
+        NothingToStore: The episode has fewer raw frames, 249 or 256: it is not padded.
     """
-    count = 0
+    count, needed = 0, (unit.frames - 1) * unit.stride + 1
     for frame in frames:
-        if count % UNIT_STRIDE == 0:
+        if count % unit.stride == 0:
             yield frame
         count += 1
-        if count == UNIT_MIN_RAW_FRAMES:
+        if count == needed:
             return
-    raise NothingToStore(f"{count} raw frames; a unit needs {UNIT_MIN_RAW_FRAMES}")
+    raise NothingToStore(f"{count} raw frames; a unit needs {needed}")
 
 
 CUTS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
     DEMONSTRATIONS: cut_demonstration,
-    DISTRACTORS: cut_unit,
+    CONTRADICTIONS: cut_demonstration,
+    **{kind: partial(cut_unit, unit=unit) for kind, unit in UNITS.items()},
 }
 """Kind of dataset to what it stores of an episode."""

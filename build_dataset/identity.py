@@ -21,7 +21,6 @@ import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
-    DISTRACTORS,
     EPISODES_DIR,
     FORMAT_VERSION,
     IDENTITY_PATH,
@@ -31,8 +30,7 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
     STATS_PATH,
     SUMS_PATH,
-    UNIT_FRAMES,
-    UNIT_STRIDE,
+    UNITS,
 )
 from robomme_interference_data.files import (
     all_files,
@@ -84,7 +82,7 @@ def identity_of(
         exact=all(record.exact for record in records),
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
-        unit={"frames": UNIT_FRAMES, "stride": UNIT_STRIDE} if kind == DISTRACTORS else None,
+        unit=UNITS[kind]._asdict() if kind in UNITS else None,
         simulators=tuple(sorted({one.simulator for one in records if one.simulator})),
         sources=tuple(sources),
         counts=Counts(len(records), sum(one.length for one in records), dict(families)),

@@ -1,51 +1,37 @@
 """Plan the buffers of a split: for every query episode and every condition, what it holds.
 
-Rules 1 to 5 and 8 of the protocol; the draw itself is `draw.py`, what a condition holds is
-`conditions.py`.
+Rules 5 and 8 of the protocol; what a condition holds is `conditions.py`, of what it is made
+`material.py`.
 """
 
 import shutil
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Generator, Iterator
 from itertools import batched
 from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
+from robomme_interference_data.build_dataset.material import ManifestPlan, QueryMaterial
+from robomme_interference_data.conditions import Condition
 from robomme_interference_data.constants import (
-    ACTION,
-    DEMONSTRATIONS,
-    DISTRACTORS,
     FORMAT_VERSION,
     IDENTITY_PATH,
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
     MAX_STEPS,
-    POSITION_LIMIT,
     RULE_VERSION,
 )
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.digest import combine
-from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import (
     BuildError,
-    FormatError,
     HistoryTooLongError,
-    InvalidOptionError,
-    SourceError,
 )
 from robomme_interference_data.files import (
-    Files,
-    LocalFiles,
     sha256_file,
     working,
     write_json,
 )
 from robomme_interference_data.hub import HubFiles
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import writing
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
@@ -53,7 +39,6 @@ from robomme_interference_data.records import (
     EpisodeRecord,
     ManifestDataset,
     ManifestHeader,
-    SessionEntry,
     place_sessions,
 )
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
@@ -63,141 +48,22 @@ _BATCH = 1024
 """Rows in a row group: few bytes find one buffer."""
 
 
-@dataclass(frozen=True)
-class ManifestPlan:
-    """All that decides the manifests.
-
-    Attributes:
-        demonstrations: The query episodes.
-        distractors: The units.
-        conditions: For which buffers are planned, in order.
-        seed: Seed of the draw.
-        position_limit: Longest history plus rollout that the systems hold; None for no limit.
-    """
-
-    demonstrations: Dataset
-    distractors: Dataset
-    conditions: tuple[Condition, ...]
-    seed: int = 0
-    position_limit: int | None = POSITION_LIMIT
-
-    @cached_property
-    def pool(self) -> UnitPool:
-        """The units, to be drawn."""
-        return UnitPool((one.episode_id for one in self.distractors.records()), self.seed)
-
-    @cached_property
-    def units(self) -> dict[EpisodeId, SessionEntry]:
-        """The units as sessions."""
-        return {
-            one.episode_id: _entry(
-                "distractor", self.distractors, one, one.length, combine(one.feature_sha256)
-            )
-            for one in self.distractors.records()
-        }
-
-
-def in_folder(root: Path) -> dict[str, Files]:
-    """Return where the datasets of a split lie that is built in a folder."""
-    return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS)}
-
-
-def plan_manifests(
-    places: Mapping[str, Files],
-    conditions: Sequence[str | Condition] = DEFAULT_CONDITIONS,
-    seed: int = 0,
-    position_limit: int | None = POSITION_LIMIT,
-) -> ManifestPlan:
-    """Check that the datasets of a split and the options fit each other.
-
-    Args:
-        places: Where `demonstrations` and `distractors` lie; see `in_folder`.
-        conditions: For which buffers are planned.
-        seed: Seed of the draw.
-        position_limit: See `ManifestPlan`.
-
-    Raises:
-        InvalidIdError, InvalidOptionError: A condition is none, or comes twice.
-        MissingFileError, FormatError: A dataset is missing or damaged.
-        SourceError: The datasets do not fit each other, or a unit is not of the train split.
-    """
-    ordered = in_order(conditions)
-    opened = {}
-    for name in (DEMONSTRATIONS, DISTRACTORS):
-        opened[name] = dataset = Dataset(places[name])
-        if dataset.kind != name:
-            raise InvalidOptionError(
-                f"{dataset.files.describe()} is a dataset of {dataset.kind}",
-                f"Put there what robomme-interference build {name} made.",
-            )
-    shown = {
-        name: {feature: s for feature, s in one.features.items() if feature != ACTION}
-        for name, one in opened.items()
-    }
-    if shown[DEMONSTRATIONS] != shown[DISTRACTORS]:
-        raise SourceError(
-            "sessions of both datasets cannot follow one another in a buffer: the demonstrations "
-            f"have {shown[DEMONSTRATIONS]}, the distractors {shown[DISTRACTORS]}",
-            "Build both with the same --cameras, from sources with the same sizes.",
-        )
-    splits = {record.episode_id.split for record in opened[DISTRACTORS].records()}
-    if splits != {"train"}:
-        raise SourceError(
-            "distractor units must come from train episodes, so that no query's own scene leaks "
-            f"into another buffer; found {', '.join(sorted(splits))}",
-            "Build the distractors with --split train.",
-        )
-    return ManifestPlan(opened[DEMONSTRATIONS], opened[DISTRACTORS], ordered, seed, position_limit)
-
-
-class _Material:
-    """What the conditions' rules make the history of one query of; see `conditions.Material`."""
-
-    def __init__(self, plan: ManifestPlan, record: EpisodeRecord):
-        self._plan = plan
-        self._record = record
-        self._units: list[SessionEntry] = []
-
-    @cached_property
-    def _lesson(self) -> SessionEntry:
-        record, dataset = self._record, self._plan.demonstrations
-        if record.exec_start_idx is None or record.lesson_sha256 is None:
-            raise FormatError.damaged(dataset.files.describe(), f"{record.episode_id}: no lesson")
-        sha = combine(record.lesson_sha256)
-        return _entry("lesson", dataset, record, record.exec_start_idx, sha)
-
-    def lesson(self) -> SessionEntry:
-        return self._lesson
-
-    def units(self, k: int) -> Sequence[SessionEntry]:
-        if k > len(self._units):  # fewer begin those that are drawn
-            drawn = self._plan.pool.draw(self._record.episode_id, k)
-            self._units = [self._plan.units[unit] for unit in drawn]
-        return self._units[:k]
-
-
-def _entry(
-    role: str, dataset: Dataset, record: EpisodeRecord, stop: int, sha256: str
-) -> SessionEntry:
-    """Return the session that an episode is from its beginning on."""
-    name = record.episode_id
-    place = dataset.kind, dataset.revision, record.episode_index
-    return SessionEntry(role, name.family, name, *place, 0, stop, 1, sha256)
-
-
 def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
     """Yield the manifests of all buffers: queries in canonical order, conditions as planned.
 
     Raises:
-        PoolTooSmallError: A query needs more units than the other families have.
+        PoolTooSmallError: A query needs more units than there are.
+        SourceError: A query has no contradicting lesson, or a unit no raw one.
         HistoryTooLongError: A buffer exceeds the position limit.
     """
-    datasets = {one.kind: one for one in (plan.demonstrations, plan.distractors)}
     lossy = {
-        (kind, e.episode_id) for kind, d in datasets.items() for e in d.records() if not e.exact
+        (name, e.episode_id)
+        for name, dataset in plan.datasets.items()
+        for e in dataset.records()
+        if not e.exact
     }
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
-        place, material = Query(plan.demonstrations, record).place, _Material(plan, record)
+        place, material = Query(plan.demonstrations, record).place, QueryMaterial(plan, record)
         # The largest first: fewer units begin those that are drawn for it.
         sessions = {one.name: one.sessions(material) for one in reversed(plan.conditions)}
         for condition in plan.conditions:
@@ -312,7 +178,7 @@ def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHe
                 sha256_file(dataset.files.path(IDENTITY_PATH)),
                 dataset.files.describe() if isinstance(dataset.files, HubFiles) else None,
             )
-            for dataset in (plan.demonstrations, plan.distractors)
+            for dataset in plan.datasets.values()
         },
         counts=counts,
         rows=rows,

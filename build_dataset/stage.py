@@ -8,6 +8,7 @@ import hashlib
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,19 +22,19 @@ from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import STATISTICS, ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
-from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, DEMONSTRATIONS, FPS, STATE
-from robomme_interference_data.digest import FeatureDigests
+from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, FPS, LESSONS, STATE
+from robomme_interference_data.digest import FeatureDigests, SpanDigester, combine
 from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.files import canonical_json, write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.records import EpisodeRecord, SpanDigests, lesson_spans
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.video import iter_frames
 
 _RECORD = "record.json"
-_LAYOUT = 3
+_LAYOUT = 4
 """Version of a staged episode's folder."""
 
 Task = tuple[int, SourceEpisode]
@@ -137,20 +138,19 @@ class StageTask:
     def _write(self, episode: EpisodeId, recording: Recording, folder: Path) -> Staged:
         codec = get_codec(self.plan.codec)
         writer = _Writer(codec, folder)
-        lesson: dict[str, str] | None = None
         try:
             for frame in CUTS[self.plan.kind](recording.frames):
-                if self.plan.kind == DEMONSTRATIONS and not frame.is_demonstration:
-                    lesson = writer.digests.current()
                 writer.add(frame)
         except NothingToStore as reason:
             writer.close()
             return Staged(episode, str(reason), None, {}, {})
         writer.close()
-        start = None if lesson is None else writer.length - 1
-        digests = writer.digests.current()
-        decoded, decoded_lesson = writer.decode(start)
-        if codec.exact and any(digests[name] != sha for name, sha in decoded.items()):
+        start = writer.length - 1 if self.plan.kind in LESSONS else None
+        spans = {} if start is None else lesson_spans(start)
+        whole, session, *parts = writer.decode(
+            [(0, writer.length), (0, writer.length if start is None else start), *spans.values()]
+        )
+        if codec.exact and whole != writer.digests.current():
             raise BuildError(
                 f"a video does not decode to the frames that were encoded with {codec.name}",
                 "Please report this with the versions that robomme-interference doctor prints.",
@@ -166,8 +166,8 @@ class StageTask:
             simulator=recording.simulator,
             exec_start_idx=start,
             exact=recording.exact and codec.exact,
-            feature_sha256=digests | decoded,
-            lesson_sha256=None if lesson is None else lesson | decoded_lesson,
+            feature_sha256=session,
+            span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
         )
         stats = {
             feature: {name: tuple(map(float, values)) for name, values in one.result().items()}
@@ -228,17 +228,17 @@ class _Writer:
         for name, values in self._vectors.items():
             write_array(self._folder / f"{name}.npy", np.stack(values))
 
-    def decode(self, start: int | None) -> tuple[dict[str, str], dict[str, str]]:
-        """Decode the videos; return digests over all frames, and over those before `start`."""
-        digests = FeatureDigests()
-        lesson: dict[str, str] = {}
+    def decode(self, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
+        """Decode the videos; return digests over spans of frames, vectors among them."""
+        digests = SpanDigester(spans)
         for name in self._encoders:
             images = iter_frames(self._folder / f"{name}.mp4", 0, self.length, FPS)
-            for count, image in enumerate(images, 1):
-                digests.update(name, image)
-                if count == start:
-                    lesson[name] = digests.current()[name]
-        return digests.current(), lesson
+            for index, image in enumerate(images):
+                digests.update(name, index, image)
+        for name, values in self._vectors.items():
+            for index, value in enumerate(values):
+                digests.update(name, index, value)
+        return digests.digests()
 
     def _begin(
         self, images: dict[str, NDArray[np.uint8]], vectors: dict[str, NDArray[np.float32]]

@@ -6,20 +6,24 @@ from typing import Any
 
 from robomme_interference_data.build_dataset.identity import identity_of, listed_files
 from robomme_interference_data.build_dataset.lerobot_meaning import lerobot_violations
-from robomme_interference_data.build_dataset.manifests import plan_manifests, planned_buffers
+from robomme_interference_data.build_dataset.manifests import planned_buffers
+from robomme_interference_data.build_dataset.material import plan_manifests
+from robomme_interference_data.conditions import datasets_of
 from robomme_interference_data.constants import (
-    DEMONSTRATIONS,
+    DATASETS,
     DISTRACTORS,
     IDENTITY_PATH,
     INDEX_DIR,
     INDEX_HEADER,
+    LESSONS,
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
     RULE_VERSION,
-    UNIT_FRAMES,
+    UNITS,
 )
 from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.digest import combine
 from robomme_interference_data.embeddings import IndexHeader, index_folder
 from robomme_interference_data.encode import CODECS
 from robomme_interference_data.errors import InterferenceError
@@ -156,23 +160,23 @@ def _identity(
 
 def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]:
     start = record.exec_start_idx
-    lessons = {name != DISTRACTORS, start is not None, record.lesson_sha256 is not None}
+    lessons = {name in LESSONS, start is not None, record.span_sha256 is not None}
     if len(lessons) > 1:
         yield Violation(where, f"exec_start_idx is {start}")
-    elif record.length != (expected := UNIT_FRAMES if start is None else start + 1):
+    elif record.length != (expected := UNITS[name].frames if start is None else start + 1):
         yield Violation(where, f"holds {record.length} frames, not {expected}")
 
 
 def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
-    spans = {"frames": (record.length, record.feature_sha256)}
-    if record.exec_start_idx is not None and record.lesson_sha256 is not None:
-        spans["lesson"] = (record.exec_start_idx, record.lesson_sha256)
-    decoded = dataset.digests(record.episode_index, 0, [stop for stop, _ in spans.values()])
-    for (what, (_, recorded)), digests in zip(spans.items(), decoded, strict=True):
-        for feature in sorted(digests.keys() | recorded.keys()):
-            if digests.get(feature) != recorded.get(feature):
-                told = f"{feature} ({what}) does not have the recorded SHA-256"
-                yield Violation(where, told)
+    recorded, spans = record.feature_sha256, record.spans
+    session, *parts = dataset.digests(record.episode_index, [record.session, *spans.values()])
+    for feature in sorted(session.keys() | recorded.keys()):
+        if session.get(feature) != recorded.get(feature):
+            yield Violation(where, f"{feature} does not have the recorded SHA-256")
+    for name, part in zip(spans, parts, strict=True):
+        if combine(part) != getattr(record.span_sha256, name, None):
+            told = f"frames {spans[name][0]} to {spans[name][1] - 1} ({name})"
+            yield Violation(where, f"{told} do not have the recorded SHA-256")
 
 
 def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
@@ -233,7 +237,8 @@ def _buffers(split: Split, datasets: Mapping[str, Dataset]) -> Iterator[Violatio
     yield from (Violation(name, f"should not be in {MANIFEST_ROWS}") for name in given)
     if header.counts != counts:
         yield Violation(where, f"counts are {header.counts}; there are {counts}")
-    if set(header.datasets) != {DEMONSTRATIONS, DISTRACTORS}:
+    needed = set(datasets_of(plan.conditions))
+    if not needed <= header.datasets.keys() <= {*DATASETS}:
         yield Violation(where, f"datasets are {sorted(header.datasets)}")
 
 

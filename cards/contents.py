@@ -9,6 +9,7 @@ from robomme_interference_data.cards.tree import Content, Tree
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
+    FURTHER,
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFEST_PATH,
@@ -41,6 +42,8 @@ def dataset_tree(dataset: Dataset) -> Tree:
 def split_tree(split: Split, base: str | None) -> Tree:
     """Return the files of a split's own repository: its units at the root, and its manifests.
 
+    Further datasets are folders there.
+
     Args:
         split: The split.
         base: Where the demonstrations lie, `namespace/name@commit`; None for a folder beside.
@@ -56,8 +59,15 @@ def split_tree(split: Split, base: str | None) -> Tree:
             f"Build the manifests again: robomme-interference build manifests {split.location}",
         )
     header = indented_json(to_dict(placed(split.header, base))).encode()
+    further = {
+        f"{name}/{path}": content
+        for name in FURTHER
+        if name in split.datasets
+        for path, content in dataset_tree(split.datasets[name]).items()
+    }
     return {
         **dataset_tree(split.datasets[DISTRACTORS]),
+        **further,
         MANIFEST_PATH: Content(header),
         BUFFERS_FILE: rows,
     }

@@ -9,6 +9,7 @@ from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.cards.tree import Content, Tree
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
+    FURTHER,
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFEST_PATH,
@@ -19,7 +20,7 @@ from robomme_interference_data.files import LocalFiles, all_files, sha256_file, 
 from robomme_interference_data.split import Split
 
 _CARD = (render.README, render.STRIP, render.CROISSANT)
-_OURS = {"data", "meta", "videos", INDEX_DIR, MANIFESTS, DEMONSTRATIONS, *_CARD}
+_OURS = {"data", "meta", "videos", INDEX_DIR, MANIFESTS, DEMONSTRATIONS, *FURTHER, *_CARD}
 """What stands at the root of an export."""
 
 

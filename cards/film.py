@@ -109,8 +109,8 @@ def film_of_lesson(facts: DatasetFacts) -> Film:
 
 def _lesson(facts: DatasetFacts, record: EpisodeRecord, frames: int) -> SessionEntry:
     dataset, name = facts.dataset, record.episode_id
-    if record.lesson_sha256 is None:
+    if record.exec_start_idx is None:
         raise FormatError.damaged(dataset.files.describe(), f"{name}: no lesson")
     place = dataset.kind, dataset.revision, record.episode_index
-    sha256 = combine(record.lesson_sha256)
+    sha256 = combine(record.feature_sha256)
     return SessionEntry("lesson", name.family, name, *place, 0, frames, 1, sha256)

@@ -68,8 +68,10 @@ def units_of(split: Split, config: PublishConfig, base: str | None) -> Goods:
 
     def parts(earlier: HubFiles | None) -> dict[str, str]:
         there = load_split(earlier.describe()) if earlier else split
-        units = Dataset(earlier) if earlier else dataset
-        return parts_of_dataset(units) | parts_of_buffers(there.manifests())
+        found = parts_of_buffers(there.manifests())
+        for name, one in there.datasets.items():
+            found |= parts_of_dataset(one) if name != DEMONSTRATIONS else {}
+        return found
 
     return _goods(repo_id, dataset, split_tree(split, base), card, parts)
 

@@ -299,7 +299,7 @@ class Buffer:
         self._verified = True
         for entry in self.manifest.sessions:
             dataset = self._datasets[entry.dataset]
-            [found] = dataset.digests(entry.episode_index, entry.start, [entry.stop])
+            [found] = dataset.digests(entry.episode_index, [(entry.start, entry.stop)])
             if combine(found) == entry.sha256:
                 continue
             recorded = self._recorded(entry) or {}

@@ -1,5 +1,7 @@
 """Numbers and names fixed by the protocol, and every path inside a dataset or split."""
 
+from typing import NamedTuple
+
 FORMAT_VERSION = 1
 """Version of the files that this package writes; a reader refuses one that it does not know."""
 
@@ -89,8 +91,35 @@ DISTRACTORS = "distractors"
 RAW_DISTRACTORS = "distractors-raw"
 """The same episodes as the distractors', 256 frames at full rate."""
 CONTRADICTIONS = "contradictions"
-DATASETS = (DEMONSTRATIONS, DISTRACTORS, RAW_DISTRACTORS, CONTRADICTIONS)
-"""Names of a split's datasets, which are their kinds; it may lack the last two."""
+"""Lessons in the scenes of the queries, with other answers."""
+
+LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
+"""Whose episodes are lessons, with the query frame after them; others' are units."""
+
+
+class Unit(NamedTuple):
+    """What a distractor unit is cut of a recorded episode: raw frames 0, stride, and so on.
+
+    Attributes:
+        frames: Stored frames.
+        stride: Raw frames from one stored frame to the next.
+    """
+
+    frames: int
+    stride: int
+
+
+UNITS = {
+    DISTRACTORS: Unit(UNIT_FRAMES, UNIT_STRIDE),
+    RAW_DISTRACTORS: Unit(UNIT_FRAMES * UNIT_STRIDE, 1),
+}
+"""Of what the units of a dataset are."""
+
+FURTHER = (RAW_DISTRACTORS, CONTRADICTIONS)
+"""Datasets that a split may lack; on the Hub they are folders of its repository."""
+
+DATASETS = (DEMONSTRATIONS, DISTRACTORS, *FURTHER)
+"""Names of a split's datasets, which are their kinds."""
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"

@@ -5,9 +5,10 @@ a lean copy of that table in `meta/interference.parquet`, and its identity in
 `meta/interference.json`.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from robomme_interference_data.constants import (
     STATE,
     SUMS_PATH,
 )
-from robomme_interference_data.digest import FeatureDigests
+from robomme_interference_data.digest import SpanDigester
 from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import (
     FormatError,
@@ -221,21 +222,19 @@ class Dataset:
         self.lerobot.check_span(episode_index, start, stop)
         return self.lerobot.vectors(episode_index, feature)[start:stop]
 
-    def digests(self, episode_index: int, start: int, stops: list[int]) -> list[dict[str, str]]:
-        """Decode an episode from `start` on, once; return its digests up to each of `stops`."""
-        found: dict[int, dict[str, str]] = {stop: {} for stop in stops}
+    def digests(self, episode_index: int, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
+        """Decode an episode once; return the digests by feature of spans of it, end excluded."""
+        first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
+        running = SpanDigester(spans)
         for name in self.features:
-            running = FeatureDigests()
-            values = (
-                self.iter_frames(episode_index, name, start, max(stops))
+            values: Iterable[NDArray[Any]] = (
+                self.iter_frames(episode_index, name, first, last)
                 if name.startswith(CAMERA_PREFIX)
-                else iter(self.read_vectors(episode_index, name, start, max(stops)))
+                else self.read_vectors(episode_index, name, first, last)
             )
-            for index, value in enumerate(values, start + 1):
-                running.update(name, value)
-                if index in found:
-                    found[index] |= running.current()
-        return [found[stop] for stop in stops]
+            for index, value in enumerate(values, first):
+                running.update(name, index, value)
+        return running.digests()
 
     def sums(self) -> dict[str, str]:
         """Return the recorded SHA-256 of every file but the indexes', by relative path.

@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robomme_interference_data.conditions import in_order
-from robomme_interference_data.constants import INDEX_DIR, INDEX_HEADER, MANIFEST_PATH, MANIFESTS
+from robomme_interference_data.constants import (
+    FURTHER,
+    INDEX_DIR,
+    INDEX_HEADER,
+    MANIFEST_PATH,
+    MANIFESTS,
+)
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
 from robomme_interference_data.files import atomic_path
 from robomme_interference_data.hub import HubFiles
@@ -75,7 +81,9 @@ def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
         wanted = {
             path
             for path, (top, *below) in ((path, path.split("/")) for path in sizes)
-            if top in ("meta", MANIFESTS) or not below or (whole and top != INDEX_DIR)
+            if top in ("meta", MANIFESTS)
+            or not below
+            or (whole and top not in (INDEX_DIR, *FURTHER))
         }
         for name, dataset in split.datasets.items():
             if dataset.files is files:

@@ -78,10 +78,18 @@ class HubFiles:
         repo_type: `dataset` or `model`.
     """
 
+    folder = ""
+
     def __init__(self, repo_id: str, revision: str | None = None, repo_type: str = "dataset"):
         self.repo_id = repo_id
         self.revision = revision or "main"
         self.repo_type = repo_type
+
+    def inside(self, folder: str) -> "HubFiles":
+        """Return the files of a folder of the repository, at the same commit."""
+        found = HubFiles(self.repo_id, self.commit, self.repo_type)
+        found.folder = f"{folder}/"
+        return found
 
     @cached_property
     def commit(self) -> str:
@@ -118,7 +126,7 @@ class HubFiles:
                 relative,
                 hf_hub_download,
                 self.repo_id,
-                relative,
+                self.folder + relative,
                 repo_type=self.repo_type,
                 revision=self.commit,
                 tqdm_class=_silent(),
@@ -156,7 +164,8 @@ class HubFiles:
             repo_type=self.repo_type,
             revision=self.commit,
         )
-        return [path for path in dict.fromkeys(paths) if not isinstance(there(path), str)]
+        found = {path: there(self.folder + path) for path in dict.fromkeys(paths)}
+        return [path for path, place in found.items() if not isinstance(place, str)]
 
     def sizes(self) -> dict[str, int]:
         """Ask how large every file of the repository is; return bytes by path.
@@ -170,7 +179,11 @@ class HubFiles:
             tree = HfApi().list_repo_tree(
                 self.repo_id, recursive=True, revision=self.commit, repo_type=self.repo_type
             )
-            return {one.path: one.size for one in tree if hasattr(one, "size")}
+            return {
+                one.path.removeprefix(self.folder): one.size
+                for one in tree
+                if hasattr(one, "size") and one.path.startswith(self.folder)
+            }
 
         found: dict[str, int] = self._asked(None, listed)
         return found
@@ -183,16 +196,15 @@ class HubFiles:
         """
         from huggingface_hub import snapshot_download
 
-        return Path(
-            self._asked(
-                None,
-                snapshot_download,
-                self.repo_id,
-                repo_type=self.repo_type,
-                revision=self.commit,
-                allow_patterns=list(patterns),
-            )
+        whole = self._asked(
+            None,
+            snapshot_download,
+            self.repo_id,
+            repo_type=self.repo_type,
+            revision=self.commit,
+            allow_patterns=[self.folder + pattern for pattern in patterns],
         )
+        return Path(whole, self.folder)
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """Return the sorted paths of the files under a folder, which are downloaded.
@@ -204,7 +216,8 @@ class HubFiles:
 
     def describe(self) -> str:
         """Return `namespace/name@revision`, with the commit as revision once it is known."""
-        return f"{self.repo_id}@{self.__dict__.get('commit', self.revision)}"
+        whole = f"{self.repo_id}@{self.__dict__.get('commit', self.revision)}"
+        return f"{whole}, {self.folder}" if self.folder else whole
 
     def _check(self, relative: str, path: Path) -> None:
         """Check a file that has just come, and remove it if it is not what the Hub has.

@@ -53,6 +53,23 @@ FINAL = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
 
 
 @dataclass(frozen=True)
+class SpanDigests:
+    """SHA-256 over spans of a demonstration, all features but actions together.
+
+    Attributes:
+        first: The first half of the lesson.
+        second: The second half, which has a frame more where their number is odd.
+        last: The lesson's last frame.
+        query: The query frame.
+    """
+
+    first: str
+    second: str
+    last: str
+    query: str
+
+
+@dataclass(frozen=True)
 class EpisodeRecord:
     """An episode of a dataset, with what its source recorded of it.
 
@@ -67,8 +84,10 @@ class EpisodeRecord:
         exec_start_idx: Index of the query frame, which is the number of lesson frames; None in a
             distractor unit.
         exact: False if a frame was ever lossily compressed.
-        feature_sha256: Digest over all frames by feature, see `digest.py`.
-        lesson_sha256: Digest over the lesson, without the query frame, by feature; None in a unit.
+        feature_sha256: Digest by feature over the session that the episode is: the lesson, or all
+            frames of a unit; see `digest.py`.
+        span_sha256: Digests of the spans that parts of a lesson are, and of the query frame, by
+            name, see `spans`; None in a unit.
     """
 
     episode_index: int
@@ -81,7 +100,7 @@ class EpisodeRecord:
     exec_start_idx: int | None
     exact: bool
     feature_sha256: dict[str, str]
-    lesson_sha256: dict[str, str] | None
+    span_sha256: SpanDigests | None
 
     def __post_init__(self) -> None:
         if not self.goals or sum(map(len, self.goals)) > _MOST_GOALS:
@@ -100,11 +119,32 @@ class EpisodeRecord:
         """The goal in words: the first of its wordings."""
         return self.goals[0]
 
+    @property
+    def session(self) -> tuple[int, int]:
+        """The stored frames, end excluded, of the session that it is: a lesson, or a unit."""
+        return 0, self.length if self.exec_start_idx is None else self.exec_start_idx
+
+    @property
+    def spans(self) -> dict[str, tuple[int, int]]:
+        """The stored frames, end excluded, of the spans of `SpanDigests`; a unit has none."""
+        if self.exec_start_idx is None:
+            return {}
+        return lesson_spans(self.exec_start_idx)
+
     def digests(self, start: int, stop: int) -> dict[str, str] | None:
         """Return the recorded digests of a span by feature; None if none are recorded for it."""
-        if (start, stop) == (0, self.length):
-            return self.feature_sha256
-        return self.lesson_sha256 if (start, stop) == (0, self.exec_start_idx) else None
+        return self.feature_sha256 if (start, stop) == self.session else None
+
+
+def lesson_spans(frames: int) -> dict[str, tuple[int, int]]:
+    """Return the spans of a demonstration of so many lesson frames; see `EpisodeRecord.spans`."""
+    half = frames // 2
+    return {
+        "first": (0, half),
+        "second": (half, frames),
+        "last": (frames - 1, frames),
+        "query": (frames, frames + 1),
+    }
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from robomme_interference_data.cache import DecodedCache
 from robomme_interference_data.conditions import Condition, parse_condition
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
+    FURTHER,
     MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
@@ -138,6 +139,8 @@ class Split:
         place, own = self.header.datasets[name].place, self.files
         if isinstance(own, LocalFiles) and (place is None or (own.root / name).is_dir()):
             return LocalFiles(own.root / name)
+        if place is None and isinstance(own, HubFiles) and name in FURTHER:
+            return own.inside(name)
         if place is None:
             raise MissingFileError(
                 f"the manifests of {self.location} do not say where its {name} are",

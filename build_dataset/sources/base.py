@@ -122,6 +122,19 @@ class Source(Protocol):
         """
         ...
 
+    def contradict(self, episode: SourceEpisode) -> SourceEpisode:
+        """Return the episode in the very scene of one that `episodes` listed, with another answer.
+
+        Raises:
+            SourceError: The source cannot make it.
+        """
+        raise SourceError(
+            f"no contradicting lesson of {episode.id}: in what {self.provenance['kind']} gives, "
+            "scene and answer come together",
+            "Conditions with contradicting lessons, stale-k<n> and misled-k<n>, are for --source "
+            "tabletop, which draws them apart.",
+        )
+
     def close(self) -> None:
         """Release what is held from one episode to the next: nothing, unless a source says so."""
         return

@@ -1,6 +1,7 @@
 """Source `tabletop` and `robomme`: a simulator plays the episodes while they are read."""
 
 from collections.abc import Callable, Generator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,14 @@ class SimulatorSource(Source):
     def episodes(self) -> list[SourceEpisode]:
         """List all episodes: RoboMME's numbers are those of the tabletop suite."""
         return [SourceEpisode(one, self.provenance) for one in sorted(episode_ids())]
+
+    def contradict(self, episode: SourceEpisode) -> SourceEpisode:
+        """Return an episode in the same scene with another answer; see `Source.contradict`."""
+        if self.name != "tabletop":
+            return super().contradict(episode)
+        from robomme_interference_data.simulators.tabletop.families import other_answer
+
+        return SourceEpisode(replace(episode.id, answer=other_answer(episode.id)), episode.key)
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Begin to play an episode; see `Source.read`."""

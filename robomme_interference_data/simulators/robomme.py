@@ -129,6 +129,11 @@ class RoboMMESimulator(Simulator):
         self._process.end()
 
     def _begin(self, episode: EpisodeId, demonstration: bool) -> Begun:
+        if episode.answer is not None:
+            raise UnknownNameError(
+                f"{episode}: RoboMME draws scene and answer together; it has no other answer",
+                f"Give the episode itself, {episode.scene}, or use the simulator tabletop.",
+            )
         known = self._process.families
         if episode.family not in known:
             raise UnknownNameError.among("family", episode.family, self.name, known)
@@ -138,7 +143,9 @@ class RoboMMESimulator(Simulator):
         self._process.played += 1
         about, arrays = self._process.call(
             "reset",
-            **vars(episode),
+            family=episode.family,
+            split=episode.split,
+            index=episode.index,
             max_steps=MAX_STEPS,
             cameras=self._cameras,
             demonstration=demonstration,

@@ -9,12 +9,8 @@ from support.splits import CONDITIONS, GOLDEN, QUERIES, contents, copy_split
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
-from robomme_interference_data.build_dataset.manifests import (
-    in_folder,
-    plan_manifests,
-    planned_buffers,
-    write_manifests,
-)
+from robomme_interference_data.build_dataset.manifests import planned_buffers, write_manifests
+from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.conditions import KINDS, Kind
 from robomme_interference_data.digest import combine
 from robomme_interference_data.draw import UnitPool
@@ -63,7 +59,7 @@ def test_what_buffers_hold(tmp_path: Path) -> None:
     found = {str(one): one for one in planned_buffers(plan)}
     assert len(found) == 8 * 4
     one = found["PatternLock/test/1 under k4"]
-    pool = UnitPool((unit.episode_id for unit in plan.distractors.records()), 5)
+    pool = UnitPool((unit.episode_id for unit in plan.datasets["distractors"].records()), 5)
     drawn = pool.draw(one.episode_id, 4)
     assert [session.source for session in one.sessions] == [one.episode_id, *drawn]
     lesson, *units = one.sessions
@@ -72,10 +68,9 @@ def test_what_buffers_hold(tmp_path: Path) -> None:
     place = (lesson.role, lesson.dataset, lesson.start, lesson.stop, lesson.repeat)
     assert place == ("lesson", "demonstrations", 0, 33, 1)
     assert lesson.revision == plan.demonstrations.revision
-    assert query.lesson_sha256 is not None
-    assert lesson.sha256 == combine(query.lesson_sha256)
+    assert lesson.sha256 == combine(query.feature_sha256)
     for unit in units:
-        stored = plan.distractors.record(unit.episode_index)
+        stored = plan.datasets["distractors"].record(unit.episode_index)
         assert stored.episode_id == unit.source
         place = (unit.role, unit.dataset, unit.start, unit.stop, unit.sha256)
         sha256 = combine(stored.feature_sha256)
@@ -90,6 +85,66 @@ def test_what_buffers_hold(tmp_path: Path) -> None:
     empty = found["PatternLock/test/1 under no-history"]
     assert (empty.sessions, empty.history_frames, empty.lesson_share) == ((), 0, 0.0)
     assert empty.query == one.query
+
+
+def test_what_buffers_beyond_the_paper_hold(tmp_path: Path) -> None:
+    """The stored spans of each session; the draws are held by test_draw."""
+    root = made_up(tmp_path)
+    names = ("k2", "before-k2", "middle-k3", "held-k2", "same-k1", "parts-k2", "absent-k2")
+    plan = plan_manifests(in_folder(root), names)
+    found = {
+        one.condition: one
+        for one in planned_buffers(plan)
+        if str(one.episode_id) == "PatternLock/test/1"
+    }
+    lesson, *units = found["k2"].sessions
+    assert found["before-k2"].sessions == (*units, lesson)
+    assert found["absent-k2"].sessions == (*units,)
+    assert (found["absent-k2"].lesson_frames, found["absent-k2"].lesson_share) == (0, 0.0)
+    first, second, *rest = found["middle-k3"].sessions
+    assert [first, second] == units
+    assert [one.role for one in rest] == ["lesson", "distractor"]
+    start, *held = found["held-k2"].sessions
+    assert start == lesson
+    assert held[0] == held[1]
+    one = held[0]
+    assert (one.role, one.start, one.stop, one.repeat, one.sha256) == ("filler", 32, 33, 32, "l")
+    assert (one.source, one.dataset) == (lesson.source, "demonstrations")
+    assert (found["held-k2"].history_frames, found["held-k2"].lesson_frames) == (97, 33)
+    own = found["same-k1"].sessions[1]
+    assert (own.role, own.family, own.source.split) == ("distractor", "PatternLock", "train")
+    begin, *middle, end = found["parts-k2"].sessions
+    assert middle == units
+    assert [(one.role, one.start, one.stop) for one in (begin, end)] == [
+        ("lesson", 0, 16),
+        ("lesson", 16, 33),
+    ]
+    assert (begin.sha256, end.sha256) == ("1", "2")
+    assert found["parts-k2"].lesson_frames == 33
+
+
+def test_datasets_that_conditions_need(tmp_path: Path) -> None:
+    root = made_up(tmp_path)
+    for name, needed in (("raw-k1", "distractors-raw"), ("misled-k0", "contradictions")):
+        with pytest.raises(SourceError, match=f"{name} needs the dataset {needed}") as caught:
+            plan_manifests(in_folder(root), ("k1", name))
+        assert f"build {needed}" in str(caught.value.hint)
+    records = [record("contradictions", "PatternLock/test/1/2", lesson=40)]
+    write_metadata(root / "contradictions", "contradictions", records)
+    plan = plan_manifests(in_folder(root), ("stale-k1",))
+    assert list(plan.datasets) == ["demonstrations", "distractors", "contradictions"]
+    with pytest.raises(SourceError, match=r"contradictions does not hold \w+/test/0"):
+        list(planned_buffers(plan))
+    queries = [record("demonstrations", "PatternLock/test/1")]
+    one = made_up(tmp_path / "one", queries=queries)
+    write_metadata(one / "contradictions", "contradictions", records)
+    [found] = planned_buffers(plan_manifests(in_folder(one), ("stale-k1",)))
+    roles = [(one.role, str(one.source), one.stop) for one in found.sessions[:2]]
+    assert roles == [
+        ("contradiction", "PatternLock/test/1/2", 40),
+        ("lesson", "PatternLock/test/1", 20),
+    ]
+    assert (found.lesson_frames, found.history_frames) == (20, 92)
 
 
 def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:

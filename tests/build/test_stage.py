@@ -21,8 +21,10 @@ from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.stage import Staged, StageTask, read_staged
+from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.execution import Worker
+from robomme_interference_data.records import SpanDigests
 from robomme_interference_data.video import iter_frames
 
 NAME = "MoveCube/test/0"
@@ -59,8 +61,16 @@ def test_a_demonstration(tmp_path: Path) -> None:
     front = np.stack([picture(f"{NAME} front", number) for number in range(21)])
     states = np.arange(21, dtype=np.float32)[:, None].repeat(8, 1)
     whole = {"observation.images.front": front, "observation.state": states, "action": 0 - states}
-    assert known.feature_sha256 == {name: digest(v) for name, v in whole.items()}
-    assert known.lesson_sha256 == {name: digest(v[:20]) for name, v in whole.items()}
+    assert known.feature_sha256 == {name: digest(v[:20]) for name, v in whole.items()}
+    shown = {"observation.images.front": front, "observation.state": states}
+    spans = {"first": (0, 10), "second": (10, 20), "last": (19, 20), "query": (20, 21)}
+    assert known.spans == spans
+    assert known.span_sha256 == SpanDigests(
+        **{
+            span: combine({name: digest(v[start:stop]) for name, v in shown.items()})
+            for span, (start, stop) in spans.items()
+        }
+    )
     assert made.features == {name: v.shape[1:] for name, v in whole.items()}
     decoded = np.stack(list(iter_frames(made.videos["observation.images.front"], 0, None, 10)))
     np.testing.assert_array_equal(decoded, front)
@@ -113,10 +123,8 @@ def test_of_a_lossy_codec_the_decoded_frames_are_hashed(tmp_path: Path) -> None:
     source.wrong[NAME] = big
     made = stored(tmp_path, source, codec="lerobot-default")
     decoded = np.stack(list(iter_frames(made.videos["observation.images.front"], 0, None, 10)))
-    digests = made.record.feature_sha256, made.record.lesson_sha256
-    assert digests[0]["observation.images.front"] == digest(decoded)
-    assert digests[1] is not None
-    assert digests[1]["observation.images.front"] == digest(decoded[:4])
+    digests = made.record.feature_sha256
+    assert digests["observation.images.front"] == digest(decoded[:4])
     assert not made.record.exact
 
 

@@ -88,7 +88,7 @@ def test_the_reference_library_reads_the_rows(published: Path) -> None:
 @pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Rollout])
 def test_every_column_is_described(record: type) -> None:
     columns = columns_of(record)
-    maps = {"feature_sha256", "lesson_sha256"}
+    maps = {"feature_sha256"}
     assert {one.name for one in columns} == {*arrow_schema(record).names} - maps
     for column in (part for one in columns for part in (one, *one.parts)):
         assert column.about.endswith((".", "…")), column.name

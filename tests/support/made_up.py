@@ -20,7 +20,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.files import LocalFiles, write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.records import EpisodeRecord, SpanDigests
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 from robomme_interference_data.simulators.base import choose_cameras
 
@@ -44,7 +44,7 @@ def record(
         "exec_start_idx": None if unit else lesson,
         "exact": True,
         "feature_sha256": digests,
-        "lesson_sha256": None if unit else digests,
+        "span_sha256": None if unit else SpanDigests("1", "2", "l", "q"),
     }
     return EpisodeRecord(**{**known, **changes})
 

@@ -1,35 +1,26 @@
-"""Conditions that nobody has foreseen go the whole way: the lesson may stand last, or nowhere."""
+"""Conditions beyond the paper go the whole way: the lesson last, in parts, or nowhere."""
 
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import worlds
 from support.runs import run as evaluate
 
 from robomme_interference_data import load_split
-from robomme_interference_data.conditions import KINDS, Kind, Material
-from robomme_interference_data.records import SessionEntry
 
 Run = Callable[..., tuple[int, str, str]]
 QUERY = "MoveCube/test/0"
-
-
-def _units_then_lesson(material: Material, k: int) -> tuple[SessionEntry, ...]:
-    return (*material.units(k), material.lesson())
-
-
-def _units_alone(material: Material, k: int) -> tuple[SessionEntry, ...]:
-    return tuple(material.units(k))
+PARTS = (slice(0, 24), slice(48, 80), slice(24, 48))  # of k1: 48 frames of lesson, 32 of a unit
 
 
 @pytest.fixture
 def split(own_split: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A split with buffers of two kinds of conditions that are registered here alone."""
-    monkeypatch.setitem(KINDS, "before", Kind("before", _units_then_lesson))
-    monkeypatch.setitem(KINDS, "absent", Kind("absent", _units_alone))
-    names = ("no-history", "k0", "k1", "before-k1", "before-k3", "absent-k1")
+    """A split with buffers of kinds of conditions beyond the paper's."""
+    names = ("no-history", "k0", "k1", "before-k1", "before-k3", "held-k1", "same-k1", "parts-k1")
+    names += ("absent-k1",)
     code, _, err = run("build", "manifests", own_split, "--conditions", *names)
     assert code == 0, err
     monkeypatch.setenv(worlds.SPLIT, str(own_split))
@@ -51,6 +42,13 @@ def test_buffers_of_other_kinds(split: Path, run: Run, tmp_path: Path) -> None:
     assert (before.frames()[32:] == plain.frames()[:48]).all()
     assert opened.load(QUERY, "absent-k1").manifest.sessions == (unit,)
     assert opened.manifest(QUERY, "absent-k1").lesson_share == 0.0
+    held = opened.load(QUERY, "held-k1").frames()
+    assert len(held) == 80
+    assert (held[48:] == held[47]).all()
+    parts = opened.load(QUERY, "parts-k1").frames()
+    assert (parts == np.concatenate([*(plain.frames()[s] for s in PARTS)])).all()
+    for buffer in (before, opened.load(QUERY, "held-k1"), opened.load(QUERY, "parts-k1")):
+        buffer.verify()
     for command in ("verify", "audit"):
         code, out, err = run(command, split)
         assert code == 0, out + err
@@ -73,7 +71,7 @@ def test_retrieval_of_other_kinds(split: Path, run: Run) -> None:
     code, out, err = run("retrieval-score", split, "--json")
     assert code == 0, err
     graded = {row["condition"] for row in json.loads(out)["cells"]}
-    assert {"before-k1", "before-k3"} < graded
+    assert {"before-k1", "before-k3", "held-k1", "same-k1", "parts-k1"} < graded
     assert not graded & {"absent-k1", "no-history"}  # nothing of the lesson to be found
 
 

@@ -58,7 +58,8 @@ class TabletopSimulator(Simulator):
         seed = seed_of(episode)
         self.env.family = episode.family
         self.env.demonstrated = self._cameras if demonstration else ()
-        _, info = self.env.reset(seed=seed)
+        options = {} if episode.answer is None else {"answer": episode.answer}
+        _, info = self.env.reset(seed=seed, options=options)
         about = EpisodeInfo(info["goals"], info["difficulty"], seed, self.name)
         return info["demonstration"], self.env.observe(self._cameras), about
 

@@ -1,6 +1,10 @@
 """The nine task families: a file each."""
 
+from numpy.random import RandomState
+
 from robomme_interference_data.errors import UnknownNameError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
 from robomme_interference_data.simulators.tabletop.families.insert_peg import InsertPeg
 from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
 from robomme_interference_data.simulators.tabletop.families.pattern_lock import PatternLock
@@ -39,3 +43,18 @@ def family_class(name: str) -> type[Family]:
     if name not in _FAMILIES:
         raise UnknownNameError.among("family", name, "tabletop", _FAMILIES)
     return _FAMILIES[name]
+
+
+def other_answer(episode: EpisodeId) -> int:
+    """Return the number of an answer that an episode's scene allows and that is not its own.
+
+    Over episodes they take turns, as own answers do.
+
+    Raises:
+        UnknownNameError: There is no such episode.
+    """
+    seed = seed_of(episode)
+    family = family_class(episode.family)(difficulty_of(seed), RandomState(seed))
+    count = len(family.answers)
+    other, own = turn_of(seed, count - 1, stream=2), turn_of(seed, count)
+    return other + (other >= own)

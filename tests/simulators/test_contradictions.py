@@ -1,0 +1,75 @@
+"""Contradicting lessons: the very scene of a query, with another answer."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from robomme_interference_data.build_dataset.sources.base import SourceEpisode
+from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import SourceError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.tabletop.episodes import (
+    difficulty_of,
+    episode_ids,
+    seed_of,
+    turn_of,
+)
+from robomme_interference_data.simulators.tabletop.families import family_class, other_answer
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Iterator[TabletopSimulator]:
+    with TabletopSimulator() as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_goal_and_first_view_are_the_querys(simulator: TabletopSimulator, family: str) -> None:
+    episode = EpisodeId(family, "test", 1)
+    source = SimulatorSource("tabletop")
+    other = source.contradict(SourceEpisode(episode)).id
+    assert other.scene == episode
+    assert other.answer is not None
+    lesson, first, info = simulator.reset(str(episode), demonstration=False)
+    own = simulator.env.answer
+    contradicting, again, told = simulator.reset(str(other), demonstration=False)
+    assert simulator.env.answer != own
+    assert simulator.env.answer == simulator.env.episode.answers[other.answer]
+    assert told == info
+    for camera, image in first.images.items():
+        np.testing.assert_array_equal(again.images[camera], image)
+    np.testing.assert_array_equal(again.state, first.state)
+    if not family.startswith("VideoUnmask"):  # there the arm stands still while the scene plays
+        shorter = min(len(lesson), len(contradicting))
+        assert not np.array_equal(lesson.states[:shorter], contradicting.states[:shorter])
+
+
+def test_other_answers_take_turns() -> None:
+    """Over the episodes of a family, split and difficulty, every other answer comes up alike."""
+    uses: dict[tuple[str, str, str], Counter[int]] = {}
+    counts: dict[tuple[str, str, str], set[int]] = {}
+    for episode in episode_ids():
+        seed = seed_of(episode)
+        number = other_answer(episode)
+        rng = np.random.RandomState(seed)
+        count = len(family_class(episode.family)(difficulty_of(seed), rng).answers)
+        own = turn_of(seed, count)
+        assert number != own
+        assert 0 <= number < count
+        group = episode.family, episode.split, difficulty_of(seed)
+        counts.setdefault(group, set()).add(count)
+        uses.setdefault(group, Counter())[number - (number > own)] += 1
+    for group, found in uses.items():
+        (count,) = counts[group]
+        if count - 1 <= found.total():
+            assert max(found.values()) - min(found.values()) <= 1
+            assert len(found) == count - 1
+
+
+def test_official_episodes_have_no_other_answer() -> None:
+    with pytest.raises(SourceError, match="scene and answer come together"):
+        SimulatorSource("robomme").contradict(SourceEpisode(EpisodeId("MoveCube", "test", 0)))
