@@ -3,14 +3,20 @@
 A demonstration is every raw frame of the demonstration section and then the first live
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
 32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw one all
-256 of them. Nothing is read beyond the last frame that is needed.
+of them, so that every unit has a raw one, of 249 frames at least. Nothing is read beyond the last frame that is needed.
 """
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 from robomme_interference_data.build_dataset.sources.base import Frame
-from robomme_interference_data.constants import CONTRADICTIONS, DEMONSTRATIONS, UNITS, Unit
+from robomme_interference_data.constants import (
+    CONTRADICTIONS,
+    DEMONSTRATIONS,
+    UNIT_MIN_RAW_FRAMES,
+    UNITS,
+    Unit,
+)
 from robomme_interference_data.errors import SourceError
 
 
@@ -45,16 +51,17 @@ def cut_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
     """Yield the frames of a unit.
 
     Raises:
-        NothingToStore: The episode has fewer raw frames, 249 or 256: it is not padded.
+        NothingToStore: The episode has fewer than 249 raw frames: it is not padded.
     """
-    count, needed = 0, (unit.frames - 1) * unit.stride + 1
+    count, most = 0, (unit.frames - 1) * unit.stride + 1
     for frame in frames:
         if count % unit.stride == 0:
             yield frame
         count += 1
-        if count == needed:
+        if count == most:
             return
-    raise NothingToStore(f"{count} raw frames; a unit needs {needed}")
+    if count < UNIT_MIN_RAW_FRAMES:
+        raise NothingToStore(f"{count} raw frames; a unit needs {UNIT_MIN_RAW_FRAMES}")
 
 
 CUTS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {

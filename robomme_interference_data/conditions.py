@@ -165,7 +165,7 @@ _KINDS = (
     Kind(
         "raw",
         _raw,
-        "lesson, n sessions of the units' episodes at full rate: 256 frames, stride 1",
+        "lesson, the same n units at full rate: 256 frames, stride 1",
         "whether the stride gives the border away",
         (RAW_DISTRACTORS,),
     ),

@@ -101,7 +101,7 @@ class Unit(NamedTuple):
     """What a distractor unit is cut of a recorded episode: raw frames 0, stride, and so on.
 
     Attributes:
-        frames: Stored frames.
+        frames: Stored frames; fewer at full rate, if the episode ends before.
         stride: Raw frames from one stored frame to the next.
     """
 

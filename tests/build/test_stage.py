@@ -218,6 +218,10 @@ def test_units_and_demonstrations() -> None:
     ]
     # fmt: on
     assert steps(CUTS[DEMONSTRATIONS](marks(3, 100))) == [0, 1, 2, 3]  # 3: the query frame
+    assert steps(CUTS[CONTRADICTIONS](marks(3, 100))) == [0, 1, 2, 3]
+    for length in (249, 255, 256, 400):  # whatever gives a unit gives a raw one
+        raw = steps(CUTS[RAW_DISTRACTORS](marks(None, length)))
+        assert raw == list(range(min(length, 256)))
 
 
 @given(lesson=st.none() | st.integers(0, 400), length=st.integers(0, 400))
@@ -239,6 +243,7 @@ def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
     ("kind", "lesson", "length", "reason"),
     [
         (DISTRACTORS, None, 248, "248 raw frames; a unit needs 249"),
+        (RAW_DISTRACTORS, None, 248, "248 raw frames; a unit needs 249"),
         (DEMONSTRATIONS, 0, 100, "no demonstration frame"),
         (DEMONSTRATIONS, 100, 100, "no live observation after the demonstration"),
     ],
