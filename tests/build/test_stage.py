@@ -21,6 +21,12 @@ from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.stage import Staged, StageTask, read_staged
+from robomme_interference_data.constants import (
+    CONTRADICTIONS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    RAW_DISTRACTORS,
+)
 from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.execution import Worker
