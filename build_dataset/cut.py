@@ -3,7 +3,8 @@
 A demonstration is every raw frame of the demonstration section and then the first live
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
 32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw one all
-of them, so that every unit has a raw one, of 249 frames at least. Nothing is read beyond the last frame that is needed.
+of them, 249 at least, so that every unit has one. Nothing is read beyond the last frame that is
+needed.
 """
 
 from collections.abc import Callable, Iterable, Iterator

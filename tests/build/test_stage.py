@@ -202,8 +202,6 @@ def test_statistics_against_numpy_in_any_order(images: NDArray[np.uint8]) -> Non
 
 # --- cuts ----------------------------------------------------------------------------------------
 
-DEMONSTRATIONS, DISTRACTORS = "demonstrations", "distractors"
-
 
 def marks(lesson: int | None, length: int) -> Generator[Frame]:
     """Yield frames that only say their number, as state, and whether they are the lesson."""
