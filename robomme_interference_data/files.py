@@ -80,9 +80,10 @@ class LocalFiles:
         """Return the file's path; see `Files.path`."""
         path = self.root / check_relative(relative, self.describe())
         # Links are followed only inside the folder, and into the store that the Hub's client
-        # keeps its snapshots' files in.
+        # keeps the files of a snapshot, or of a folder in one, in.
         root = self.root.resolve()
-        store = root.parent.parent / "blobs" if root.parent.name == "snapshots" else root
+        stores = (one.parent.parent / "blobs" for one in (root, root.parent) if _is_snapshot(one))
+        store = next(stores, root)
         real = Path(os.path.realpath(path))  # which a link that goes round does not stop
         if not (real.is_relative_to(root) or real.is_relative_to(store)):
             raise FormatError(
@@ -124,6 +125,10 @@ def all_files(root: Path) -> list[str]:
     """Return the sorted relative paths of all that is no folder, links that lead nowhere too."""
     found = (path for path in root.rglob("*") if path.is_symlink() or not path.is_dir())
     return sorted(path.relative_to(root).as_posix() for path in found)
+
+
+def _is_snapshot(folder: Path) -> bool:
+    return folder.parent.name == "snapshots"
 
 
 def check_relative(relative: str, where: str) -> str:

@@ -7,6 +7,7 @@ every machine makes the same pixels.
 
 import hashlib
 from collections.abc import Generator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ _SHORT = 200
 class SampleSource(Source):
     """Three train episodes and a test episode of each family.
 
+    In a contradicting lesson the gripper goes the other way round.
+
     Args:
         families: Names of the families, which need not be the benchmark's.
         size: Height and width of the images in pixels, a multiple of 16.
@@ -54,6 +57,10 @@ class SampleSource(Source):
         # The same episode of another place among the families looks different.
         return [SourceEpisode(one, self._families.index(one.family)) for one in sorted(ids)]
 
+    def contradict(self, episode: SourceEpisode) -> SourceEpisode:
+        """Return an episode in the same scene with another answer; see `Source.contradict`."""
+        return replace(episode, id=replace(episode.id, answer=1))
+
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Make an episode up; see `Source.read`."""
         name = episode.id
@@ -71,7 +78,8 @@ class _Scene:
     """One episode's table, cubes and path, on a grid of 256 × 256."""
 
     def __init__(self, episode: EpisodeId, family: int, size: int):
-        digest = hashlib.sha256(str(episode).encode()).digest()
+        digest = hashlib.sha256(str(episode.scene).encode()).digest()
+        self._contradicts, self._mirrored = episode.answer is not None, 0
         self.seed = int.from_bytes(digest[:4])
         self.size = size
         self._periods = (40 + 6 * family, 56 + 4 * family + digest[4] % 8)
@@ -84,16 +92,17 @@ class _Scene:
 
     def frames(self, length: int, lesson: int, cameras: tuple[str, ...]) -> Generator[Frame]:
         """Yield the frames of an episode, `lesson` of them the demonstration."""
+        self._mirrored = lesson if self._contradicts else 0
         for step in range(length):
             images = {camera: getattr(self, camera)(step) for camera in cameras}
             yield Frame(images, self.state(step), self.state(step + 1), step < lesson)
 
     def _gripper(self, step: int) -> tuple[int, int]:
         """Column and row of the gripper at a step."""
-        return (
-            32 + _triangle(step, self._periods[0], 192),
-            70 + _triangle(step, self._periods[1], 130),
+        across, down = (
+            _triangle(step, p, h) for p, h in zip(self._periods, (192, 130), strict=True)
         )
+        return 32 + (192 - across if step < self._mirrored else across), 70 + down
 
     def front(self, step: int) -> NDArray[np.uint8]:
         """Draw the front view, `(size, size, 3) uint8`."""

@@ -7,10 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import worlds
+from support.hub_server import HubServer
+from support.publishing import UNITS, plain_cards, publish
 from support.runs import run as evaluate
 
 from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.constants import DATASETS
+from robomme_interference_data.query import Query
 
+Login = Callable[..., None]
 Run = Callable[..., tuple[int, str, str]]
 QUERY = "MoveCube/test/0"
 PARTS = (slice(0, 24), slice(48, 80), slice(24, 48))  # of k1: 48 frames of lesson, 32 of a unit
@@ -92,3 +98,58 @@ def test_rollouts_and_scores_of_other_kinds(split: Path, run: Run, tmp_path: Pat
     code, _, err = run("score", tmp_path / "run", "--grid", "given", "--out", out)
     assert code == 0, err
     assert "before-k1" in (out / "report.html").read_text()
+
+
+FURTHER = ("raw-k1", "stale-k1", "misled-k0")
+
+
+@pytest.mark.slow
+def test_further_datasets_go_to_the_hub_and_back(
+    hub: HubServer, login: Login, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At full rate, and with contradicting lessons: folders of the split's repository."""
+    plain_cards(monkeypatch)
+    login("someone")
+    root, sources = tmp_path / "split", ("--source", "sample", "--workers", "1")
+    wanted = ("--split", "test", "--families", "MoveCube", "--cameras", "front")
+    code, _, err = run(
+        *("build", "all", *sources, *wanted, "--conditions", "k1", *FURTHER),
+        *("--unit-episodes", "0", "--out", root),
+    )
+    assert code == 0, err
+    for command in ("verify", "audit"):
+        code, out, err = run(command, root)
+        assert code == 0, out + err
+    here = load_split(root)
+    assert {*here.datasets} == {*DATASETS}
+    lesson, unit = here.manifest(QUERY, "k1").sessions
+    raw, stale = here.load(QUERY, "raw-k1"), here.load(QUERY, "stale-k1")
+    assert raw.manifest.sessions[1].source == unit.source
+    assert len(raw) == len(here.load(QUERY, "k1")) + 256 - 32
+    fewer = here.load(QUERY, "k1").frames()[48:]
+    assert (raw.frames()[48::8] == fewer).all()
+    contradiction = stale.manifest.sessions[0]
+    assert (contradiction.role, str(contradiction.source)) == ("contradiction", f"{QUERY}/1")
+    assert stale.manifest.sessions[1:] == (lesson, unit)
+    other = Query(here.datasets["contradictions"], here.datasets["contradictions"].record(0))
+    assert (other.goal, other.frame().tolist()) == (raw.goal, here.query(QUERY).frame().tolist())
+    assert (other.state() == here.query(QUERY).state()).all()
+    assert (stale.frames()[:48] != stale.frames()[48:96]).any()
+
+    publish(root)
+    there = load_split(UNITS)
+    assert there.revision == here.revision
+    for name in ("k1", *FURTHER):
+        buffer = there.load(QUERY, name, verify=True)
+        assert (buffer.frames() == here.load(QUERY, name).frames()).all()
+    assert list(verify_split(there)) == []
+    copy = tmp_path / "copy"
+    code, _, err = run("fetch", UNITS, "--to", copy)
+    assert code == 0, err
+    assert (load_split(copy).load(QUERY, "stale-k1", verify=True).frames() == stale.frames()).all()
+    code, out, err = run("verify", copy)
+    assert code == 0, out + err
+    code, _, err = run("fetch", UNITS, "--conditions", "k1", "--to", tmp_path / "part")
+    assert code == 0, err
+    assert load_split(tmp_path / "part").load(QUERY, "k1", verify=True).condition == "k1"
+    assert not list((tmp_path / "part").rglob("contradictions/videos"))
