@@ -2,7 +2,7 @@
 
 import filecmp
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -87,7 +87,7 @@ def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
         }
         for name, dataset in split.datasets.items():
             if dataset.files is files:
-                wanted |= {*_paths(dataset, episodes[name], cameras, config.index)}
+                wanted |= {*_paths(dataset, episodes[name], cameras, config.index, sizes)}
         if lacking := sorted(wanted - sizes.keys()):
             more = f" and {len(lacking) - 1} more files" if len(lacking) > 1 else ""
             hint = "Without --index, the frames can be fetched." if config.index else None
@@ -154,7 +154,11 @@ def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
 
 
 def _paths(
-    dataset: "Dataset", episodes: Iterable[int], cameras: Iterable[str], encoder: str | None
+    dataset: "Dataset",
+    episodes: Iterable[int],
+    cameras: Iterable[str],
+    encoder: str | None,
+    there: Container[str],
 ) -> Iterator[str]:
     from robomme_interference_data.embeddings import (
         CENTRE_FILE,
@@ -167,8 +171,10 @@ def _paths(
         yield from dataset.files_of(index, cameras)
     for camera in cameras if encoder is not None else ():
         folder = index_folder(encoder or "", camera)
-        own = (INDEX_HEADER, INDEX_SUMS, CENTRE_FILE, *map(episode_file, episodes))
+        own = (INDEX_HEADER, INDEX_SUMS, *map(episode_file, episodes))
         yield from (f"{folder}/{name}" for name in own)
+        if (centre := f"{folder}/{CENTRE_FILE}") in there:  # of units, if the encoder is centred
+            yield centre
 
 
 def _copy(source: Path, target: Path) -> None:

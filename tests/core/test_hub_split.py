@@ -23,6 +23,7 @@ from robomme_interference_data.errors import FormatError, HubError, MissingFileE
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.run import run_evaluation
 from robomme_interference_data.execution import Serial
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 
 QUERY = "MoveCube/test/0"
 VERSION = "data-1.0.0"
@@ -188,6 +189,23 @@ def test_fetch_is_for_repositories_and_mixes_no_splits(
 def test_a_repository_that_is_no_split(hub: HubServer) -> None:
     with pytest.raises(MissingFileError, match="is not a split"):
         load_split(BASE)
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_a_part_comes_with_its_embeddings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Any, centred: bool
+) -> None:
+    root, out, encoder = copy_split(tmp_path / "units"), tmp_path / "part", Thumbnail()
+    encoder.centred = centred
+    make_index(root, encoder)
+    part = ("--families", "MoveCube", "--conditions", "k1", "--cameras", "front")
+    with running_hub(tmp_path / "cache", monkeypatch) as server:
+        push_split(server, root, tmp_path / "work")
+        assert run("fetch", SPLIT, *part, "--index", "thumbnail", "--to", out)[0] == 0
+    found, expected = (
+        load_split(one).load("MoveCube/test/0", "k1", cameras=["front"]) for one in (out, root)
+    )
+    assert np.array_equal(found.embeddings("thumbnail"), expected.embeddings("thumbnail"))
 
 
 # --- every command takes a repository -------------------------------------------------------------
