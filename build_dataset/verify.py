@@ -1,6 +1,7 @@
 """Recompute every hash and every rule of a split, and name each violation."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,11 +92,9 @@ def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Viola
             yield Violation(name, error.message)
     frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
     progress.start("Verifying", frames if decode else 0)
-    pool = datasets.get(DISTRACTORS)
     for name, dataset in datasets.items():
         yield from _told(name, _dataset(name, dataset, header, progress if decode else None))
-        if pool is not None:
-            yield from _indexes(name, dataset, pool.revision)
+        yield from _indexes(name, dataset, datasets.get(DISTRACTORS))
     if len(datasets) == len(header.datasets):
         yield from _told(MANIFESTS, _buffers(split, datasets))
 
@@ -186,7 +185,7 @@ def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Vi
             yield Violation(where, f"{told} do not have the recorded SHA-256")
 
 
-def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
+def _indexes(name: str, dataset: Dataset, units: Dataset | None) -> Iterator[Violation]:
     """Check the embeddings beside a dataset, whatever encoders and cameras they are of."""
     root = dataset.files.snapshot() / INDEX_DIR
     folders: dict[str, list[str]] = {}
@@ -197,23 +196,24 @@ def _indexes(name: str, dataset: Dataset, pool: str) -> Iterator[Violation]:
         elif not path.startswith("."):  # one that is being made
             folders.setdefault(f"{INDEX_DIR}/{folder}", []).append(path)
     for folder, files in folders.items():
-        yield from _told(f"{name}/{folder}", _index(name, dataset, folder, pool))
+        yield from _told(f"{name}/{folder}", _index(name, dataset, folder, units))
         for path in files:
             if not (root / path).is_file():
                 yield Violation(f"{name}/{INDEX_DIR}/{path}", "leads nowhere")
 
 
-def _index(name: str, dataset: Dataset, folder: str, pool: str) -> Iterator[Violation]:
+def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> Iterator[Violation]:
     where = f"{name}/{folder}"
     header = read_header(dataset.files.path(f"{folder}/{INDEX_HEADER}"), IndexHeader)
     made = header.encoder.name, header.camera
     if index_folder(*made) != folder:
         yield Violation(where, f"holds the embeddings of {made[0]}, camera {made[1]}")
-    else:
-        lengths = {record.episode_index: record.length for record in dataset.records()}
-        dataset.index(*made).check(lengths)
-    if header.pool != pool:
-        yield Violation(where, "its centre and typical cosine are of other distractors")
+        return
+    lengths = {record.episode_index: record.length for record in dataset.records()}
+    dataset.index(*made).check(lengths, units=name == DISTRACTORS)
+    with suppress(InterferenceError):  # which is told where the units are checked
+        if units is not None and units.index(*made).made != dataset.index(*made).made:
+            yield Violation(where, f"was made with another encoder than that of the {DISTRACTORS}")
 
 
 def _buffers(split: Split, datasets: Mapping[str, Dataset]) -> Iterator[Violation]:

@@ -1,7 +1,7 @@
-"""Make the index of datasets: embed every stored frame of a camera, and keep it beside the data.
+"""Make the index of a dataset: embed every stored frame of a camera, and keep it beside the data.
 
-Features are kept in a hidden folder beside the index's place, an episode at a time, so that an
-interrupted run goes on from there. The index gets its name when it is whole.
+It is made in a hidden folder beside its place, an episode at a time, so that an interrupted run
+goes on from there. The index gets its name when it is whole.
 """
 
 import shutil
@@ -32,10 +32,10 @@ from robomme_interference_data.embeddings import (
     EmbeddingIndex,
     EncoderRecord,
     IndexHeader,
+    centre_of,
     encoder_id,
     episode_file,
     index_folder,
-    normalised,
 )
 from robomme_interference_data.errors import (
     BuildError,
@@ -56,9 +56,10 @@ from robomme_interference_data.files import (
     write_json,
     write_text,
 )
-from robomme_interference_data.retrieval.encoders import Encoder, encoder_digest
+from robomme_interference_data.retrieval.encoders import Encoder, check_encoder, encoder_digest
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.rows import to_dict
+from robomme_interference_data.split_index import normalised
 from robomme_interference_data.work_progress import WorkProgress
 
 
@@ -87,15 +88,14 @@ def build_index(
     force: bool = False,
     executor: Executor | None = None,
 ) -> list[IndexReport]:
-    """Embed every stored frame of datasets whose frames are to be compared with each other.
+    """Embed every stored frame of datasets, each by itself.
 
-    What an encoder is centred on, and what it finds in any two frames, come from the train pool
-    alone: the distractor units. So the embedding of a frame, and where its history is cut, depend
-    on no other query. The same data, encoder, device and batch give the same bytes, interrupted or
-    not. An index that is there and right is left as it is, on whatever device it was computed.
+    An index depends on its dataset, the encoder and the camera alone. The same data, encoder,
+    device and batch give the same bytes, interrupted or not. An index that is there and right is
+    left as it is, on whatever device it was computed.
 
     Args:
-        roots: Folders of the datasets, one of them the distractor units.
+        roots: Folders of the datasets.
         encoder: What embeds.
         progress: Shows how far it is.
         camera: Camera to embed, with or without `observation.images.`.
@@ -105,39 +105,28 @@ def build_index(
 
     Raises:
         UnknownNameError: A dataset has no such camera.
-        InvalidOptionError: There are no distractor units among them.
         BuildError: Another process makes one of the indexes, or the encoder gave something that is
             no finite number.
         MissingFileError, FormatError, TruncatedVideoError: A dataset cannot be read.
     """
     if threads < 1:
         raise InvalidOptionError.expected("threads", threads, "1 or more")
-    datasets = [Dataset(LocalFiles(root)) for root in roots]
-    units = next((dataset for dataset in datasets if dataset.kind == DISTRACTORS), None)
-    if units is None:
-        raise InvalidOptionError(
-            f"{datasets[0].files.describe()} holds {datasets[0].kind}; expected distractor units "
-            "beside them, which tell what any two frames share",
-            "Index both at once: robomme-interference index SPLIT",
-        )
-    works = [_Work(root, one, encoder, camera) for root, one in zip(roots, datasets, strict=True)]
+    works = [_Work(root, encoder, camera) for root in roots]
     with ExitStack() as held:
         for work in works:
             held.enter_context(working(work.folder))
         progress.start(encoder.name, sum(sum(work.lengths) for work in works))
-        pool: EmbeddingIndex | None = None
-        reports = {}
-        for work in sorted(works, key=lambda work: work.dataset is not units):
-            header, embedded = None if force else work.found(pool), 0
+        reports = []
+        for work in works:
+            header, embedded = None if force else work.found(), 0
             if header is not None:
                 progress.advance(header.frames, before=True)
             else:
                 embedded = work.embed(executor or Serial(), threads, progress, force=force)
-                header = work.write(pool)
+                header = work.write()
             shutil.rmtree(work.hidden)
-            reports[work] = IndexReport(str(work.folder), embedded, header)
-            pool = pool or units.index(encoder.name, camera)
-        return [reports[work] for work in works]
+            reports.append(IndexReport(str(work.folder), embedded, header))
+        return reports
 
 
 @dataclass
@@ -153,8 +142,8 @@ class _EmbedTask:
     def _dataset(self) -> Dataset:
         return Dataset(self.files)
 
-    def __call__(self, task: int, worker: Worker) -> NDArray[np.float32]:
-        """Return the features of an episode, `(T, D) float32`."""
+    def __call__(self, task: int, worker: Worker) -> NDArray[np.float16]:
+        """Return the features of an episode as they are kept, `(T, D) float16`."""
         dataset, batch = self._dataset, self.encoder.batch
         length = dataset.record(task).length
         features, waiting = [], deque[Future[Any]]()
@@ -171,35 +160,37 @@ class _EmbedTask:
                 if len(waiting) > 2 * self.threads:  # prepared images are large
                     features.append(self.encoder.features(waiting.popleft().result()))
             features += [self.encoder.features(one.result()) for one in waiting]
-        return np.concatenate(features)
+        with np.errstate(over="ignore"):  # what is too large is no finite number
+            return np.concatenate(features).astype(np.float16)
 
 
 class _Work:
-    """The index of one dataset, being made; `pool` is that of the units, None if this is it."""
+    """The index of one dataset, being made."""
 
-    def __init__(self, root: Path, dataset: Dataset, encoder: Encoder, camera: str):
-        dataset.shape(camera)  # there is such a camera
-        self.dataset, self.encoder = dataset, encoder
+    def __init__(self, root: Path, encoder: Encoder, camera: str):
+        self.dataset, self.encoder = Dataset(LocalFiles(root)), encoder
+        self.dataset.shape(camera)  # there is such a camera
+        self.units = self.dataset.kind == DISTRACTORS
         self.camera = camera.removeprefix(CAMERA_PREFIX)
-        self.lengths = [record.length for record in dataset.records()]
+        self.lengths = [record.length for record in self.dataset.records()]
         self.computed = {"in": encoder.computed_in, "batch": encoder.batch}
         self.folder = root / index_folder(encoder.name, camera)
         self.hidden = work_folder(self.folder)
         # Features that were made otherwise have another place: they are never mixed.
-        made_of = canonical_json([encoder.fingerprint, self.computed, dataset.revision])
-        kept = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
-        self.features = [kept / episode_file(episode) for episode in range(len(self.lengths))]
+        made_of = canonical_json([encoder.fingerprint, self.computed, self.dataset.revision])
+        self.made = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
+        self.features = [self.made / episode_file(episode) for episode in range(len(self.lengths))]
 
-    def found(self, pool: EmbeddingIndex | None) -> IndexHeader | None:
+    def found(self) -> IndexHeader | None:
         """Return the header of the index that is there, if it is right."""
         files, revision = self.dataset.files, self.dataset.revision
         try:
             index = EmbeddingIndex(files, revision, self.encoder.name, self.camera)
-            index.check(dict(enumerate(self.lengths)))
+            check_encoder(index.header.encoder, self.encoder, index.remedy)
+            index.check(dict(enumerate(self.lengths)), units=self.units)
         except InterferenceError:
             return None
-        wanted = encoder_digest(self.encoder, index.centre), self.camera, revision
-        return index.header if index.made == (pool.made if pool else wanted) else None
+        return index.header
 
     def embed(
         self, executor: Executor, threads: int, progress: WorkProgress, *, force: bool
@@ -229,36 +220,29 @@ class _Work:
             progress.advance(len(outcome.value))
         return sum(self.lengths[episode] for episode in missing)
 
-    def write(self, pool: EmbeddingIndex | None) -> IndexHeader:
-        """Write the index, and give it its name."""
-        made, encoder, centre = self.hidden / "made", self.encoder, pool.centre if pool else None
-        shutil.rmtree(made, ignore_errors=True)
-        if pool is None and encoder.centred:  # on the mean, each episode weighing the same
-            means = (np.load(path).mean(axis=0, dtype=np.float64) for path in self.features)
-            centre = np.asarray(sum(means) / len(self.features), np.float32)
+    def write(self) -> IndexHeader:
+        """Write what belongs to the features, and give the index its name."""
+        made, encoder, typical, centre = self.made, self.encoder, None, None
         names = [episode_file(episode) for episode in range(len(self.lengths))]
-        for name, path in zip(names, self.features, strict=True):
-            (made / name).parent.mkdir(parents=True, exist_ok=True)
-            embeddings = normalised(np.load(path), centre)
-            write_array(made / name, embeddings)
-        if pool:
-            typical = pool.header.typical_cosine
-        else:
-            typical = typical_cosine(len(names), lambda episode: np.load(made / names[episode]))
-        if centre is not None:
-            names.append(CENTRE_FILE)
-            write_array(made / CENTRE_FILE, centre)
-        write_text(made / INDEX_SUMS, format_sums(made, names))
-        digest = encoder_digest(encoder, centre)
+        if self.units:
+            if encoder.centred:
+                centre = centre_of(map(np.load, self.features))
+                write_array(made / CENTRE_FILE, centre)
+            typical = typical_cosine(
+                len(names), lambda episode: normalised(np.load(self.features[episode]), centre)
+            )
+        written = names if centre is None else [*names, CENTRE_FILE]
+        write_text(made / INDEX_SUMS, format_sums(made, written))
         header = IndexHeader(
             format_version=FORMAT_VERSION,
-            encoder=EncoderRecord(encoder_id(encoder.name), encoder.fingerprint, digest),
+            encoder=EncoderRecord(
+                encoder_id(encoder.name), encoder.fingerprint, encoder_digest(encoder)
+            ),
             computed=self.computed,
             camera=self.camera,
             revision=self.dataset.revision,
-            pool=pool.header.pool if pool else self.dataset.revision,
             frames=sum(self.lengths),
-            size=embeddings.shape[1],
+            size=np.load(self.features[0]).shape[1],
             typical_cosine=typical,
             sums=sha256_file(made / INDEX_SUMS),
         )

@@ -53,7 +53,7 @@ def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[Span, ...
     return tuple(zip(starts, stops, strict=True))
 
 
-def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float16]]) -> float:
+def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float32]]) -> float:
     """Return the median cosine of two frames of different episodes.
 
     It tells what an encoder finds in two frames that have nothing to do with each other: near 1
@@ -62,7 +62,7 @@ def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float16]]) ->
 
     Args:
         episodes: How many the pool holds.
-        read: Returns the embeddings of one of them, `(T, D) float16`, each of length 1, T at
+        read: Returns the embeddings of one of them, `(T, D) float32`, each of length 1, T at
             least 1.
 
     Returns:
@@ -73,7 +73,7 @@ def typical_cosine(episodes: int, read: Callable[[int], NDArray[np.float16]]) ->
     chosen = _middles(episodes, min(episodes, _SAMPLE))
     each = _SAMPLE // len(chosen)
     parts = [found[_middles(len(found), each)] for found in map(read, chosen)]
-    sample = np.concatenate(parts).astype(np.float32)
+    sample = np.concatenate(parts)
     owner = np.repeat(np.arange(len(chosen)), each)
     pairs = (sample @ sample.T)[owner[:, None] < owner]
     return round(float(np.median(pairs)), 4)

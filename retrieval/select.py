@@ -149,14 +149,14 @@ def measure(
     Raises:
         MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
     """
-    embeddings = buffer.embeddings(encoder, camera).astype(np.float32)
+    embeddings = buffer.embeddings(encoder, camera)
     return Measured(
         buffer.episode_id,
         buffer.condition,
         buffer.sessions,
         adjacent_cosines(embeddings),
-        cosines(embeddings, buffer.query.embedding(encoder, camera) if query is None else query),
-        buffer.query.dataset.index(encoder, camera).header.typical_cosine,
+        cosines(embeddings, buffer.query_embedding(encoder, camera) if query is None else query),
+        buffer.index(encoder, camera).typical_cosine,
     )
 
 

@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.embeddings import EmbeddingIndex, index_folder, normalised
-from robomme_interference_data.errors import InvalidOptionError, StaleIndexError
+from robomme_interference_data.embeddings import index_folder
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.encoders import (
-    encoder_digest,
+    check_encoder,
     make_encoder,
     published_threshold,
 )
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import Rule, choose, measure
+from robomme_interference_data.split_index import SplitIndex
 
 
 class Selector:
@@ -66,20 +67,20 @@ class Selector:
             buffer: Any buffer of the split whose index it looks up.
 
         Returns:
-            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the embeddings;
+            `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the features;
             `camera`; `method`; `cut`; and `threshold`, the cosine that the cut comes to.
 
         Raises:
             MissingIndexError, StaleIndexError, FormatError: As for `select`.
         """
-        header = self._index(buffer).header
+        index = self._index(buffer)
         return {
-            "encoder": header.encoder.name,
-            "fingerprint": header.encoder.sha256,
+            "encoder": index.encoder.name,
+            "fingerprint": index.encoder.sha256,
             "camera": self.camera,
             "method": self.rule.method,
             "cut": self.rule.cut,
-            "threshold": self.rule.threshold(header.typical_cosine),
+            "threshold": self.rule.threshold(index.typical_cosine),
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Span:
@@ -103,17 +104,11 @@ class Selector:
             given = f"{image.dtype} of shape {image.shape}"
             raise InvalidOptionError.expected("image", given, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
-        query = normalised(features, index.centre)[0]
+        query = index.embed(features)[0]
         return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).span
 
-    def _index(self, buffer: Buffer) -> EmbeddingIndex:
-        """Return the index of the query, made with this very encoder."""
-        index = buffer.query.dataset.index(self._encoder.name, self.camera)
-        if index.header.encoder.sha256 != encoder_digest(self._encoder, index.centre):
-            raise StaleIndexError(
-                f"the embeddings of {self._encoder.name!r} beside the data were made with another "
-                "version of the encoder: its weights, settings, preprocessing or code differ",
-                "Make them again: robomme-interference index SPLIT --encoder "
-                f"{self._encoder.name} --camera {self.camera}",
-            )
+    def _index(self, buffer: Buffer) -> SplitIndex:
+        """Return the index of the split, made with this very encoder."""
+        index = buffer.index(self._encoder.name, self.camera)
+        check_encoder(index.encoder, self._encoder, index.remedy)
         return index

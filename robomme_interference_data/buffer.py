@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.cache import DecodedCache, frames_sha256
-from robomme_interference_data.constants import KEY_FRAMES, STATE
+from robomme_interference_data.constants import DISTRACTORS, KEY_FRAMES, STATE
 from robomme_interference_data.dataset import Dataset, camera_feature
 from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import (
@@ -22,7 +22,6 @@ from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
     MissingExtraError,
-    StaleIndexError,
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
@@ -33,6 +32,7 @@ from robomme_interference_data.records import (
     SessionEntry,
     place_sessions,
 )
+from robomme_interference_data.split_index import SplitIndex
 
 _PIECE = 8 * KEY_FRAMES
 """Frames that one thread decodes at a time."""
@@ -256,7 +256,14 @@ class Buffer:
             for decoder in decoders.values():
                 decoder.close()
 
-    def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
+    def index(self, encoder: str, camera: str = "front") -> SplitIndex:
+        """Open the indexes of the datasets that the buffer needs; see `SplitIndex`."""
+        needed = {DISTRACTORS, self.query.dataset.kind}
+        needed |= {entry.dataset for entry in self.manifest.sessions}
+        datasets = {name: one for name, one in self._datasets.items() if name in needed}
+        return SplitIndex(datasets, encoder, camera)
+
+    def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
         """Look up the embeddings of all frames; none is decoded.
 
         Args:
@@ -264,29 +271,29 @@ class Buffer:
             camera: Name of the camera, with or without `observation.images.`.
 
         Returns:
-            `(T, D) float16`, each of length 1, in the buffer's order; a new array.
+            `(T, D) float32`, each of length 1, in the buffer's order; a new array.
 
         Raises:
-            MissingIndexError: A dataset has no embeddings of this encoder and camera.
-            StaleIndexError: They were made of other data, with another encoder, or differently in
-                the datasets.
-            FormatError: They are of an unknown version, or damaged.
+            MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
         """
-        of_query = self.query.dataset.index(encoder, camera)
-        parts: list[NDArray[np.float16]] = [np.empty((0, of_query.header.size), np.float16)]
+        index = self.index(encoder, camera)
+        parts: list[NDArray[np.float32]] = [np.empty((0, index.size), np.float32)]
         for entry in self.manifest.sessions:
-            index = self._datasets[entry.dataset].index(encoder, camera)
-            if index.made != of_query.made:
-                places = (self.query.dataset, self._datasets[entry.dataset])
-                raise StaleIndexError(
-                    f"the embeddings of encoder {encoder!r} were made differently in "
-                    f"{' and in '.join(place.files.describe() for place in places)}",
-                    "Make them again, both at once: robomme-interference index SPLIT "
-                    f"--encoder {encoder}",
-                )
-            values = index.span(entry.episode_index, entry.start, entry.stop)
+            values = index.span(entry.dataset, entry.episode_index, entry.start, entry.stop)
             parts.append(values if entry.repeat == 1 else np.repeat(values, entry.repeat, axis=0))
         return np.concatenate(parts)
+
+    def query_embedding(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
+        """Look up the embedding of the first live observation, `(D,) float32`.
+
+        For grading without a simulator: in a rollout, what the robot sees is embedded then.
+
+        Raises:
+            MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
+        """
+        place = self.query.place
+        span = place.dataset, place.episode_index, place.frame, place.frame + 1
+        return self.index(encoder, camera).span(*span)[0]
 
     def verify(self) -> None:
         """Decode everything and compare it with the manifest's SHA-256.

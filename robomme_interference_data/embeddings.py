@@ -1,10 +1,12 @@
-"""Look up the embeddings of stored frames: the index that lies beside a dataset's frames.
+"""What an encoder makes of a dataset's stored frames: the index that lies beside them.
 
 An index is made by `robomme-interference index` (the retrieval area); reading it needs numpy
-only. Every episode has a file of its own. `docs/format.md` lists them.
+only. It depends on its dataset, the encoder and the camera alone; `split_index.py` makes
+embeddings of it. Every episode has a file of its own. `docs/format.md` lists them.
 """
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -17,8 +19,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.arrays import read_array
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
-    DEMONSTRATIONS,
-    DISTRACTORS,
+    DATASETS,
     INDEX_DIR,
     INDEX_HEADER,
     PAPER_ENCODER,
@@ -54,7 +55,7 @@ class EncoderRecord:
     Attributes:
         name: As `encoder_id` has it.
         fingerprint: What determines the features: model, weights, preprocessing, code.
-        sha256: Over fingerprint and centre; only embeddings that share it are compared.
+        sha256: Over the fingerprint; only embeddings that share it are compared.
     """
 
     name: str
@@ -72,10 +73,10 @@ class IndexHeader:
         computed: Device, precision and batch: they may change the last bits.
         camera: Name of the camera that was embedded.
         revision: Revision of the dataset.
-        pool: Revision of the distractor units that centre and typical cosine are of.
-        frames: Embeddings in all.
-        size: Values in an embedding.
-        typical_cosine: Median cosine of two frames of different distractor units of the pool.
+        frames: Frames in all.
+        size: Values of a frame.
+        typical_cosine: Of distractor units: median cosine of two frames of different ones, centred
+            if the encoder is. None for demonstrations.
         sums: SHA-256 of `SHA256SUMS`, which lists the other files.
         sha256: SHA-256 of the canonical JSON of all other fields.
     """
@@ -85,10 +86,9 @@ class IndexHeader:
     computed: dict[str, Any]
     camera: str
     revision: str
-    pool: str
     frames: int
     size: int
-    typical_cosine: float
+    typical_cosine: float | None
     sums: str
     sha256: str = ""
 
@@ -104,7 +104,7 @@ class IndexHeader:
 
 
 def episode_file(episode_index: int) -> str:
-    """Return where an episode's embeddings lie inside the folder of an index."""
+    """Return where an episode's features lie inside the folder of an index."""
     return f"chunk-{episode_index // 1000:03d}/episode-{episode_index:06d}.npy"
 
 
@@ -152,27 +152,18 @@ def index_folder(encoder: str, camera: str = "front") -> str:
     return f"{INDEX_DIR}/{'@'.join(re.sub(r'[^A-Za-z0-9._-]+', '-', part) for part in parts)}"
 
 
-def normalised(
-    features: NDArray[Any], centre: NDArray[np.float32] | None = None
-) -> NDArray[np.float16]:
-    """Turn what an encoder makes of images into embeddings of length 1.
+def centre_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
+    """Return what frames have in common: the mean of each episode's mean, `(D,) float32`.
 
     Args:
-        features: `(T, D)` float.
-        centre: `(D,) float32`, taken off first, or None.
-
-    Returns:
-        `(T, D) float16`; a row of noughts, which resembles nothing, where nothing is left.
+        episodes: Features of each episode, `(T, D) float16`.
     """
-    values = features.astype(np.float64)
-    if centre is not None:
-        values -= centre
-    lengths = np.sqrt((values * values).sum(axis=1, keepdims=True))
-    return (values / np.where(lengths > 0, lengths, 1)).astype(np.float16)
+    means = [features.mean(axis=0, dtype=np.float64) for features in episodes if len(features)]
+    return np.asarray(sum(means) / max(len(means), 1), np.float32)
 
 
 class EmbeddingIndex:
-    """The embeddings of every stored frame of a dataset, of one camera and one encoder.
+    """The features of every stored frame of a dataset, of one camera and one encoder.
 
     Args:
         files: The dataset's files.
@@ -195,48 +186,60 @@ class EmbeddingIndex:
         camera = camera.removeprefix(CAMERA_PREFIX)
         of = f"encoder {encoder!r}" + ("" if camera == "front" else f" and camera {camera!r}")
         option = "" if camera == "front" else f" --camera {camera}"
-        self._remedy = (
-            f"Type: robomme-interference index {_data_of(files)} --encoder {encoder}{option}"
-        )
+        self.remedy = _remedy(files, f"--encoder {encoder}{option}")
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
-            raise MissingIndexError(f"{root} has no embeddings of {of}", self._remedy) from None
+            raise MissingIndexError(f"{root} has no embeddings of {of}", self.remedy) from None
         try:
             self.header = read_header(path, IndexHeader)
         except FormatError as error:
-            raise FormatError(error.message, self._remedy) from None
+            raise FormatError(error.message, self.remedy) from None
         made = self.header.encoder.name, self.header.camera
         if made != (encoder_id(encoder), camera):
             raise StaleIndexError(
                 f"the embeddings in {self._place} are of encoder {made[0]!r} and "
                 f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
-                f"Give the encoder as {made[0]!r}, or make them anew. {self._remedy}",
+                f"Give the encoder as {made[0]!r}, or make them anew. {self.remedy}",
             )
         if self.header.revision != revision:
             raise StaleIndexError(
                 f"the embeddings of {of} in {root} were made of data with "
                 f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
-                f"Make them again. {self._remedy}",
+                f"Make them again. {self.remedy}",
             )
 
     @property
-    def made(self) -> tuple[str, str, str]:
-        """What embeddings that are compared with each other share: encoder, camera and pool."""
-        return self.header.encoder.sha256, self.header.camera, self.header.pool
+    def made(self) -> tuple[str, int]:
+        """What indexes share whose frames are compared: the encoder, and so the size."""
+        return self.header.encoder.sha256, self.header.size
 
     @cached_property
     def centre(self) -> NDArray[np.float32] | None:
-        """What is taken off the encoder's output before it is normalised, or None."""
+        """What is taken off features before they are normalised, see `centre_of`.
+
+        Only in an index of distractor units, and None there too if the encoder is not centred.
+        """
         if CENTRE_FILE not in self._sums:
             return None
         return self._array(CENTRE_FILE, (self.header.size,), np.float32)
 
+    @property
+    def typical_cosine(self) -> float:
+        """What `IndexHeader` says of distractor units.
+
+        Raises:
+            FormatError: It says nothing.
+        """
+        if self.header.typical_cosine is None:
+            raise self._damaged(f"{INDEX_HEADER} has no typical cosine")
+        return self.header.typical_cosine
+
     def span(self, episode_index: int, start: int, stop: int) -> NDArray[np.float16]:
-        """Return the embeddings of stored frames `start` to `stop` (excluded) of an episode.
+        """Return the features of stored frames `start` to `stop` (excluded) of an episode.
 
         Returns:
-            `(stop - start, size) float16`, each of length 1; a new array.
+            `(stop - start, size) float16`, as the encoder gave them, rounded; a new array.
 
         Raises:
             UnknownNameError: The index does not hold these frames.
@@ -248,34 +251,36 @@ class EmbeddingIndex:
             raise UnknownNameError(
                 f"frames {start} to {stop - 1} of episode {episode_index} are not in "
                 f"{self._place}, which has {len(found)} frames of that episode",
-                f"It is damaged: make it again. {self._remedy}",
+                f"It is damaged: make it again. {self.remedy}",
             )
         return np.asarray(found)[start:stop].copy()
 
-    def check(self, lengths: dict[int, int]) -> None:
+    def check(self, lengths: dict[int, int], *, units: bool) -> None:
         """Read all of it: every file against its SHA-256, and the frames of every episode.
 
         Args:
             lengths: Stored frames of each episode of the dataset.
+            units: Whether the dataset is of distractor units.
 
         Raises:
             FormatError: A file is missing or damaged, or one is too many.
         """
-        finite = np.isfinite(self.header.typical_cosine)
-        if not finite or self.header.sha256 != self.header.digest():
+        header, typical = self.header, self.header.typical_cosine
+        finite = typical is None or np.isfinite(typical)
+        if not finite or header.sha256 != header.digest():
             raise self._damaged(f"{INDEX_HEADER} does not have the SHA-256 that it records")
-        _ = self.centre
-        for episode, length in lengths.items():
-            self.span(episode, 0, length)
-        expected = {episode_file(episode) for episode in lengths}
+        if (typical is not None) != units:
+            raise self._damaged(f"the typical cosine is {typical}")
+        expected = {*map(episode_file, lengths), *([CENTRE_FILE] if units else [])}
         listed = {name.removeprefix(f"{self._folder}/") for name in self._files.list(self._folder)}
         known = {*self._sums, INDEX_HEADER, INDEX_SUMS}
-        if extra := sorted(listed ^ known | (self._sums.keys() - expected - {CENTRE_FILE})):
+        if extra := sorted(listed ^ known | (self._sums.keys() - expected)):
             raise self._damaged(f"{extra[0]} is missing, or too many")
-        if self.header.frames != sum(lengths.values()):
-            raise self._damaged(
-                f"{self.header.frames} frames; the dataset has {sum(lengths.values())}"
-            )
+        found = centre_of(self.span(episode, 0, length) for episode, length in lengths.items())
+        if self.centre is not None and not np.array_equal(self.centre, found):
+            raise self._damaged(f"{CENTRE_FILE} is not the mean of the episodes")
+        if header.frames != sum(lengths.values()):
+            raise self._damaged(f"{header.frames} frames; the dataset has {sum(lengths.values())}")
 
     @cached_property
     def _sums(self) -> dict[str, str]:
@@ -304,12 +309,17 @@ class EmbeddingIndex:
             raise self._damaged(error.message) from None
 
     def _damaged(self, what: str) -> FormatError:
-        return FormatError(f"{self._place}: {what}", self._remedy)
+        return FormatError(f"{self._place}: {what}", self.remedy)
 
 
-def _data_of(files: Files) -> str:
-    """Return the folder to index: the split of a dataset, as both are indexed together."""
+def _remedy(files: Files, options: str) -> str:
+    """Return what to type so that a dataset has an index; a split's are indexed together."""
+    command = "robomme-interference index"
     if not isinstance(files, LocalFiles):
-        return f"FOLDER, once the data of {files.describe()} is there"
+        return (
+            f"Fetch {files.describe()} to a folder and type: {command} FOLDER {options}. Or ask "
+            "its publisher to add them."
+        )
     root = files.root
-    return str(root.parent if root.name in (DEMONSTRATIONS, DISTRACTORS) else root)
+    split = root.parent if root.name in DATASETS else root
+    return f"Type: {command} {split} {options}"

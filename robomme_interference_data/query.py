@@ -83,14 +83,3 @@ class Query:
         """Return the state at the first live observation, `(8,) float32`; see `Buffer.states`."""
         start, index = self.lesson_frames, self.record.episode_index
         return self.dataset.read_vectors(index, STATE, start, start + 1)[0]
-
-    def embedding(self, encoder: str, camera: str = "front") -> NDArray[np.float16]:
-        """Look up the embedding of the first live observation, `(D,) float16`.
-
-        For grading without a simulator: in a rollout, what the robot sees is embedded then.
-
-        Raises:
-            MissingIndexError, StaleIndexError, FormatError: See `Dataset.index`.
-        """
-        start, index = self.lesson_frames, self.record.episode_index
-        return self.dataset.index(encoder, camera).span(index, start, start + 1)[0]

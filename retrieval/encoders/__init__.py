@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.embeddings import encoder_id
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.embeddings import EncoderRecord, encoder_id
+from robomme_interference_data.errors import InvalidOptionError, StaleIndexError, UnknownNameError
 from robomme_interference_data.files import canonical_json
 
 _KINDS = ("siglip", "thumbnail")
@@ -25,8 +25,8 @@ class Encoder(Protocol):
 
     Attributes:
         name: Under which `make_encoder` makes it.
-        centred: Whether the mean over a data set is taken off the features before they are
-            normalised.
+        centred: Whether the mean over the distractor units is taken off the features before they
+            are normalised.
         batch: Images that it takes best at a time.
         computed_in: Where and in which precision it computes, such as `cpu, float32`.
         fingerprint: What determines the features up to that precision, as plain values: model,
@@ -48,11 +48,28 @@ class Encoder(Protocol):
         ...
 
 
-def encoder_digest(encoder: Encoder, centre: NDArray[np.float32] | None) -> str:
-    """Return the one hash of all that determines embeddings: encoder and centre."""
-    digest = None if centre is None else sha256(centre.tobytes()).hexdigest()
-    text = canonical_json({"centre": digest, "encoder": encoder.fingerprint})
-    return sha256(text.encode()).hexdigest()
+def encoder_digest(encoder: Encoder) -> str:
+    """Return the one hash of all that determines an encoder's features."""
+    return sha256(canonical_json(encoder.fingerprint).encode()).hexdigest()
+
+
+def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: str) -> None:
+    """Check that embeddings were made with this very encoder.
+
+    Args:
+        recorded: What their index records.
+        encoder: The encoder.
+        remedy: How they are made again.
+
+    Raises:
+        StaleIndexError: They were not.
+    """
+    if recorded.sha256 != encoder_digest(encoder):
+        raise StaleIndexError(
+            f"the embeddings of {encoder.name!r} beside the data were made with another version "
+            "of the encoder: its weights, settings, preprocessing or code differ",
+            f"Make them again. {remedy}",
+        )
 
 
 def encoder_name(name: str) -> str:

@@ -20,8 +20,8 @@ stays."""
 class Thumbnail:
     """Mean colours of 8 × 8 cells and their differences to the next cell, right and below.
 
-    Features are centred on the mean over the data set: what all frames share (table, walls, the
-    robot's base) says nothing about which session a frame is of.
+    Features are centred on the mean of the distractor units: what all frames share (table, walls,
+    the robot's base) says nothing about which session a frame is of.
     """
 
     name = "thumbnail"

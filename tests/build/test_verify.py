@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.damage import flipped_bits
 from support.made_up import record, write_metadata
-from support.retrieval import make_index
+from support.retrieval import QUIET, TwoSums, make_index
 from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
 
 from robomme_interference_data import load_split
@@ -25,6 +25,7 @@ from robomme_interference_data.build_dataset.material import in_folder, plan_man
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.files import sha256_file
+from robomme_interference_data.retrieval.index import build_index
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
 RECORDS = "distractors/meta/interference.parquet"
@@ -112,6 +113,12 @@ def test_a_flipped_bit_in_the_header_of_an_index(own_split: Path) -> None:
     path.write_text(json.dumps(header, indent=2))
     for _ in flipped_bits(path, 4):
         expect(own_split, "distractors/index/thumbnail: .*")
+
+
+def test_indexes_of_different_encoders(own_split: Path) -> None:
+    make_index(own_split)
+    build_index([own_split / "demonstrations"], TwoSums(), QUIET)
+    expect(own_split, "demonstrations/index/thumbnail: .*another encoder")
 
 
 def _expect_of_header(root: Path) -> None:

@@ -182,7 +182,7 @@ def test_numbers_are_whole(use: Callable[[Buffer, Any], object], told: str, wron
         lambda made: made.query.frame(b"front"),
         lambda made: made.embeddings(3),
         lambda made: made.embeddings(["thumbnail"]),
-        lambda made: made.query.embedding("thumbnail", None),
+        lambda made: made.query_embedding("thumbnail", None),
     ],
 )
 def test_cameras_and_encoders_are_names(use: Callable[[Any], object]) -> None:

@@ -138,7 +138,6 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         ("index {bare} --batch 0", "batch 0"),
         ("index {bare} --threads 0", "threads 0"),
         ("index {bare} --workers 0", "workers 0"),
-        ("index {bare}/demonstrations", "expected distractor units"),
         ("retrieval-score {bare}", "robomme-interference index {bare} --encoder thumbnail"),
         ("retrieval-score {split} --rules best", "there is no method 'best'"),
         ("retrieval-score {split} --encoder clip", "there is no encoder 'clip'"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.embeddings import encoder_id, index_folder, normalised
+from robomme_interference_data.embeddings import encoder_id, index_folder
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
@@ -33,14 +33,6 @@ def test_cells_of_uneven_size_are_means() -> None:
     # Cell (2, 7): rows 5 to 6 (42 // 8, 63 // 8 = 7 excluded), columns 9 and 10.
     expected = image[5:7, 9:11].mean(axis=(0, 1)) / 255
     assert row[:192].reshape(8, 8, 3)[2, 7] == pytest.approx(expected, abs=1e-6)
-
-
-def test_normalising() -> None:
-    rows = normalised(np.array([[3, 4], [1, 1]]), np.array([0, 0], np.float32))
-    assert rows.dtype == np.float16
-    assert rows[0] == pytest.approx([0.6, 0.8], abs=1e-3)
-    # Nothing is left of the centre itself.
-    assert normalised(np.array([[1, 1]]), np.array([1, 1], np.float32)).tolist() == [[0, 0]]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from support.retrieval import (
     FRAMES,
     QUIET,
@@ -20,14 +23,21 @@ from support.retrieval import (
 from support.splits import QUERIES, UNITS
 
 from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.embeddings import normalised
+from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import BuildError, MissingIndexError
 from robomme_interference_data.files import hold, work_folder
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import measure
+from robomme_interference_data.split_index import normalised
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "index"
+
+
+def units_index(split: Path, camera: str = "front") -> EmbeddingIndex:
+    return load_split(split).datasets["distractors"].index("thumbnail", camera)
+
 
 # --- what it holds -----------------------------------------------------------------------------
 
@@ -35,11 +45,12 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
     buffer = load_buffer(QUERIES[0], "k3", split=indexed)
     found = buffer.embeddings("thumbnail")
-    assert found.dtype == np.float16 and found.shape == (48 + 3 * 32, 528)
-    encoder, centre = Thumbnail(), buffer.query.dataset.index("thumbnail").centre
+    assert found.dtype == np.float32 and found.shape == (48 + 3 * 32, 528)
+    assert np.linalg.norm(found, axis=1) == pytest.approx(1, abs=1e-6)
+    encoder, centre = Thumbnail(), units_index(indexed).centre
     assert np.array_equal(found, normalised(encoder.prepare(buffer.frames()), centre))
     query = normalised(encoder.prepare(buffer.query.frame()[None]), centre)[0]
-    assert np.array_equal(buffer.query.embedding("thumbnail"), query)
+    assert np.array_equal(buffer.query_embedding("thumbnail"), query)
     lesson, unit, *_ = buffer.manifest.sessions
     turned = remade(indexed, [unit, lesson]).embeddings("thumbnail")
     assert np.array_equal(turned, np.concatenate([found[48:80], found[:48]]))
@@ -51,28 +62,65 @@ def test_embeddings_are_the_callers(indexed: Path) -> None:
     once = buffer.embeddings("thumbnail")
     kept = once.copy()
     once += 1
-    buffer.query.embedding("thumbnail")[:] = 0
+    buffer.query_embedding("thumbnail")[:] = 0
     assert np.array_equal(buffer.embeddings("thumbnail"), kept)
-    assert buffer.query.embedding("thumbnail").any()
+    assert buffer.query_embedding("thumbnail").any()
 
 
-def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path, own_split: Path) -> None:
+def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None:
     datasets = load_split(indexed).datasets
     units, images = datasets["distractors"], np.empty((UNITS, 32, 32, 32, 3), np.uint8)
     for episode in range(UNITS):
         units.read_frames(episode, "front", 0, images[episode])
-    expected = Thumbnail().prepare(images.reshape(-1, 32, 32, 3)).mean(axis=0, dtype=np.float64)
-    headers = []
-    for dataset in datasets.values():
-        index = dataset.index("thumbnail")
-        assert index.centre == pytest.approx(expected, abs=1e-6)
-        headers.append((index.made, index.header.typical_cosine))
-        assert index.header.pool == units.revision
-    assert headers[0] == headers[1]
-    # Made without any demonstration, they are the same.
-    build_index([own_split / "distractors"], Thumbnail(), QUIET)
-    place = "distractors/index/"
-    assert files_of(own_split) == {k: v for k, v in files_of(indexed).items() if place in k}
+    features = Thumbnail().prepare(images.reshape(-1, 32, 32, 3)).astype(np.float16)
+    index = units.index("thumbnail")
+    assert index.centre == pytest.approx(features.mean(axis=0, dtype=np.float64), abs=1e-7)
+    pool = normalised(features, index.centre).reshape(UNITS, 32, -1)
+    assert index.typical_cosine == typical_cosine(UNITS, pool.__getitem__)
+    assert np.array_equal(index.span(3, 0, 32), features.reshape(UNITS, 32, -1)[3])
+    other = datasets["demonstrations"].index("thumbnail")
+    assert (other.centre, other.header.typical_cosine) == (None, None)
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "distractors"])
+def test_a_dataset_is_indexed_on_its_own(indexed: Path, own_split: Path, name: str) -> None:
+    build_index([own_split / name], Thumbnail(), QUIET)
+    both = files_of(indexed).items()
+    assert files_of(own_split) == {k: v for k, v in both if k.startswith(f"{name}/")}
+
+
+def test_a_live_frame_has_the_embedding_of_the_stored_one(indexed: Path) -> None:
+    buffer = load_buffer(QUERIES[0], "k3", split=indexed)
+    index, stored = buffer.index("thumbnail"), buffer.embeddings("thumbnail")
+    for place in (0, 47, 48, 100):
+        live = index.embed(Thumbnail().prepare(buffer.frame(place)[None]))[0]
+        assert np.array_equal(live, stored[place])
+        assert measure(buffer, "thumbnail", query=live).alike[place] == 1
+
+
+@given(arrays(np.float32, (3, 4), elements=st.floats(-999, 999, width=32)), st.booleans())
+def test_normalising(features: np.ndarray, centred: bool) -> None:
+    centre = np.array([3, 0, -1, 0.5], np.float32) if centred else None
+    found = normalised(features, centre)
+    assert found.dtype == np.float32
+    assert np.array_equal(found, normalised(features.astype(np.float16), centre))
+    exact = features.astype(np.float16).astype(np.float64) - (0 if centre is None else centre)
+    lengths = np.linalg.norm(exact, axis=1, keepdims=True)
+    assert found * lengths == pytest.approx(exact, rel=1e-5, abs=1e-5)
+
+
+def test_nothing_is_left_of_the_centre() -> None:
+    rows = normalised(np.array([[3, 4], [1, 1]]), np.array([1, 1], np.float32))
+    assert rows[0] == pytest.approx([2 / 13**0.5, 3 / 13**0.5]) and not rows[1].any()
+
+
+def test_datasets_that_a_buffer_does_not_need_may_lack_an_index(
+    indexed: Path, tiny_split: Path
+) -> None:
+    split = load_split(indexed)
+    expected = split.load(QUERIES[0], "k1").embeddings("thumbnail")
+    split.datasets["contradictions"] = load_split(tiny_split).datasets["demonstrations"]
+    assert np.array_equal(split.load(QUERIES[0], "k1").embeddings("thumbnail"), expected)
 
 
 def test_each_camera_has_an_index_of_its_own(indexed: Path, own_split: Path) -> None:
@@ -82,7 +130,7 @@ def test_each_camera_has_an_index_of_its_own(indexed: Path, own_split: Path) -> 
     both = files_of(own_split)
     assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
     buffer = load_buffer(QUERIES[0], "k1", split=own_split)
-    centre = buffer.query.dataset.index("thumbnail", "wrist").centre
+    centre = units_index(own_split, "wrist").centre
     expected = normalised(Thumbnail().prepare(buffer.frames("wrist")), centre)
     found = buffer.embeddings("thumbnail", "observation.images.wrist")
     assert np.array_equal(found, expected)
@@ -103,12 +151,12 @@ def test_an_index_is_the_same_bytes_every_time(indexed: Path, own_split: Path) -
 
 
 def test_an_interrupted_run_goes_on(indexed: Path, own_split: Path) -> None:
-    # Units come first, two batches of 16 each: three are done, and the first of the fourth.
+    # Three lessons of four batches each, then units of two: one is done, and half of the next.
     with pytest.raises(KeyboardInterrupt):
-        make_index(own_split, Interrupted(after=7))
+        make_index(own_split, Interrupted(after=15))
     with pytest.raises(MissingIndexError):
         load_buffer(QUERIES[0], "k0", split=own_split).embeddings("thumbnail")
-    assert make_index(own_split) == [FRAMES[0], FRAMES[1] - 3 * 32]
+    assert make_index(own_split) == [0, FRAMES[1] - 32]
     assert files_of(own_split) == files_of(indexed)
 
 
@@ -120,7 +168,7 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_split: Path) -> None:
         ("distractors/index/thumbnail/chunk-000/episode-000003.npy", [0, FRAMES[1]]),
         ("distractors/index/thumbnail/SHA256SUMS", [0, FRAMES[1]]),
         ("distractors/index/thumbnail/index.json", [0, FRAMES[1]]),
-        ("demonstrations/index/thumbnail/centre.npy", [FRAMES[0], 0]),
+        ("distractors/index/thumbnail/centre.npy", [0, FRAMES[1]]),
         ("demonstrations/index/thumbnail/stray.txt", [FRAMES[0], 0]),
     ],
 )
@@ -137,15 +185,11 @@ def test_what_is_missing_or_damaged_is_made_again(
     assert files_of(own_split) == files_of(indexed)
 
 
-def test_an_index_of_another_device_is_kept_one_of_other_units_is_not(
-    indexed: Path, own_split: Path
-) -> None:
+def test_an_index_of_another_device_is_kept(indexed: Path, own_split: Path) -> None:
     shutil.copytree(indexed, own_split, dirs_exist_ok=True)
     header = own_split / "demonstrations/index/thumbnail/index.json"
     change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
     assert make_index(own_split) == [0, 0]
-    change_header(header, pool="0" * 64)
-    assert make_index(own_split) == [FRAMES[0], 0]
 
 
 # --- refusals ----------------------------------------------------------------------------------
@@ -154,16 +198,16 @@ def test_an_index_of_another_device_is_kept_one_of_other_units_is_not(
 def test_what_cannot_be_embedded(own_split: Path) -> None:
     class Holed(Thumbnail):
         def features(self, prepared: Any) -> Any:
-            prepared[-1, 5] = np.inf
+            prepared[-1, 5] = 1e6  # more than float16 holds
             return prepared
 
     class Broken(Thumbnail):
         def features(self, prepared: Any) -> Any:
             raise RuntimeError("out of memory")
 
-    with pytest.raises(BuildError, match=r"not finite for \w+/train/\d"):
+    with pytest.raises(BuildError, match=r"not finite for \w+/test/\d"):
         make_index(own_split, Holed())
-    with pytest.raises(BuildError, match=r"/train/\d cannot be embedded: .*out of memory"):
+    with pytest.raises(BuildError, match=r"/test/\d cannot be embedded: .*out of memory"):
         make_index(own_split, Broken())
     assert not list(own_split.glob("*/index/thumbnail"))
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.damage import flipped_bits
-from support.retrieval import make_index
+from support.retrieval import change_header, make_index
 from support.splits import QUERIES
 
 from robomme_interference_data import load_buffer, load_split
@@ -21,9 +21,10 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.files import format_sums, read_sums, sha256_file
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.retrieval.select import measure
 from robomme_interference_data.retrieval.selector import Selector
 
-FOLDER = "demonstrations/index/thumbnail"
+FOLDER, OF_UNITS = (f"{name}/index/thumbnail" for name in ("demonstrations", "distractors"))
 
 
 @pytest.fixture
@@ -37,10 +38,10 @@ def look_up(split: Path, encoder: str = "thumbnail") -> None:
 
 
 def check(split: Path) -> None:
-    """Read all of the demonstrations' index."""
-    load_split(split).datasets["demonstrations"].index("thumbnail").check(
-        dict.fromkeys((0, 1, 2), 49)
-    )
+    """Read all of both indexes."""
+    for dataset in load_split(split).datasets.values():
+        lengths = {record.episode_index: record.length for record in dataset.records()}
+        dataset.index("thumbnail").check(lengths, units=dataset.kind == "distractors")
 
 
 def test_without_an_index(tiny_split: Path) -> None:
@@ -58,9 +59,8 @@ def test_without_an_index(tiny_split: Path) -> None:
     [
         ({"revision": "0" * 64}, StaleIndexError, "revision 0000"),
         ({"format_version": 2}, FormatError, "format version 2"),
-        ({"size": 7}, FormatError, "of shape"),
+        ({"size": 7}, StaleIndexError, "made differently"),
         ({"camera": "wrist"}, StaleIndexError, "camera 'wrist'"),
-        ({"pool": "0" * 64}, StaleIndexError, "made differently"),
         ({"encoder": None}, FormatError, "encoder: None"),
         ({"sums": "0" * 64}, FormatError, "SHA256SUMS"),
         ({"frames": "many"}, FormatError, "frames: 'many'"),
@@ -90,7 +90,7 @@ def test_any_flipped_bit_is_an_error_or_does_no_harm(whole: Path) -> None:
 
 @pytest.mark.parametrize("name", ["chunk-000/episode-000000.npy", "centre.npy", "SHA256SUMS"])
 def test_a_damaged_file_is_named(whole: Path, name: str) -> None:
-    path = whole / FOLDER / name
+    path = whole / OF_UNITS / name
     content = path.read_bytes()
     for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:50], b"", None):
         path.unlink() if damaged is None else path.write_bytes(damaged)
@@ -126,10 +126,52 @@ def test_two_models_of_one_name_are_told_apart(own_split: Path) -> None:
 
 
 def test_an_index_of_another_version_of_the_encoder(whole: Path) -> None:
-    path = whole / FOLDER / "index.json"
-    header = json.loads(path.read_text())
-    header["encoder"]["sha256"] = "0" * 64
-    path.write_text(json.dumps(header))
+    for folder, said in (
+        (FOLDER, "made differently in"),
+        (OF_UNITS, "another version of the enco"),
+    ):
+        path = whole / folder / "index.json"
+        header = json.loads(path.read_text())
+        header["encoder"]["sha256"] = "0" * 64
+        path.write_text(json.dumps(header))
+        buffer = load_buffer(QUERIES[0], "k0", split=whole)
+        with pytest.raises(StaleIndexError, match=said) as caught:
+            Selector("thumbnail").select(buffer, buffer.query.frame())
+        assert f"robomme-interference index {whole} --encoder thumbnail" in str(caught.value.hint)
+
+
+def test_what_is_known_of_the_units_is_in_their_index_alone(whole: Path) -> None:
+    """Hashes are right; what is told of all units is missing, wrong, or not where it belongs."""
+    change_header(whole / OF_UNITS / "index.json", typical_cosine=None)
     buffer = load_buffer(QUERIES[0], "k0", split=whole)
-    with pytest.raises(StaleIndexError, match="another version of the encoder"):
-        Selector("thumbnail").select(buffer, buffer.query.frame())
+    with pytest.raises(FormatError, match="typical cosine"):
+        measure(buffer, "thumbnail")
+    with pytest.raises(FormatError, match="typical cosine"):
+        check(whole)
+    change_header(whole / OF_UNITS / "index.json", typical_cosine=0.5)
+    check(whole)
+    change_header(whole / FOLDER / "index.json", typical_cosine=0.5)
+    with pytest.raises(FormatError, match="typical cosine"):
+        check(whole)
+    change_header(whole / FOLDER / "index.json", typical_cosine=None)
+    centre = np.load(whole / OF_UNITS / "centre.npy")
+    for folder, said in ((OF_UNITS, "not the mean"), (FOLDER, "too many")):
+        before = read_sums(whole / folder / "SHA256SUMS")
+        np.save(whole / folder / "centre.npy", centre + (folder == OF_UNITS))
+        sums = format_sums(whole / folder, sorted({*before, "centre.npy"}))
+        (whole / folder / "SHA256SUMS").write_text(sums)
+        digest = sha256_file(whole / folder / "SHA256SUMS")
+        change_header(whole / folder / "index.json", sums=digest)
+        with pytest.raises(FormatError, match=f"centre.npy is .*{said}"):
+            check(whole)
+        make_index(whole)
+        check(whole)
+
+
+def test_a_split_without_units(whole: Path) -> None:
+    header = whole / "manifests/manifest.json"
+    told = json.loads(header.read_text())
+    del told["datasets"]["distractors"]
+    header.write_text(json.dumps(told))
+    with pytest.raises(MissingIndexError, match="distractors"):
+        load_buffer(QUERIES[0], "k0", split=whole).embeddings("thumbnail")

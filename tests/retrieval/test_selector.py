@@ -24,14 +24,14 @@ def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
 def test_what_identifies_a_selector(indexed: Path) -> None:
     for condition in ("no-history", "k1"):  # any buffer of the split will do
         buffer = load_buffer(QUERIES[0], condition, split=indexed)
-        header = buffer.query.dataset.index("thumbnail").header
+        index = buffer.index("thumbnail")
         assert Selector("thumbnail").identity(buffer) == {
             "encoder": "thumbnail",
-            "fingerprint": header.encoder.sha256,
+            "fingerprint": index.encoder.sha256,
             "camera": "front",
             "method": "max",
             "cut": "adaptive",
-            "threshold": (1 + header.typical_cosine) / 2,
+            "threshold": (1 + index.typical_cosine) / 2,
         }
     fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
     assert (fixed["method"], fixed["cut"], fixed["threshold"]) == ("mean", 0.5, 0.5)

@@ -139,7 +139,7 @@ def _index(root: Path) -> None:
     dataset = _sound_datasets(root)["distractors"]
     index = EmbeddingIndex(dataset.files, dataset.revision, "thumbnail")
     assert index.span(0, 0, 1).shape == (1, index.header.size)
-    index.check({index: 32 for index in range(len(dataset))})
+    index.check({index: 32 for index in range(len(dataset))}, units=True)
 
 
 def _run(root: Path) -> None:

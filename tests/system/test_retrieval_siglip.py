@@ -12,11 +12,11 @@ from support.retrieval import make_index
 from support.splits import QUERIES
 
 from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.embeddings import normalised
 from robomme_interference_data.errors import FormatError, HubError, InvalidOptionError
 from robomme_interference_data.retrieval.encoders import make_encoder
 from robomme_interference_data.retrieval.select import measure
 from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.split_index import normalised
 
 
 @cache
@@ -58,9 +58,9 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
         expected = whole.get_image_features(**inputs).pooler_output.numpy()
     assert found.shape == (9, 32) and found.dtype == np.float32
     assert found == pytest.approx(expected, abs=1e-5)
-    # Alone or together, within a unit of float16 (2⁻¹¹ below 1).
+    # Alone or together, within a unit of float16 (2⁻¹¹ of a value).
     alone = np.concatenate([encoder.features(encoder.prepare(image[None])) for image in images])
-    apart = normalised(found).astype(np.float32) - normalised(alone)
+    apart = normalised(found) - normalised(alone)
     assert np.abs(apart).max() <= 2**-11
     assert encoder.computed_in == "cpu, float32"
     assert encoder.fingerprint == make_encoder(model, device="cpu").fingerprint
@@ -72,11 +72,13 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
 def test_siglip_makes_an_index(own_split: Path, model: str) -> None:
     encoder = make_encoder(model, device="cpu")
     make_index(own_split, encoder)
-    demonstrations = load_split(own_split).datasets["demonstrations"]
-    index, length = demonstrations.index(model), demonstrations.record(0).length
-    found = index.span(0, 0, length)
-    assert found.shape == (length, 32) and index.centre is None
-    assert np.linalg.norm(found.astype(np.float32), axis=1) == pytest.approx(1, abs=2e-3)
+    datasets = load_split(own_split).datasets
+    demonstrations, length = datasets["demonstrations"], datasets["demonstrations"].record(0).length
+    images = np.empty((length, *demonstrations.shape("front")), np.uint8)
+    demonstrations.read_frames(0, "front", 0, images)
+    found, expected = demonstrations.index(model).span(0, 0, length), encoder.prepare(images)
+    assert found == pytest.approx(encoder.features(expected), rel=2e-3, abs=2e-3)
+    assert datasets["distractors"].index(model).centre is None
     buffer = load_buffer(QUERIES[0], "k1", split=own_split)
     selector = Selector(model, device="cpu")
     assert selector.name == "siglip-tiny/max/adaptive"
