@@ -18,7 +18,7 @@ from robomme_interference_data.console import (
     say,
     stoppable,
 )
-from robomme_interference_data.constants import IDENTITY_PATH
+from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
 
 
 def index(
-    split: Annotated[Path, typer.Argument(help="Folder of the split, or of its units alone.")],
+    split: Annotated[Path, typer.Argument(help="Folder of a split, or of one of its datasets.")],
     encoder: EncoderName = "thumbnail",
     camera: Camera = "front",
     device: Annotated[
@@ -57,7 +57,8 @@ def index(
     """Embed every stored frame once, and keep the embeddings beside the data.
 
     Goes on where an interrupted run stopped. An index that is there and right is kept, even if
-    another device computed it.
+    another device computed it. Where datasets of the split lie on the Hub, it looks whether they
+    have embeddings there.
 
     Examples:
     ```
@@ -66,8 +67,9 @@ def index(
     ```
     """
     from robomme_interference_data.execution import Processes, Serial
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval.encoders import make_encoder
-    from robomme_interference_data.retrieval.index import build_index
+    from robomme_interference_data.retrieval.index import build_index, look_on_hub
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.work_progress import WorkProgress
 
@@ -78,6 +80,7 @@ def index(
             f"{split} is neither a split nor a dataset of this package",
             f"Make one: robomme-interference build all --source KIND:PATH --out {split}",
         )
+    planned = load_split(split) if (split / MANIFEST_PATH).is_file() else None
     made = make_encoder(encoder, device=device, batch=batch)
     with stoppable("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(
@@ -89,6 +92,8 @@ def index(
             force=force,
             executor=Serial() if workers == 1 else Processes(workers),
         )
+    for told in look_on_hub(planned, made, camera) if planned else ():
+        say(told)
     if as_json:
         print_json([to_dict(report) for report in reports])
         return

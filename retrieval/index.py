@@ -6,7 +6,7 @@ goes on from there. The index gets its name when it is whole.
 
 import shutil
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -39,6 +39,7 @@ from robomme_interference_data.embeddings import (
 )
 from robomme_interference_data.errors import (
     BuildError,
+    HubError,
     InterferenceError,
     InvalidOptionError,
     first_line,
@@ -56,9 +57,11 @@ from robomme_interference_data.files import (
     write_json,
     write_text,
 )
+from robomme_interference_data.hub import HubFiles
 from robomme_interference_data.retrieval.encoders import Encoder, check_encoder, encoder_digest
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.rows import to_dict
+from robomme_interference_data.split import Split
 from robomme_interference_data.split_index import normalised
 from robomme_interference_data.work_progress import WorkProgress
 
@@ -127,6 +130,37 @@ def build_index(
             shutil.rmtree(work.hidden)
             reports.append(IndexReport(str(work.folder), embedded, header))
         return reports
+
+
+def look_on_hub(split: Split, encoder: Encoder, camera: str = "front") -> Iterator[str]:
+    """Say of each dataset of a split that lies on the Hub whether retrieval finds embeddings there.
+
+    Args:
+        split: The split.
+        encoder: What embedded its other datasets.
+        camera: Camera, with or without `observation.images.`.
+    """
+    for name, recorded in split.header.datasets.items():
+        files = split.place(name)
+        if not isinstance(files, HubFiles):
+            continue
+        try:
+            index = EmbeddingIndex(files, recorded.revision, encoder.name, camera)
+            check_encoder(index.header.encoder, encoder, index.remedy)
+        except HubError as error:
+            told = f"whether {files.describe()} has embeddings cannot be told: {error.message}"
+            yield "\n".join([told, *filter(None, [error.hint])])
+        except InterferenceError as error:
+            option = "" if camera == "front" else f" --camera {camera}"
+            yield (
+                f"retrieval will not find the {name}: {error.message}\n"
+                "Ask their publisher for embeddings, or fetch them and make your own:\n"
+                f"  hf download {files.repo_id} --repo-type dataset --revision {files.commit} "
+                f"--local-dir {split.location}/{name}\n"
+                f"  robomme-interference index {split.location} --encoder {encoder.name}{option}"
+            )
+        else:
+            yield f"{files.describe()} has embeddings by the same encoder: retrieval finds them"
 
 
 @dataclass
