@@ -122,8 +122,8 @@ class Publisher(Publishing):
         """
         *first, last = steps
         done = [self.put(step) for step in first]
-        if done != first:
-            last = self._split_step(_place(done[0]))  # which names the commit of what it is for
+        if [*map(_place, done)] != [*map(_place, first)]:
+            last = self._split_step(_place(done[0]))
         return [*done, self.put(last)]
 
     def _split_step(self, base: str) -> Step:
@@ -131,4 +131,5 @@ class Publisher(Publishing):
 
 
 def _place(step: Step) -> str:
-    return f"{step.repository.repo_id}@{step.published or _UNKNOWN}"
+    """Return what a split names of its demonstrations: it stays, whatever becomes of their card."""
+    return f"{step.repository.repo_id}@{step.same or step.published or _UNKNOWN}"

@@ -6,12 +6,13 @@ The tag comes last. What has no tag is no version, whatever an upload that faile
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 from robomme_interference_data.cards import render
 from robomme_interference_data.cards.publish_config import VersionConfig
 from robomme_interference_data.cards.step import Step
 from robomme_interference_data.cards.tree import Content, Difference, Entry, Tree, beside, compare
-from robomme_interference_data.cards.upload import HubRepository, State
+from robomme_interference_data.cards.upload import HubRepository
 from robomme_interference_data.cards.versions import Change, Version, change_between
 from robomme_interference_data.errors import FormatError, MissingFileError, PublishError
 from robomme_interference_data.hub import HubFiles
@@ -107,8 +108,8 @@ class Publishing:
 
         Args:
             goods: What it is to hold.
-            follows: Its versions count on their own: where its data are as they were, whatever the
-                card says, it stays as it is, and otherwise takes the next version that fits.
+            follows: Its versions count on their own: if it has changed it takes the next one that
+                fits, whatever version is asked for.
 
         Raises:
             PublishError: The version is there already, and is another one; or it does not say how
@@ -118,26 +119,33 @@ class Publishing:
         repository = HubRepository(goods.repo_id, self._tell, self._wait)
         wanted = self.config.wanted
         state = repository.state()
-        there = repository.tree(state.head) if state else {}
+        held = cache(repository.tree)  # what a commit holds never changes
+        there = held(state.head) if state else {}
+        versions = state.versions if state else {}
+        same = None
+        for earlier in reversed(versions.values() if follows else ()):
+            if compare(goods.files, _without_card(held(earlier))):
+                break
+            same = earlier
 
         def step(version: Version) -> Step:
             tree = goods.tree(version)
-            return Step(repository, version, tree, state, compare(tree, there), None, goods.lerobot)
+            differs = compare(tree, there)
+            return Step(repository, version, tree, state, differs, None, goods.lerobot, same)
 
-        if state is None or not state.versions:
+        if not versions:
             _check_ours(goods, repository, there)
             return step(wanted or goods.first)
-        newest = max(state.versions)
+        newest = max(versions)
         version = newest if follows or wanted is None else wanted
-        found, commit, differs = step(version), state.versions.get(version), None
+        found, commit, differs = step(version), versions.get(version), None
         if commit is not None:
-            held = repository.tree(commit)
-            differs = compare(found.tree, held)
-            if not differs or (follows and not compare(goods.files, _without_card(held))):
+            differs = compare(found.tree, held(commit))
+            if not differs:
                 return replace(found, published=commit, difference=Difference())
-        fits = newest.after(self._change(goods, state, newest))
+        fits = newest.after(_change(goods, versions[newest]))
         if follows:
-            return step(max(wanted or fits, fits))
+            return step(fits)
         if commit is None and version >= fits:
             return found
         raise PublishError(
@@ -148,12 +156,14 @@ class Publishing:
             f"The next version that fits: --version {fits}",
         )
 
-    def _change(self, goods: Goods, state: State, version: Version) -> Change:
-        try:
-            before = goods.parts(HubFiles(goods.repo_id, state.versions[version]))
-        except (FormatError, MissingFileError):
-            before = {"what cannot be read": ""}
-        return change_between(before, goods.parts(None))
+
+def _change(goods: Goods, earlier: str) -> Change:
+    """Return how much has changed since a commit."""
+    try:
+        before = goods.parts(HubFiles(goods.repo_id, earlier))
+    except (FormatError, MissingFileError):
+        before = {"what cannot be read": ""}
+    return change_between(before, goods.parts(None))
 
 
 def _without_card(there: Mapping[str, Entry]) -> dict[str, Entry]:

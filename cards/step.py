@@ -22,6 +22,8 @@ class Step:
         difference: What has to be sent and removed.
         published: Commit of the version; None as long as it is not there.
         lerobot: Tag by which LeRobot finds a dataset of its format, such as `v3.0`; or None.
+        same: Commit of the first version that holds the same but for the card, of a repository
+            whose versions count on their own; None if none does.
     """
 
     repository: HubRepository
@@ -31,6 +33,7 @@ class Step:
     difference: Difference
     published: str | None
     lerobot: str | None
+    same: str | None
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values, for JSON."""

@@ -1,7 +1,7 @@
 """A repository on the Hub that is written to: one commit at a time, then tags."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -9,12 +9,11 @@ from typing import Any
 from robomme_interference_data.cards.tree import Difference, Entry, Tree, compare
 from robomme_interference_data.cards.versions import Version, versions_of
 from robomme_interference_data.errors import HubError
+from robomme_interference_data.hub_errors import Asked, busy_for
 
 _TRIES = 5
 _AT_ONCE = 16
 """Files that are sent at a time: most are small, and wait for answers."""
-_BUSY = (429, 503)
-_AGAIN = "What was sent is kept: type the same command again"
 _LONGEST_WAIT = 330
 """Seconds; the Hub counts requests in windows of five minutes."""
 
@@ -59,6 +58,7 @@ class HubRepository:
 
         self.repo_id = repo_id
         self._api = HfApi()
+        self._asked = Asked(repo_id)
         self._tell = tell
         self._wait = wait
         self._of = {"repo_id": repo_id, "repo_type": "dataset"}
@@ -66,7 +66,7 @@ class HubRepository:
     @property
     def page(self) -> str:
         """Address of its page."""
-        return f"{self._api.endpoint}/datasets/{self.repo_id}"
+        return self._asked.page
 
     def state(self) -> State | None:
         """Return what it holds; None if there is none of this name that this login may see.
@@ -118,7 +118,9 @@ class HubRepository:
             refused = error
         state = self.state()  # it may be there all the same: the answer may have been lost
         if state is None:
-            raise refused or HubError(f"{self.repo_id} was made, and is not there", f"{_AGAIN}.")
+            raise refused or HubError(
+                f"{self.repo_id} was made, and is not there", f"{self._asked.again}."
+            )
         return state
 
     def commit(self, tree: Tree, head: str, message: str) -> str:
@@ -148,7 +150,7 @@ class HubRepository:
         if left:
             raise HubError(
                 f"{self.repo_id} does not hold what was sent: {left}",
-                f"{_AGAIN}.",
+                f"{self._asked.again}.",
             )
         return made
 
@@ -209,70 +211,15 @@ class HubRepository:
 
     # --- asking ----------------------------------------------------------------------------------
 
-    def _ask(self, ask: Callable[..., Any], **options: Any) -> Any:
+    def _ask(self, call: Callable[..., Any], **options: Any) -> Any:
         """Ask the client; wait and ask again while the Hub is busy."""
-        import httpx
-
-        for left in reversed(range(_TRIES)):
+        for _ in range(_TRIES - 1):
             try:
-                return ask(**options)
-            except (OSError, ValueError, RuntimeError, httpx.TransportError) as error:
-                cause = _cause(error)
-                response = getattr(cause, "response", None)
-                if response is None and getattr(cause, "errno", None) is not None:
-                    raise cause from None  # the system's word on a file
-                seconds = None
-                if response is not None and response.status_code in _BUSY:
-                    seconds = _seconds(response.headers)
-                if seconds is None or not left or seconds > _LONGEST_WAIT:
-                    raise self._explained(cause) from error
-                self._tell(f"The Hub is busy: trying again in {seconds:.0f} s")
-                self._wait(seconds)
-        raise AssertionError
-
-    def _explained(self, error: BaseException) -> HubError:
-        """Return the client's error in this package's words, with what to do next."""
-        from huggingface_hub import constants, errors
-
-        code = getattr(getattr(error, "response", None), "status_code", None)
-        if isinstance(error, errors.GatedRepoError):
-            what = f"{self.repo_id} is gated, and this login has not been given access"
-            hint = f"Ask for access at {self.page}"
-        elif isinstance(error, errors.LocalTokenNotFoundError) or code == 401:
-            what = f"the Hub at {constants.ENDPOINT} does not know this login"
-            hint = "Make a token that may write, and type: hf auth login"
-        elif code == 403:
-            what = f"this login may not write to {self.repo_id}"
-            hint = "Give a repository of your own, or a token that may write: hf auth login --force"
-        elif code == 412:
-            what = f"somebody else wrote to {self.repo_id} at the same time"
-            hint = f"Look at {self.page}/commits/main. {_AGAIN}, if that is as it should be."
-        elif code in _BUSY:
-            seconds = _seconds(error.response.headers)  # type: ignore[attr-defined]
-            what = f"the Hub is busy: {self.repo_id} is not published yet"
-            hint = f"{_AGAIN} in {max(seconds / 60, 1):.0f} minutes or more."
-        elif constants.HF_HUB_OFFLINE:
-            what = f"{self.repo_id} cannot be reached: HF_HUB_OFFLINE is set"
-            hint = "Type the same command again, with HF_HUB_OFFLINE=0 in front."
-        else:
-            what = f"{self.repo_id}: {' '.join(str(error).split())}"
-            hint = f"{_AGAIN}."
-        return HubError(what, hint)
-
-
-def _cause(error: BaseException) -> BaseException:
-    """Return what was behind an error: of an upload, the client tells only which file it was."""
-    while isinstance(error, RuntimeError) and error.__cause__ is not None:
-        error = error.__cause__
-    return error
-
-
-def _seconds(headers: Mapping[str, str]) -> float:
-    """Return how long a busy server wants to be left alone; a while, if it does not say."""
-    from huggingface_hub.utils import parse_ratelimit_headers
-
-    limit = parse_ratelimit_headers(headers)
-    if limit is not None and limit.remaining == 0:
-        return float(limit.reset_in_seconds)
-    after = headers.get("Retry-After", "")
-    return float(after) if after.isdigit() else 10.0
+                return self._asked.ask(call, **options)
+            except HubError as error:
+                seconds = busy_for(error)
+                if seconds is None or seconds > _LONGEST_WAIT:
+                    raise
+            self._tell(f"The Hub is busy: trying again in {seconds:.0f} s")
+            self._wait(seconds)
+        return self._asked.ask(call, **options)

@@ -16,13 +16,10 @@ from typing import Any
 
 from robomme_interference_data.errors import (
     HashMismatchError,
-    HubError,
-    InterferenceError,
     InvalidOptionError,
-    MissingFileError,
-    first_line,
 )
 from robomme_interference_data.files import LocalFiles, check_relative, sha256_file
+from robomme_interference_data.hub_errors import Asked
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
@@ -107,7 +104,7 @@ class HubFiles:
         if _VERSION.fullmatch(self.revision):
             with suppress(RevisionResolutionError):
                 return str(resolve(self.repo_id, local_files_only=True, **wanted).resolved)
-        return str(self._asked(None, resolve, self.repo_id, **wanted).resolved)
+        return str(self._ask(None, resolve, self.repo_id, **wanted).resolved)
 
     def path(self, relative: str) -> Path:
         """Return the file's path in the cache, downloading it first if need be; see `Files.path`.
@@ -122,7 +119,7 @@ class HubFiles:
         check_relative(relative, self.describe())
         new = self.missing([relative])
         path = Path(
-            self._asked(
+            self._ask(
                 relative,
                 hf_hub_download,
                 self.repo_id,
@@ -185,7 +182,7 @@ class HubFiles:
                 if hasattr(one, "size") and one.path.startswith(self.folder)
             }
 
-        found: dict[str, int] = self._asked(None, listed)
+        found: dict[str, int] = self._ask(None, listed)
         return found
 
     def snapshot(self, *patterns: str) -> Path:
@@ -196,7 +193,7 @@ class HubFiles:
         """
         from huggingface_hub import snapshot_download
 
-        whole = self._asked(
+        whole = self._ask(
             None,
             snapshot_download,
             self.repo_id,
@@ -216,7 +213,7 @@ class HubFiles:
 
     def describe(self) -> str:
         """Return `namespace/name@revision`, with the commit as revision once it is known."""
-        whole = f"{self.repo_id}@{self.__dict__.get('commit', self.revision)}"
+        whole = f"{self.repo_id}@{self._at}"
         return f"{whole}, {self.folder}" if self.folder else whole
 
     def _check(self, relative: str, path: Path) -> None:
@@ -235,75 +232,16 @@ class HubFiles:
                 "It was thrown away. Type the same command again.",
             )
 
-    def _asked(self, relative: str | None, ask: Any, *arguments: Any, **options: Any) -> Any:
-        """Ask the client, and return its error in this package's words."""
-        import httpx
-        from huggingface_hub import errors
+    def _ask(self, relative: str | None, call: Any, *arguments: Any, **options: Any) -> Any:
+        path = None if relative is None else self.folder + relative
+        asked = Asked(self.repo_id, self.repo_type, self._at, path)
+        return asked.ask(call, *arguments, **options)
 
-        try:
-            return ask(*arguments, **options)
-        except (
-            errors.HfHubHTTPError,
-            errors.EntryNotFoundError,
-            errors.FileMetadataError,
-            errors.HFValidationError,
-            errors.OfflineModeIsEnabled,
-            errors.RevisionResolutionError,
-            errors.IncompleteSnapshotError,
-            httpx.TransportError,
-        ) as error:
-            raise self._explain(error, relative) from error
-        except OSError as error:
-            if error.errno is not None:  # the system's word on a file
-                raise
-            raise HubError(
-                f"{relative or 'the repository'} of {self.describe()} did not come whole: "
-                f"{first_line(error)}",
-                "What came whole is kept. Type the same command again.",
-            ) from error
-
-    def _explain(self, error: Exception, relative: str | None) -> InterferenceError:
-        from huggingface_hub import constants, errors
-
-        kind = "datasets/" if self.repo_type == "dataset" else ""
-        page = f"{constants.ENDPOINT}/{kind}{self.repo_id}"
-        repository = f"{self.repo_type} repository {self.repo_id!r} on {constants.ENDPOINT}"
-        if isinstance(error, errors.GatedRepoError):
-            return HubError(
-                f"the {repository} is gated, and this login has not been given access",
-                f"Ask for access at {page}, then type: hf auth login",
-            )
-        if isinstance(error, errors.RevisionNotFoundError):
-            return HubError(
-                f"the {repository} has no revision {self.revision!r}",
-                f"Its branches and tags are listed at {page}/tree/main",
-            )
-        if isinstance(error, errors.RepositoryNotFoundError | errors.HFValidationError):
-            return HubError(
-                f"there is no {repository} that this login may see",
-                "Check the name; if a folder on this machine was meant, it does not exist. For a "
-                "private repository, type: hf auth login",
-            )
-        if isinstance(error, errors.RemoteEntryNotFoundError):
-            return MissingFileError(
-                f"{relative} is missing in {self.describe()}",
-                f"The repository is not complete; its files: {page}/tree/{self.commit}",
-            )
-        what = f"the {repository}" if relative is None else f"{relative} of the {repository}"
-        option = "" if self.repo_type == "model" else f" --repo-type {self.repo_type}"
-        command = (
-            f"hf download{option} {self.repo_id} --revision "
-            f"{self.__dict__.get('commit', self.revision)}" + (f" {relative}" if relative else "")
-        )
-        if constants.HF_HUB_OFFLINE:
-            return HubError(
-                f"{what} is not in the cache, and HF_HUB_OFFLINE is set",
-                f"Where there is a network, type: HF_HUB_OFFLINE=0 {command}",
-            )
-        return HubError(
-            f"{what} is not in the cache, and the Hub cannot be reached: {first_line(error)}",
-            f"Try again when it can be reached, with: {command}",
-        )
+    @property
+    def _at(self) -> str:
+        """The commit once it is known, and before that the revision."""
+        at: str = self.__dict__.get("commit", self.revision)
+        return at
 
 
 def _git_sha1(path: Path) -> str:

@@ -21,6 +21,7 @@ from support.publishing import (
 from support.splits import CONDITIONS, GOLDEN, contents, copy_split
 
 from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.cards import render
 from robomme_interference_data.errors import HubError, InvalidOptionError, PublishError
 
 QUERY = "MoveCube/test/0"
@@ -156,7 +157,11 @@ def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, follo
         assert f"--version {following}" in str(caught.value.hint)
     assert writes(hub) == []
     kept, new = publish(root, version=following, **options)
-    assert kept.published == lessons.published  # the demonstrations are as they were
+    # The demonstrations are as they were; with another licence, their card is not.
+    assert (kept.published == lessons.published) == (how != "card")
+    assert load_split(UNITS).header.datasets["demonstrations"].place == (
+        f"{LESSONS}@{lessons.published}"
+    )
     assert tags(hub, UNITS) == {
         "data-1.0.0": units.published,
         f"data-{following}": new.published,
@@ -206,7 +211,28 @@ def test_demonstrations_count_their_own_versions(hub: HubServer, tmp_path: Path)
     assert (str(lessons.version), str(units.version)) == ("1.0.1", "1.0.1")
     (root / "demonstrations" / "index" / "most").write_bytes(b"most")
     lessons, units = publish(root, version="3.0.0")
-    assert (str(lessons.version), str(units.version)) == ("3.0.0", "3.0.0")
+    assert (str(lessons.version), str(units.version)) == ("1.0.2", "3.0.0")
+
+
+def test_their_card_alone_is_a_version_of_theirs(
+    hub: HubServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lessons, units = publish(GOLDEN)
+    told = {"README.md": b"---\nlicense: mit\n---\nmore", "README-strip.png": b"a"}
+    for card, version in ((told, "1.0.1"), (told | {"croissant.json": b"{}"}, "1.0.2")):
+        monkeypatch.setattr(render, "demonstrations_files", lambda *_, card=card: card)
+        new, kept = publish(GOLDEN)
+        assert (str(new.version), files(hub, LESSONS)["README.md"]) == (version, card["README.md"])
+        assert tags(hub, LESSONS)[f"data-{version}"] == new.published != lessons.published
+        assert kept.published == units.published  # it names the first commit, which holds the data
+        hub.asked.clear()
+        again = publish(GOLDEN)
+        assert [one.published for one in again] == [new.published, units.published]
+        assert writes(hub) == []
+    # What is for them from now on names the commit of their data, too.
+    publish(GOLDEN, "someone/other", demonstrations_id=LESSONS)
+    header = load_split("someone/other").header.datasets["demonstrations"]
+    assert header.place == f"{LESSONS}@{lessons.published}"
 
 
 # --- published demonstrations --------------------------------------------------------------------
