@@ -8,7 +8,7 @@ from robomme_interference_data.build_dataset.audit import audit_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.files import LocalFiles, naming
 from robomme_interference_data.split import Split
 from robomme_interference_data.work_progress import WorkProgress
 
@@ -49,7 +49,10 @@ def open_with_lerobot(name: str, root: Path) -> None:
 
     Raises:
         PublishError: LeRobot cannot.
+        OSError: The disk is full, or a folder cannot be written to.
     """
+    from datasets import config
+
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -59,6 +62,12 @@ def open_with_lerobot(name: str, root: Path) -> None:
         for index in (0, len(dataset) - 1):
             dataset[index]
     except Exception as error:
+        told: BaseException | None = error
+        while told is not None:  # LeRobot copies tables to a cache, and that disk may be full
+            if isinstance(told, OSError) and told.errno is not None:
+                with naming(config.HF_DATASETS_CACHE):
+                    raise told from None
+            told = told.__cause__
         raise PublishError(
             f"LeRobot cannot open {root}: {type(error).__name__}: {error}",
             "Its files are as recorded: look whether lerobot is of a version that this package "

@@ -134,10 +134,15 @@ def publish(
     ```
     """
     from robomme_interference_data.cards.checks import check_split
+    from robomme_interference_data.cards.upload import HubRepository
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
     opened = load_split(split)
+    if to is not None:
+        check_output(to.resolve().parent)
+    elif not dry_run:
+        HubRepository(config.repo_id, say).check_rights(there=False)  # checks may take hours
     with WorkProgress(quiet=as_json) as progress:
         check_split(opened, progress)
     if to is not None:
@@ -152,7 +157,6 @@ def _export(
     from robomme_interference_data.cards.export import exported_tree, write_tree
     from robomme_interference_data.cards.tree import total_size
 
-    check_output(to.resolve().parent)
     tree = exported_tree(split, config)
     written = not dry_run and write_tree(tree, to)
     told = {"to": str(to), "files": len(tree), "bytes": total_size(tree), "written": written}

@@ -139,7 +139,8 @@ def main() -> None:
     except OSError as error:
         if error.errno is None:  # not the system's word on a file
             raise
-        where = f"{error.filename}: " if error.filename is not None else ""
+        names = [name for name in (error.filename, error.filename2) if name is not None]
+        where = f"{' -> '.join(map(str, names))}: " if names else ""
         hint = "Check the path, its permissions and the space left on the disk."
         _fail(f"{where}{error.strerror}", hint)
 

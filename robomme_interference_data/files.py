@@ -244,6 +244,17 @@ def write_text(path: Path, text: str) -> None:
 
 
 @contextmanager
+def naming(place: object) -> Iterator[None]:
+    """Say where, if the system says no more than what: of a full disk, it does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(place)
+        raise
+
+
+@contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path` that becomes `path` if the block succeeds.
 
@@ -254,11 +265,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
     os.close(handle)
     partial = Path(name)
     try:
-        yield partial
-        partial.chmod(0o644)
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        partial.replace(path)
+        with naming(path):
+            yield partial
+            partial.chmod(0o644)
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
+            partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -333,7 +345,8 @@ def working(out: Path) -> Iterator[Path]:
         if (work / "before").exists() and not out.exists():
             (work / "before").rename(out)
         try:
-            yield work
+            with naming(work):
+                yield work
         finally:
             if not any(work.glob("*/[!.]*")):
                 shutil.rmtree(work, ignore_errors=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robomme_interference_data.errors import HubError, InterferenceError, MissingFileError
+from robomme_interference_data.files import naming
 
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _BUSY = (429, 503)
@@ -64,10 +65,8 @@ class Asked:
         ) as error:
             cause = _cause(error)
             if isinstance(cause, OSError) and cause.errno is not None:
-                # Of a full disk, the system does not say where it is.
-                cache = None if self.revision is None else constants.HF_HUB_CACHE
-                where = cache if cause.filename is None else cause.filename
-                raise OSError(cause.errno, cause.strerror, where) from error
+                with naming(constants.HF_HUB_CACHE if self.revision else self.repo_id):
+                    raise cause from None
             raise self._explained(cause) from cause
 
     def _explained(self, error: BaseException) -> InterferenceError:

@@ -130,9 +130,20 @@ def test_a_damaged_split_is_not_published(hub: HubServer, run: Run, tmp_path: Pa
     root = copy_split(tmp_path / "split")
     (root / "distractors" / "meta" / "build_report.json").write_text("{}\n")
     code, _, err = run("publish", root, "--repo-id", UNITS, "--yes")
-    assert (code, hub.requests) == (1, [])
+    assert (code, written(hub)) == (1, False)
     assert "build_report.json" in err
     assert f"robomme-interference verify {root}" in err
+
+
+@pytest.mark.parametrize("token", ["hf_unknown", ""])
+def test_who_is_not_logged_in_does_not_wait_for_the_checks(
+    hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch, token: str
+) -> None:
+    monkeypatch.setattr(checks, "check_split", lambda *_: pytest.fail("it was checked"))
+    monkeypatch.setenv("HF_TOKEN", token)
+    code, _, err = run(*ASKED, "--yes")
+    assert (code, len(hub.requests) <= 1) == (1, True)
+    assert "does not know this login" in err and "hf auth login" in err
 
 
 def test_a_split_that_leaks_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,24 @@
 """Publishing when something goes wrong: nothing is half-published, and the same command goes on."""
 
+import os
+import signal
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
+from huggingface_hub import constants
 from support.hub_server import HubServer
-from support.publishing import LESSONS, UNITS, files, plain_cards, publish, tags
-from support.splits import GOLDEN
+from support.machine import WRONG, full_disk, set_clocks
+from support.publishing import LESSONS, UNITS, files, plain_cards, plan_again, publish, tags
+from support.splits import CONDITIONS, GOLDEN, contents, copy_split
 
+from robomme_interference_data import load_split
+from robomme_interference_data.cards import checks
+from robomme_interference_data.cards.checks import open_with_lerobot
+from robomme_interference_data.cards.export import exported_tree, write_tree
+from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.errors import HubError
 
 
@@ -104,6 +115,12 @@ def test_but_not_for_ever(hub: HubServer, fault: dict[str, Any], waited: list[fl
     assert len(hub.uploads()) == len(set(hub.uploads()))
 
 
+def test_a_connection_that_drops_during_an_upload(hub: HubServer) -> None:
+    hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, drop=1000)
+    publish(GOLDEN)
+    assert whole(hub)
+
+
 def test_somebody_else_wrote_meanwhile(hub: HubServer) -> None:
     other = {"README.md": b"to come", "notes.txt": b"other"}
     hub.fault("POST", "/tiny/commit/", call=lambda: hub.push(f"datasets/{UNITS}", other))
@@ -163,3 +180,71 @@ def test_a_hub_that_is_down(hub: HubServer) -> None:
     with pytest.raises(HubError, match="busy"):
         publish(GOLDEN, waits=waits)
     assert waits == [10.0] * 4
+
+
+# --- this machine --------------------------------------------------------------------------------
+
+
+def test_a_full_disk_does_not_matter_the_first_time(hub: HubServer) -> None:
+    with full_disk():
+        publish(GOLDEN)
+    assert whole(hub)
+
+
+def test_a_full_disk_while_versions_are_compared(hub: HubServer, tmp_path: Path) -> None:
+    _, units = publish(GOLDEN)
+    root = copy_split(tmp_path / "split")
+    plan_again(root, [*CONDITIONS, "k2"])
+    with full_disk(), pytest.raises(OSError, match="File too large") as caught:
+        publish(root, version="1.1.0")
+    assert caught.value.filename == constants.HF_HUB_CACHE
+    assert tags(hub, UNITS).keys() == {"data-1.0.0", "v3.0"}
+    publish(root, version="1.1.0")
+    assert tags(hub, UNITS).keys() == {"data-1.0.0", "data-1.1.0", "v3.0"}
+    assert tags(hub, UNITS)["data-1.0.0"] == units.published
+
+
+def test_a_full_disk_while_exporting(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    tree = exported_tree(load_split(GOLDEN), PublishConfig(UNITS))
+    for left in (0, 12_000):  # the first file does not fit, a later one
+        with full_disk(left), pytest.raises(OSError, match="File too large") as caught:
+            write_tree(tree, out)
+        assert str(tmp_path) in f"{caught.value.filename} {caught.value.filename2}"
+        assert [*tmp_path.iterdir()] == []
+    assert write_tree(tree, out)
+    assert {path: one.read() for path, one in tree.items()} == contents(out)
+
+
+def test_a_full_disk_while_lerobot_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datasets import config
+
+    monkeypatch.setattr(config, "HF_DATASETS_CACHE", str(tmp_path))
+    with full_disk(12_000), pytest.raises(OSError, match="File too large") as caught:
+        open_with_lerobot("distractors", GOLDEN / "distractors")
+    assert str(caught.value.filename).startswith(str(tmp_path))
+    open_with_lerobot("distractors", GOLDEN / "distractors")
+
+
+@pytest.mark.parametrize("clocks", WRONG)
+def test_a_wrong_clock(hub: HubServer, monkeypatch: pytest.MonkeyPatch, clocks: str) -> None:
+    with monkeypatch.context() as wrong:
+        set_clocks(hub, wrong, *WRONG[clocks])
+        first = publish(GOLDEN)
+    assert whole(hub)
+    hub.clock = 0
+    assert [one.published for one in publish(GOLDEN)] == [one.published for one in first]
+
+
+def test_stopped_while_publishing(
+    hub: HubServer, run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks, "check_split", lambda *_: None)
+    interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
+    hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=interrupt)
+    command = ("publish", GOLDEN, "--repo-id", UNITS, "--yes")
+    code, _, err = run(*command)
+    assert code == 130 and "go on with:\nrobomme-interference publish" in err
+    assert "data-1.0.0" in tags(hub, LESSONS) and tags(hub, UNITS) == {}
+    assert run(*command)[0] == 0
+    assert whole(hub)

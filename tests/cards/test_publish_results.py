@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from support import runs, worlds
 from support.hub_server import HubServer
+from support.machine import full_disk
 from support.publishing import files, tags
 from support.splits import GOLDEN
 
@@ -46,6 +47,16 @@ def test_results_are_published_once(hub: HubServer, ended: Path, run: Run, tmp_p
     assert code == 0 and "published, " in err and hub.received == sent
     code, out, err = run("card", REPO)
     assert code == 0 and "results" in out, err
+
+
+def test_a_full_disk_while_scores_are_written(hub: HubServer, ended: Path, run: Run) -> None:
+    asked = ("publish-results", ended, "--repo-id", REPO, "--grid", "given", "--yes")
+    with full_disk(1000):
+        code, _, err = run(*asked)
+    assert code == 1 and "File too large" in err and "space left on the disk" in err
+    assert hub.repositories == {}
+    assert run(*asked)[0] == 0
+    assert [*tags(hub, REPO)] == ["data-1.0.0"]
 
 
 def test_other_rows_are_another_version(

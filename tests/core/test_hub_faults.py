@@ -1,19 +1,27 @@
 """Loading from a Hub when something goes wrong: one clear error, and the same call goes on."""
 
-from collections.abc import Iterator
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from huggingface_hub import constants
-from support.hub import SPLIT, push_split, running_hub
+from support.hub import BASE, SPLIT, push_split, running_hub
 from support.hub_server import HubServer, User
+from support.machine import DAY, WRONG, full_disk, set_clocks
 from support.splits import GOLDEN
 
 from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.errors import HashMismatchError, HubError, InterferenceError
 
+Run = Callable[..., tuple[int, str, str]]
 QUERY, VERSION = "MoveCube/test/0", "data-1.0.0"
 ROWS, VIDEO = r"/manifests/buffers\.parquet", r"/observation.images.front/.*\.mp4"
 STATES = r"/data/.*\.parquet"
@@ -106,15 +114,94 @@ def test_a_renamed_repository_is_found(hub: HubServer) -> None:
     assert whole()
 
 
-def test_a_cache_that_cannot_be_written(
-    hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises((OSError, InterferenceError)):
+# --- this machine --------------------------------------------------------------------------------
+
+
+def leftovers(folder: Path) -> list[Path]:
+    return [path for end in ("incomplete", "partial", "tmp") for path in folder.rglob(f"*.{end}")]
+
+
+def test_a_full_disk(hub: HubServer, tmp_path: Path) -> None:
+    with full_disk(12_000), pytest.raises(OSError, match="File too large") as caught:
         load()
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    assert not isinstance(caught.value, InterferenceError)
+    assert caught.value.filename == constants.HF_HUB_CACHE
+    assert leftovers(tmp_path) == []
     assert whole()
+
+
+@pytest.mark.parametrize("where", ["cache", "folder"])
+def test_a_full_disk_while_fetching(hub: HubServer, tmp_path: Path, run: Run, where: str) -> None:
+    out, command = tmp_path / "out", ["fetch", f"{SPLIT}@{VERSION}", "--to", tmp_path / "out"]
+    if where == "folder":
+        assert run(*command[:2])[0] == 0
+    with full_disk(12_000):
+        code, _, err = run(*command)
+    place = constants.HF_HUB_CACHE if where == "cache" else f"-> {out}/"
+    assert code == 1 and f"{place}" in err and "File too large" in err
+    assert "kept; once mended, go on with:\nrobomme-interference fetch" in err
+    assert "space left on the disk" in err
+    assert leftovers(tmp_path) == [] and not (out / "manifests" / "manifest.json").exists()
+    assert run(*command)[0] == 0
+    assert [*verify_split(load_split(out))] == []
+
+
+def test_a_cache_that_cannot_be_written(
+    hub: HubServer, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ("fetch", f"{SPLIT}@{VERSION}", "--conditions", "k1")
+    (tmp_path / "file").write_bytes(b"")  # a folder's rights would not bind root
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "file" / "cache"))
+    code, _, err = run(*command)
+    assert code == 1 and f"Error: {tmp_path / 'file'}" in err and "Not a directory" in err
+    assert "go on with:\nrobomme-interference fetch" in err and "permissions" in err
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    assert run(*command)[0] == 0
+    assert whole()
+
+
+@pytest.mark.parametrize("revision", [VERSION, "main"])
+def test_a_cache_that_can_only_be_read(hub: HubServer, tmp_path: Path, revision: str) -> None:
+    loaded = load_buffer(QUERY, "k3", split=SPLIT, revision=revision).frames()
+    for folder in (
+        "cache/.locks",
+        *[f"cache/datasets--{one.replace('/', '--')}/refs" for one in (SPLIT, BASE)],
+    ):
+        shutil.rmtree(tmp_path / folder, ignore_errors=True)
+        (tmp_path / folder).write_bytes(b"")
+    before = len(hub.downloads())
+    again = load_buffer(QUERY, "k3", split=SPLIT, revision=revision, verify=True)
+    assert np.array_equal(again.frames(), loaded)
+    assert len(hub.downloads()) == before
+
+
+@pytest.mark.parametrize("clocks", WRONG)
+def test_a_wrong_clock(hub: HubServer, monkeypatch: pytest.MonkeyPatch, clocks: str) -> None:
+    set_clocks(hub, monkeypatch, *WRONG[clocks])
+    assert whole()
+
+
+@pytest.mark.parametrize("seconds", [-DAY, DAY])
+def test_a_cache_of_another_day(hub: HubServer, tmp_path: Path, seconds: float) -> None:
+    load()
+    moment = time.time() + seconds
+    for path in (tmp_path / "cache").rglob("*"):
+        os.utime(path, (moment, moment))
+    before = len(hub.requests)
+    assert whole()
+    assert len(hub.requests) == before
+
+
+def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> None:
+    command = ("fetch", f"{SPLIT}@{VERSION}", "--to", tmp_path / "out")
+    hub.fault("GET", VIDEO, after=3, call=partial(os.kill, os.getpid(), signal.SIGINT))
+    code, _, err = run(*command)
+    assert code == 130 and "kept; go on with:\nrobomme-interference fetch" in err
+    assert leftovers(tmp_path) == [] and not (tmp_path / "out").exists()
+    assert run(*command)[0] == 0
+    came = [one.path for one in hub.asked if one.method == "GET" and one.status == 200]
+    came = [path for path in came if not path.startswith("/api/")]
+    assert len(came) - len({*came}) <= 8  # those that were on their way come again
 
 
 def test_nothing_is_asked_of_a_split_that_is_open(hub: HubServer) -> None:
