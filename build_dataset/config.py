@@ -160,8 +160,9 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             "--demonstrations",
             config.demonstrations,
             "demonstrations that are published",
-            "For demonstrations in a folder: robomme-interference build all, or build distractors "
-            "and build manifests.",
+            "A published split's card names the repository of its demonstrations. For "
+            "demonstrations in a folder: robomme-interference build all, or build distractors and "
+            "build manifests.",
         )
     cameras = config.cameras or base.cameras
     units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))

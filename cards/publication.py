@@ -30,7 +30,9 @@ def check_repo_id(repo_id: object, option: str = "--repo-id") -> str:
     from huggingface_hub.errors import HFValidationError
     from huggingface_hub.utils import validate_repo_id
 
-    expected = "namespace/name of a repository on the Hub, of letters, digits, '-', '_' and '.'"
+    expected = (
+        "namespace/name of a repository on the Hub, at most 96 letters, digits, '-', '_' and '.'"
+    )
     if not isinstance(repo_id, str):
         raise InvalidOptionError.expected(option, repo_id, expected)
     try:

@@ -39,8 +39,7 @@ class PublishConfig(VersionConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.demonstrations_id is not None:
-            check_repo_id(self.demonstrations_id, "--demonstrations-id")
+        check_repo_id(self.demonstrations, "--demonstrations-id")
         if self.repo_id == self.demonstrations_id:
             raise InvalidOptionError(
                 f"--repo-id and --demonstrations-id are both {self.repo_id!r}",

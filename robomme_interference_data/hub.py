@@ -172,9 +172,11 @@ class HubFiles:
         """
         from huggingface_hub import HfApi
 
+        commit = self.commit  # what it raises is told already
+
         def listed() -> dict[str, int]:
             tree = HfApi().list_repo_tree(
-                self.repo_id, recursive=True, revision=self.commit, repo_type=self.repo_type
+                self.repo_id, recursive=True, revision=commit, repo_type=self.repo_type
             )
             return {
                 one.path.removeprefix(self.folder): one.size
