@@ -31,7 +31,8 @@ def check_repo_id(repo_id: object, option: str = "--repo-id") -> str:
     from huggingface_hub.utils import validate_repo_id
 
     expected = (
-        "namespace/name of a repository on the Hub, at most 96 letters, digits, '-', '_' and '.'"
+        "namespace/name of a repository on the Hub, of letters, digits, '-', '_' and '.', at most "
+        "96 in the name"
     )
     if not isinstance(repo_id, str):
         raise InvalidOptionError.expected(option, repo_id, expected)

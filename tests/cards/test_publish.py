@@ -335,7 +335,7 @@ def test_members_publish_for_an_organization(hub: HubServer, login: Login) -> No
         ({"repo_id": "tiny"}, "--repo-id 'tiny'"),
         ({"demonstrations_id": "a/b/c"}, "--demonstrations-id 'a/b/c'"),
         ({"demonstrations_id": UNITS}, "are both"),
-        ({"repo_id": "someone/" + "a" * 80}, "--demonstrations-id 'someone/a*-demonstrations'"),
+        ({"repo_id": "someone/" + "a" * 90}, "--demonstrations-id 'someone/a*-demonstrations'"),
         ({"version": "1.0"}, "--version '1.0'"),
         ({"version": ""}, "--version ''"),
         ({"license": "MIT License"}, "--license"),
