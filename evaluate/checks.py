@@ -31,6 +31,7 @@ from robomme_interference_data.execution import Executor, Worker
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.simulators.registry import (
     SIMULATORS,
+    check_shift,
     find_simulator,
     make_simulator,
 )
@@ -67,10 +68,12 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
 
     Raises:
         UnknownNameError: There is no such simulator or camera, or a name passes for a system.
-        InvalidOptionError: A setting is out of range or does not go with another.
+        InvalidOptionError: A setting is out of range or does not go with another: a shift with a
+            simulator that has none, for one.
         MissingExtraError: A library for videos or retrieval is not installed.
     """
     find_simulator(config.simulator)
+    check_shift(config.simulator, config.shift)
     for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
         value = getattr(config, name)
         if not 0 < value < math.inf:

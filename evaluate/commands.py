@@ -41,6 +41,8 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     robomme-interference evaluate --policy guess --conditions no-history \
       --workers 2 --split S --out runs/guess
 
+    robomme-interference evaluate --policy replay --shift light:2 --split S --out runs/light
+
     robomme-interference evaluate --policy oracle --episodes 0-4 --videos \
       --split S --out runs/oracle
 

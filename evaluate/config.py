@@ -8,6 +8,7 @@ from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import Rollout
 from robomme_interference_data.settings import setting
+from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class RunConfig:
     split: Path = setting(help="Folder of the split of buffers.")
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
     simulator: str = setting("tabletop", help="tabletop, robomme or module:function of your own.")
+    shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
     conditions: tuple[str, ...] = setting(
         (), help="no-history, k0, k1, …; by default all that apply."
     )
@@ -91,6 +93,7 @@ class Run:
             condition=item.condition,
             episode_split=item.episode.split,
             episode=item.episode.index,
+            shift=self.config.shift,
             model_seed=self.config.model_seed,
             protocol_version=PROTOCOL_VERSION,
             **values,

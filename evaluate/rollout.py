@@ -22,6 +22,7 @@ from robomme_interference_data.evaluate.systems import check_history, name_syste
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.sampling import even_sample, lesson_frames, lesson_share
+from robomme_interference_data.shifts import NO_SHIFT
 from robomme_interference_data.simulators.base import Observation, Simulator, action_array
 from robomme_interference_data.split import Split
 
@@ -82,7 +83,8 @@ def run_rollout(
             )
         check_episode(buffer.query, demonstration, first, info)
         if config.check_lesson:
-            check_lesson(buffer.query, demonstration, first)
+            # Under a shift the first live view is to differ from the recorded one.
+            check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
         with clock.part("history_s"):
             if selector is not None and len(buffer):
                 start, stop = selector.select(buffer, first.images[selector.camera])

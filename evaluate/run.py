@@ -238,6 +238,7 @@ def _identity(
         "simulator_version": versions.get(config.simulator),
         "revision": split.revision,
         "episode_split": config.episode_split,
+        "shift": config.shift,
         "model_seed": config.model_seed,
         "retrieval_index": None if selector is None else plain(selector.identity(buffer)),
         "protocol_version": PROTOCOL_VERSION,

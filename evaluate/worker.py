@@ -132,4 +132,6 @@ def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, An
         # Its own limit ends a little before the worker's: its error shows what RoboMME printed.
         limit = 0.9 * config.simulator_timeout
         return {"python": config.robomme_python, "cameras": cameras, "answer_s": limit}
-    return {"cameras": cameras} if config.simulator == "tabletop" else {}
+    if config.simulator == "tabletop":
+        return {"cameras": cameras, "shift": config.shift}
+    return {}

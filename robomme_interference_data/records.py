@@ -13,6 +13,7 @@ from typing import Any
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.shifts import parse_shift
 
 ROLES = ("lesson", "distractor", "filler", "contradiction")
 """What a session is to its query: its own demonstration (or a part of it), a session of another
@@ -405,6 +406,7 @@ KEY_COLUMNS = (
     "condition",
     "episode_split",
     "episode",
+    "shift",
     "model_seed",
     "protocol_version",
 )
@@ -427,6 +429,7 @@ class Rollout:
         condition: `no-history`, `k0`, `k1`, …
         episode_split: `train`, `val` or `test`.
         episode: Index of the query episode.
+        shift: How the live scene differed from the lesson's, such as `light:2`; `none` if not.
         model_seed: Seed that the policy was given.
         protocol_version: `PROTOCOL_VERSION` of the run.
         seed: Seed of the scene.
@@ -465,6 +468,7 @@ class Rollout:
     condition: str
     episode_split: str
     episode: int
+    shift: str
     model_seed: int
     protocol_version: int
     seed: int | None
@@ -493,6 +497,7 @@ class Rollout:
     finished_at: str | None = None
 
     def __post_init__(self) -> None:
+        parse_shift(self.shift)
         if self.status not in FINAL:
             raise FormatError(f"status {self.status!r} is none of {', '.join(FINAL)}")
         expected = None if self.status == Status.ERROR else self.status == Status.SUCCESS

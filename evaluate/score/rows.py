@@ -20,9 +20,10 @@ from robomme_interference_data.evaluate.score.sources import (
     find_sources,
     read_part,
 )
-from robomme_interference_data.evaluate.score.values import parsed, shown
+from robomme_interference_data.evaluate.score.values import parsed, shifted, shown
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.records import Status
+from robomme_interference_data.shifts import NO_SHIFT
 
 RELEASED_SIMULATOR = "robomme"
 """The simulator of rows that name none."""
@@ -131,7 +132,7 @@ class _Joined:
         self._reasons: dict[int, str] = {}
         self._default = {
             **{"simulator": RELEASED_SIMULATOR, "system": system, "episode_split": "test"},
-            **{"model_seed": 0, "protocol_version": PROTOCOL_VERSION},
+            **{"shift": NO_SHIFT, "model_seed": 0, "protocol_version": PROTOCOL_VERSION},
         }
         self._rows = Rows({}, {}, {})
         for name in COLUMNS:
@@ -139,6 +140,7 @@ class _Joined:
             codes = [self._judged(name, number, places) for number in range(len(parts))]
             self._rows.codes[name] = np.concatenate([np.zeros(0, np.int64), *codes])
             self._rows.values[name] = list(places)
+        self._tell_shifts_apart()
 
     def _judged(self, name: str, number: int, places: dict[Any, int]) -> Codes:
         """Judge the values of a column of one file, each by itself; −1 for a bad one."""
@@ -161,6 +163,19 @@ class _Joined:
         for row in np.flatnonzero(known[codes] < 0).tolist():
             self._reasons.setdefault(start + row, reasons[int(codes[row])])
         return known[codes]
+
+    def _tell_shifts_apart(self) -> None:
+        """Let rows under a shift be of a simulator of their own, such as `tabletop+light:2`."""
+        codes, values = self._rows.codes, self._rows.values
+        places: dict[str, int] = {}
+        named = [
+            places.setdefault(shifted(*pair), len(places))
+            for pair in product(values["simulator"], values["shift"])
+        ]
+        given, shift = codes["simulator"], codes["shift"]
+        joint = np.array([*named, -1])[given * len(values["shift"]) + shift]
+        codes["simulator"] = np.where((given < 0) | (shift < 0), -1, joint)
+        values["simulator"] = list(places)
 
     def checked(self) -> Rows:
         """Return the rows that are sound, beside each other too, and what is against the others."""

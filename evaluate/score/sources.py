@@ -37,7 +37,7 @@ Codes = NDArray[np.int64]
 
 _SCHEMA = arrow_schema(Rollout)
 _NEEDED = ("family", "condition", "episode", "status", "success")
-_RUN_ONLY = {"split", "revision", "episode_split", "model_seed", "protocol_version"}
+_RUN_ONLY = {"split", "revision", "episode_split", "shift", "model_seed", "protocol_version"}
 """Key columns of a run's rows. The released layout is without them, and without `simulator`,
 which exported rows of other simulators have as one column more."""
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables

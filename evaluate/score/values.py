@@ -15,6 +15,7 @@ from robomme_interference_data.errors import InvalidOptionError, UnknownNameErro
 from robomme_interference_data.evaluate.score.sources import COLUMNS
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.records import FINAL, Status
+from robomme_interference_data.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import SIMULATORS
 
 _NAMES = {"family": FAMILIES, "episode_split": SPLITS, "difficulty": DIFFICULTIES}
@@ -31,6 +32,7 @@ _OPTIONAL = {"seed", "difficulty", "steps", "success", "video", "retrieval_model
 _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # programs save some whole numbers as floats
 # Names of files hold it, so no `/`. A simulator of one's own is `module:function` in rows.
 _SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
+_UNDER = "+"  # no name of a simulator has it
 
 
 def parsed(name: str, value: Any) -> Any:
@@ -63,14 +65,25 @@ def parsed(name: str, value: Any) -> Any:
     return float(text) if name in _FRACTIONS else text
 
 
-def _check_simulator(name: str) -> None:
+def shifted(simulator: str, shift: str) -> str:
+    """Return what a simulator under a shift is called: rows under two shifts never mix."""
+    return simulator if shift == NO_SHIFT else f"{simulator}{_UNDER}{shift}"
+
+
+def _check_simulator(text: str) -> None:
+    name, under, shift = text.partition(_UNDER)
+    if under:
+        parse_shift(shift)
     if name not in SIMULATORS and name.lower() in SIMULATORS:
         raise UnknownNameError.none("simulator", name, SIMULATORS)
     if not _SIMULATOR.fullmatch(name):
         raise ValueError("up to 128 letters, digits, '.', '_', '-' and ':'")
 
 
-_CHECKS = {"system": name_system, "condition": parse_condition, "simulator": _check_simulator}
+_CHECKS = {
+    **{"system": name_system, "condition": parse_condition, "simulator": _check_simulator},
+    "shift": parse_shift,
+}
 
 
 def shown(value: Any) -> str:

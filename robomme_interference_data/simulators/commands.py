@@ -8,6 +8,7 @@ import typer
 
 from robomme_interference_data.console import AsJson, check_output, print_json
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,6 +35,7 @@ def simulate(
     video: Annotated[Path | None, typer.Option(help="Write a video here, .mp4.")] = None,
     as_json: AsJson = False,
     simulator: Annotated[str, typer.Option(help="tabletop or robomme.")] = "tabletop",
+    shift: Annotated[str, typer.Option(help=SHIFT_HELP)] = NO_SHIFT,
     robomme_python: Annotated[
         str | None,
         typer.Option(help="RoboMME's own interpreter.", envvar="ROBOMME_PYTHON", show_envvar=True),
@@ -47,6 +49,7 @@ def simulate(
     Examples:
     ```
     robomme-interference simulate --family MoveCube --episode 3 --video out.mp4
+    robomme-interference simulate --family MoveCube --shift clutter:3 --video out.mp4
     robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
     ```
     """
@@ -55,8 +58,9 @@ def simulate(
     from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId
     from robomme_interference_data.records import Status
-    from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
+    from robomme_interference_data.simulators.registry import check_shift, make_simulator
 
+    check_shift(simulator, shift)
     policies = POLICIES if simulator != "robomme" else POLICIES[2:]
     policy = policy or policies[0]
     if policy not in policies:
@@ -65,16 +69,18 @@ def simulate(
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     check_output(video)
     name = EpisodeId(family, split, episode)
-    options: dict[str, Any] = {}
-    if simulator in SIMULATORS and video is None:
-        options["cameras"] = ()
-    if simulator == "robomme":
-        options["python"] = robomme_python
+    options: dict[str, dict[str, Any]] = {
+        "tabletop": {"shift": shift},
+        "robomme": {"python": robomme_python},
+    }
+    own = options.get(simulator, {})
+    if own and video is None:
+        own["cameras"] = ()
     clip: VideoEncoder | None = None
     with ExitStack() as stack:
         # First: minutes are spent on what is to be in it.
         path = None if video is None else stack.enter_context(atomic_path(video))
-        running = stack.enter_context(closing(make_simulator(simulator, **options)))
+        running = stack.enter_context(closing(make_simulator(simulator, **own)))
         lesson, seen, info = running.reset(str(name))
         if path is not None:
             first = _picture(seen.images, LIVE)
@@ -98,6 +104,7 @@ def simulate(
         "goal": info.goal,
         "difficulty": info.difficulty,
         "seed": info.seed,
+        "shift": shift,
         "policy": policy,
         "status": str(status),
         "lesson_frames": len(lesson),

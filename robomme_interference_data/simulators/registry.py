@@ -4,7 +4,12 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from robomme_interference_data.errors import MissingExtraError, UnknownNameError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    UnknownNameError,
+)
+from robomme_interference_data.shifts import parse_shift
 from robomme_interference_data.simulators.base import Simulator
 
 
@@ -62,6 +67,20 @@ def find_simulator(name: str) -> Callable[..., Simulator]:
             "Expected <module>:<function>, which can be imported and returns a simulator.",
         ) from error
     return found
+
+
+def check_shift(simulator: str, shift: str) -> None:
+    """Check that a simulator can change its live scene as a shift says.
+
+    Raises:
+        InvalidOptionError: It is no shift, or the simulator has none.
+    """
+    if parse_shift(shift) is not None and simulator != "tabletop":
+        raise InvalidOptionError(
+            f"--shift {shift} on {simulator}: only tabletop can light and furnish its scenes "
+            "otherwise after the demonstration",
+            "Run it on --simulator tabletop, or leave --shift out.",
+        )
 
 
 def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:

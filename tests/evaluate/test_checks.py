@@ -43,6 +43,13 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
         ({"simulator": "nosuch:thing"}, UnknownNameError, "no simulator 'nosuch:thing'"),
         ({"simulator": "tabletop"}, InvalidOptionError, "recorded on 'sample', the run is on"),
+        ({"shift": "fog:1"}, InvalidOptionError, "shift 'fog:1'; expected none, or light"),
+        ({"shift": "light:2"}, InvalidOptionError, "on support.worlds:World: only tabletop"),
+        (
+            {"shift": "light:2", "simulator": "robomme"},
+            InvalidOptionError,
+            "--shift light:2 on robomme: only tabletop",
+        ),
         ({"episodes": "0-9"}, UnknownNameError, "no query episode"),
         ({"episode_split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
@@ -172,8 +179,9 @@ def test_only_what_somebody_looks_at_is_drawn(monkeypatch: pytest.MonkeyPatch) -
 
     for name in ("tabletop", "robomme"):
         monkeypatch.setitem(SIMULATORS, name, make)
-    assert options("tabletop") == {"cameras": ()}
-    assert options("tabletop", "wrist") == {"cameras": ("wrist",)}
+    assert options("tabletop") == {"cameras": (), "shift": "none"}
+    assert options("tabletop", shift="light:2") == {"cameras": (), "shift": "light:2"}
+    assert options("tabletop", "wrist")["cameras"] == ("wrist",)
     step = {"retrieval": "thumbnail", "retrieval_camera": "wrist"}
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")

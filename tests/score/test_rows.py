@@ -20,6 +20,8 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
 )
+from robomme_interference_data.evaluate.score.compare import compare
+from robomme_interference_data.evaluate.score.export import export
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 
 COLUMNS = ("simulator", "system", "condition", "family", "episode", "model_seed", "status")
@@ -288,6 +290,37 @@ def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:
         made.score(made.write_csv(tmp_path / "b.csv", []))
 
 
+# --- shifts ------------------------------------------------------------------------------------
+
+
+def test_rows_under_several_shifts_never_mix(tmp_path: Path) -> None:
+    rows = made.cells({(made.OWN, "k0"): "ssff"})
+    lit = made.changed(made.cells({(made.OWN, "k0"): "sfff"}), shift="light:2")
+    found = made.score(made.write_csv(tmp_path / "a.csv", [*rows, *lit]))
+    assert sorted(found.cubes) == ["tabletop", "tabletop+light:2"]
+    rates = {(one.simulator, one.part): one.counts[0] for one in found.cells if not one.part}
+    assert rates == {("tabletop", ""): 2, ("tabletop+light:2", ""): 1}
+    # Exported, they keep the name, and are read as what they are.
+    exported = export(found.rows, tmp_path / "out")
+    assert [path.name for path in exported] == [
+        f"{made.OWN}-tabletop+light:2_rollouts.csv",
+        f"{made.OWN}-tabletop_rollouts.csv",
+    ]
+    assert told(read_rows(exported, made.OWN)) == told(found.rows)
+    both = [made.write_csv(tmp_path / "b.csv", rows), made.write_csv(tmp_path / "c.csv", lit)]
+    with pytest.raises(InvalidOptionError, match=r"tabletop and tabletop\+light:2"):
+        compare(*both)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("shift", "fog:1"), ("shift", ""), ("simulator", "tabletop+fog:1")]
+)
+def test_what_is_no_shift_is_a_bad_row(tmp_path: Path, column: str, value: str) -> None:
+    path = write(tmp_path / "a.parquet", **{column: pa.array([value, *["none"] * 106])})
+    with pytest.raises(BadRowsError, match=r"row 1: shift .*; expected none, or light"):
+        read_rows([path])
+
+
 # --- files -------------------------------------------------------------------------------------
 
 
@@ -300,7 +333,7 @@ def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:
         ("system,family,family,condition,episode,status,success", "two columns 'family'"),
         (
             "system,simulator,split,family,condition,episode,status,success",
-            "lacks the columns revision, episode_split, model_seed, protocol_version;",
+            "lacks the columns revision, episode_split, shift, model_seed, protocol_version;",
         ),
         ("", "lacks the columns"),
     ],

@@ -144,6 +144,7 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
         "goal": "goal",
         "difficulty": "easy",
         "seed": 200,
+        "shift": "none",
         "policy": "oracle",
         "status": "success",
         "lesson_frames": 5,
@@ -174,6 +175,8 @@ def test_simulate_can_play_the_demonstration_only(run: Run) -> None:
         ("--video {}/file/out.mp4", "{}/file"),
         ("--policy orakel", "oracle, guess, none"),
         ("--simulator robomme --policy oracle", "is none of none"),
+        ("--shift fog:1", "such as light:2"),
+        ("--shift light:2", "only tabletop"),
         ("--video {}/out.mp4", "no such episode"),
     ],
 )

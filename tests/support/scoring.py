@@ -57,6 +57,7 @@ def row(system: str, condition: str, family: str, episode: int, letter: str) -> 
         condition=condition,
         episode_split="test",
         episode=episode,
+        shift="none",
         model_seed=0,
         protocol_version=1,
         seed=1000 * FAMILIES.index(family) + episode,

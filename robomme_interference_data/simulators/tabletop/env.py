@@ -17,18 +17,17 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, FPS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.records import Status
+from robomme_interference_data.shifts import Shift
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, turn_of
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.simulators.tabletop.kit import Kit
+from robomme_interference_data.simulators.tabletop.look import FRONT_EYE, FRONT_TARGET, Look
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
 from robomme_interference_data.simulators.tabletop.renderer import make_renderer
 
-# The table up to x = 0.14 m, and at its home pose the whole arm but for the top of its shoulder.
-FRONT_EYE = (0.80, 0.0, 0.64)  # m
-FRONT_TARGET = (-0.30, 0.0, 0.21)  # m
 FRONT_VIEW = math.radians(46)
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
@@ -48,7 +47,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     """One family's episodes; `reset(seed=s)` is the episode of that seed, demonstration and all.
 
     `demonstrated` names the cameras that draw the demonstration; where `demonstrating` is False it
-    is not even played. `reset` takes seeds from 0 to 2**32 - 1 and the options `difficulty`, and
+    is not even played. Under `shift` the live scene looks otherwise than the demonstration's, see
+    `look`. `reset` takes seeds from 0 to 2**32 - 1 and the options `difficulty`, and
     `answer`, the index of the hidden answer to use instead of the seed's own. Its info holds
     `goal`, `goals`, `difficulty` and `demonstration`.
 
@@ -72,6 +72,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.drawing = render
         self.demonstrated: Sequence[str] = CAMERAS
         self.demonstrating = False
+        self.shift: Shift | None = None
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
             if options.setdefault(name, values[0]) not in values:
                 expected = " or ".join(map(repr, values))
@@ -149,8 +150,13 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.episode, self.answer = episode, answers[answer]
         self.guess = answers[turn_of(number, len(answers), stream=1)]
         observed, info = super().reset(seed=number, options=options)
+        if self.drawing:
+            cameras = {name: self._camera(name) for name in CAMERAS}
+            self._look = Look(self.scene.sub_scenes[0], cameras, number)
         if self.demonstrating:
             info["demonstration"] = self._demonstrate()
+            if self.shift is not None:
+                self.show(self.shift)
             observed = self.get_obs(self.get_info())
         goals = self.episode.goals()
         info.update(goal=goals[0], goals=goals, difficulty=difficulty)
@@ -177,16 +183,23 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         if self.drawing and cameras:
             self.scene.sub_scenes[0].update_render()
             for name in cameras:
-                sensor = self._sensors[name]
-                camera = sensor.camera._render_cameras[0]
+                camera = self._camera(name)
                 camera.take_picture()
                 images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
         return Observation(images, self.arm.state)
+
+    def show(self, shift: Shift | None) -> None:
+        """Let the scene look as under a shift from now on; None as it was built."""
+        if self.drawing:
+            self._look.show(shift)
 
     def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
         """Return the view of a camera, front by default, `(1, 256, 256, 3) uint8` RGB."""
         name = camera_name or CAMERAS[0]
         return torch.from_numpy(self.observe((name,)).images[name])[None]
+
+    def _camera(self, name: str) -> Any:
+        return self._sensors[name].camera._render_cameras[0]
 
     def _demonstrate(self) -> Demonstration:
         seen, actions = [], []

@@ -1,6 +1,6 @@
 """The embedded suite as a simulator: nine families in one environment, an episode at a time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
+from robomme_interference_data.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.simulators.base import (
     CAMERAS,
     Begun,
@@ -28,18 +29,23 @@ class TabletopSimulator(Simulator):
     Args:
         cameras: Names of the cameras to draw; fewer are faster. Without any, episodes run several
             times as fast: for policies that do not look.
+        shift: How the live scene differs from that of the demonstration: `none`, or such as
+            `light:2`. It is only seen: states, judgements and built-in policies stay what they
+            are.
 
     Raises:
-        InvalidOptionError: There is no such camera.
+        InvalidOptionError: There is no such camera, or no such shift.
         NoRendererError: No Vulkan device of this machine can render.
     """
 
     name = "tabletop"
 
-    def __init__(self, cameras: Sequence[str] = CAMERAS):
+    def __init__(self, cameras: Sequence[str] = CAMERAS, shift: str = NO_SHIFT):
         self._cameras = choose_cameras(cameras)
+        wanted = parse_shift(shift)
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
         self.env = TabletopEnv(render=bool(cameras), obs_mode="none")
+        self.env.shift = wanted
         self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
 
     def act(self, policy: str) -> NDArray[np.float32]:
@@ -48,6 +54,18 @@ class TabletopSimulator(Simulator):
         if policy not in POLICIES:
             raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
         return self.env.act(policy)
+
+    def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
+        """Yield what is seen now as under each of several shifts; the scene stays what it is.
+
+        Raises:
+            SimulatorCrashError: There is no episode to look at, or the simulator is closed.
+        """
+        self._running()
+        for shift in shifts:
+            self.env.show(shift)
+            yield self.env.observe(self._cameras)
+        self.env.show(self.env.shift)
 
     def close(self) -> None:
         """Release the scene; further calls but `close` are errors."""

@@ -1,0 +1,63 @@
+"""How the world may have changed since the lesson: what a shift is, and how it is written."""
+
+import re
+from dataclasses import dataclass
+
+from robomme_interference_data.errors import InvalidOptionError
+
+KINDS = ("light", "camera", "clutter")
+"""What changes: colour and brightness of the lamps; where cameras stand and look; things that take
+no part, put beside."""
+
+STRENGTHS = (1, 2, 3)
+"""How much, from a little to clearly."""
+
+NO_SHIFT = "none"
+"""Stands for no shift: the live scene is that of the lesson."""
+
+SHIFT_HELP = (
+    "none, or how the live scene differs from the lesson's (tabletop): light, camera or clutter and "
+    "a strength from 1 to 3, such as light:2."
+)
+"""What the option of every command says."""
+
+_SHIFT = re.compile(f"({'|'.join(KINDS)}):([{''.join(map(str, STRENGTHS))}])")
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A change of the live scene after the lesson, such as `light:2`; made by `parse_shift`.
+
+    Attributes:
+        kind: One of `KINDS`.
+        strength: One of `STRENGTHS`.
+    """
+
+    kind: str
+    strength: int
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.strength}"
+
+
+SHIFTS = tuple(Shift(kind, strength) for kind in KINDS for strength in STRENGTHS)
+"""All shifts, in the order of a dataset's frames."""
+
+
+def parse_shift(text: str) -> Shift | None:
+    """Read a shift; None for `none`.
+
+    Raises:
+        InvalidOptionError: The text is neither.
+    """
+    if text == NO_SHIFT:
+        return None
+    match = _SHIFT.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise InvalidOptionError.expected(
+            "shift",
+            text,
+            f"{NO_SHIFT}, or {', '.join(KINDS)} with a strength from {STRENGTHS[0]} to "
+            f"{STRENGTHS[-1]}, such as light:2",
+        )
+    return Shift(match[1], int(match[2]))

@@ -1,0 +1,125 @@
+"""What a shift changes: what is seen of the live scene, and nothing else."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    SimulatorCrashError,
+    UnknownNameError,
+)
+from robomme_interference_data.shifts import KINDS, SHIFTS, Shift
+from robomme_interference_data.simulators import Status
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.tabletop.drawing import PANDA
+from robomme_interference_data.simulators.tabletop.look import PLACES, TALL, WIDE
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+EPISODE = "MoveCube/test/2"
+
+
+@pytest.fixture
+def shifted(tabletop: TabletopSimulator) -> Any:
+    """The simulator, which may be put under a shift."""
+    yield tabletop
+    tabletop.env.shift = None
+
+
+def begin(simulator: TabletopSimulator, episode: str, shift: Shift | None) -> Observation:
+    simulator.env.shift = shift
+    return simulator.reset(episode, demonstration=False)[1]
+
+
+def apart(one: Observation, other: Observation, camera: str) -> float:
+    """Mean difference of two pictures, of 255."""
+    first, second = (seen.images[camera].astype(int) for seen in (one, other))
+    return float(np.abs(first - second).mean())
+
+
+def test_each_shift_is_seen_and_the_stronger_the_more(shifted: TabletopSimulator) -> None:
+    plain = begin(shifted, EPISODE, None)
+    views = dict(zip(SHIFTS, shifted.views(SHIFTS), strict=True))
+    for kind in KINDS:
+        weak, middle, strong = (apart(plain, views[Shift(kind, n)], "front") for n in (1, 2, 3))
+        assert 0.4 < weak < middle < strong
+        # Things at the sides of the table are not before the wrist camera.
+        seen = apart(plain, views[Shift(kind, 1)], "wrist")
+        assert seen == 0 if kind == "clutter" else seen > 1
+    for seen in views.values():
+        assert np.array_equal(seen.state, plain.state)
+    again = shifted.env.observe()
+    assert all(np.array_equal(again.images[name], plain.images[name]) for name in plain.images)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
+    shifted: TabletopSimulator, kind: str
+) -> None:
+    shift = Shift(kind, 3)
+    plain = shifted.reset(EPISODE)
+    [looked] = shifted.views([shift])
+    shifted.env.shift = shift
+    lesson, first, about = shifted.reset(EPISODE)
+    assert about == plain[2]
+    for name, frames in plain[0].images.items():
+        assert np.array_equal(lesson.images[name], frames)
+        assert np.array_equal(first.images[name], looked.images[name])
+    other = begin(shifted, "MoveCube/test/5", shift)
+    [moved] = shifted.views([Shift(kind, 1)])
+    assert apart(other, first, "front") > 1 and apart(other, moved, "front") > 0.4
+    # And the next episode without a shift is what it always was.
+    assert apart(begin(shifted, EPISODE, None), plain[1], "front") == 0
+
+
+def test_the_scene_stays_under_a_shift_while_it_is_played(shifted: TabletopSimulator) -> None:
+    played: list[list[NDArray[np.float32]]] = []
+    for shift in (None, *(Shift(kind, 3) for kind in KINDS)):
+        begin(shifted, EPISODE, shift)
+        states, status = [], Status.ONGOING
+        while status is Status.ONGOING:
+            seen, status = shifted.step(shifted.act("oracle"), observe=False)
+            states.append(seen.state)
+        assert status is Status.SUCCESS
+        played.append(states)
+    for states in played[1:]:
+        assert np.array_equal(states, played[0])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, family: str) -> None:
+    """No part of the hand, and nothing on the table, comes to where one of them may stand."""
+    blind.reset(f"{family}/test/2", demonstration=False)
+    robot = blind.env.agent.robot._objs[0]
+    names = [f"scene-0-{PANDA}_panda_{name}" for name in ("hand", "leftfinger", "rightfinger")]
+    parts = [link for link in robot.links if link.name in names]
+    assert len(parts) == 3
+    rigid = [one._rigid for one in blind.env.kit.bodies if one._rigid is not None]  # no table
+    parts += [one for one in rigid if one.collision_shapes]
+    status, steps = Status.ONGOING, 0
+    while status is Status.ONGOING:
+        _, status = blind.step(blind.act("oracle"), observe=False)
+        steps += 1
+        spans = [part.compute_global_aabb_tight() for part in parts if steps % 4 == 0]
+        for low, high in spans:
+            for x, y in PLACES:
+                if low[2] < TALL and high[2] > 0:
+                    way = np.maximum(0, np.maximum(low[:2] - (x, y), (x, y) - high[:2]))
+                    assert math.hypot(*way) > WIDE
+    assert status is Status.SUCCESS
+
+
+def test_shifts_are_asked_for_by_name(shifted: TabletopSimulator) -> None:
+    with pytest.raises(InvalidOptionError, match="shift 'fog:1'; expected none, or light"):
+        TabletopSimulator(shift="fog:1")
+    with pytest.raises(UnknownNameError):
+        shifted.reset("MoveCube/test/99")
+    with pytest.raises(SimulatorCrashError, match="runs no episode"):
+        list(shifted.views(SHIFTS))
