@@ -31,6 +31,7 @@ from robomme_interference_data.constants import (
     MANIFESTS,
     RAW_DISTRACTORS,
     REPORT_PATH,
+    SHIFTED,
 )
 from robomme_interference_data.errors import visible
 from robomme_interference_data.settings import with_settings
@@ -137,6 +138,24 @@ def contradictions(config: BuildConfig, as_json: AsJson = False) -> None:
     """
     with stoppable(_KEPT):
         _build(plan_build(CONTRADICTIONS, config), config.out, config.workers, as_json=as_json)
+
+
+@app.command()
+@with_settings
+def shifted(config: BuildConfig, as_json: AsJson = False) -> None:
+    r"""Build what query episodes look like under each shift, for `retrieval-score --shift`.
+
+    Nine frames of each episode: the first live view under light, camera and clutter, each at
+    strengths 1, 2 and 3. Take the query episodes; build manifests and index the split afterwards.
+
+    Example:
+    ```
+    robomme-interference build shifted --source tabletop --split test --episodes 0-4 \
+        --out S/shifted
+    ```
+    """
+    with stoppable(_KEPT):
+        _build(plan_build(SHIFTED, config), config.out, config.workers, as_json=as_json)
 
 
 @app.command()

@@ -14,6 +14,7 @@ from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
     POSITION_LIMIT,
+    SHIFTED,
     SPLITS,
     UNIT_FRAMES,
     UNITS,
@@ -240,6 +241,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
             columns={name: column for name, _, column in pairs},
             families_file=config.families_file,
             robomme_python=config.robomme_python,
+            shifted=kind == SHIFTED,
         )
         for text in config.source
     )

@@ -14,6 +14,7 @@ from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
+    SHIFTED,
     UNIT_MIN_RAW_FRAMES,
     UNITS,
     Unit,
@@ -68,6 +69,7 @@ def cut_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
 CUTS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
     DEMONSTRATIONS: cut_demonstration,
     CONTRADICTIONS: cut_demonstration,
+    SHIFTED: iter,
     **{kind: partial(cut_unit, unit=unit) for kind, unit in UNITS.items()},
 }
-"""Kind of dataset to what it stores of an episode."""
+"""Kind of dataset to what it stores of an episode; of views under shifts, all that is streamed."""

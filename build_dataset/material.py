@@ -18,6 +18,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     POSITION_LIMIT,
     RAW_DISTRACTORS,
+    SHIFTED,
     UNIT_FRAMES,
     UNITS,
 )
@@ -80,6 +81,7 @@ class ManifestPlan:
                 for one in dataset.records()
             }
             for name, dataset in self.datasets.items()
+            if name in ROLE_OF
         }
 
 
@@ -142,6 +144,8 @@ def plan_manifests(
                 f"leaks into another buffer; found {', '.join(sorted(splits))}",
                 f"Build the {name} with --split train.",
             )
+    if SHIFTED in opened:
+        _check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])
     return ManifestPlan(opened, ordered, seed, position_limit)
 
 
@@ -158,6 +162,20 @@ def _check_features(datasets: Mapping[str, Dataset]) -> None:
                 f"demonstrations have {shown[DEMONSTRATIONS]}, the {name} {features}",
                 "Build both with the same --cameras, from sources with the same sizes.",
             )
+
+
+def _check_scenes(shifted: Dataset, base: Dataset) -> None:
+    """Check that views under shifts are of the scenes of the demonstrations, and of all."""
+    found, wanted = ([*one.identity.sources] for one in (shifted, base))
+    why = f"was built from {found}, the demonstrations from {wanted}"
+    if all(one in wanted for one in found):
+        there, asked = ({r.episode_id for r in one.records()} for one in (shifted, base))
+        why = f"lacks {min(asked - there)}" if asked - there else ""
+    if why:
+        raise SourceError(
+            f"{shifted.files.describe()} {why}",
+            f"Build it of all query episodes: robomme-interference build {SHIFTED}, or remove it.",
+        )
 
 
 class QueryMaterial:

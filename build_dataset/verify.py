@@ -21,6 +21,7 @@ from robomme_interference_data.constants import (
     MANIFEST_ROWS,
     MANIFESTS,
     RULE_VERSION,
+    SHIFTED,
     UNIT_MIN_RAW_FRAMES,
     UNITS,
 )
@@ -32,6 +33,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.records import EpisodeRecord, ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
+from robomme_interference_data.shifts import SHIFTS
 from robomme_interference_data.split import Split
 from robomme_interference_data.work_progress import WorkProgress
 
@@ -166,6 +168,8 @@ def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]
         return
     if start is not None:
         expected = range(start + 1, start + 2)
+    elif name == SHIFTED:
+        expected = range(len(SHIFTS), len(SHIFTS) + 1)
     else:
         most, stride = UNITS[name]
         expected = range((UNIT_MIN_RAW_FRAMES - 1) // stride + 1, most + 1)

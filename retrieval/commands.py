@@ -1,6 +1,7 @@
 """The commands of retrieval: `index`, `retrieve`, `retrieval-score` and `calibrate`."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ from robomme_interference_data.console import (
 )
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.select import Measured
@@ -161,6 +163,7 @@ def retrieval_score(
         ),
     ] = ["max"],  # noqa: B006 - typer copies it
     camera: Camera = "front",
+    shift: Annotated[str, typer.Option(help=SHIFT_HELP)] = NO_SHIFT,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for cells.csv, rows.csv (each query) and retrieval.png."),
@@ -173,6 +176,7 @@ def retrieval_score(
     ```
     robomme-interference retrieval-score my-split
     robomme-interference retrieval-score my-split --rules all --out my-score
+    robomme-interference retrieval-score my-split --shift light:2
     ```
     """
     from robomme_interference_data.files import write_text
@@ -183,10 +187,11 @@ def retrieval_score(
     check_output(out)
     name = encoders.encoder_name(encoder)
     wanted = select.parse_rules(rules, encoders.published_threshold(name))
-    about, measured = _measured(split, name, camera, quiet=as_json)
+    about, measured = _measured(split, name, camera, shift, quiet=as_json)
     grades = [grade.grade(one, rule) for rule in wanted for one in measured]
     cells = list(grade.cells(grades))
     title = f"Retrieval on {about['split']}, encoder {name}, camera {camera}"
+    title += "" if shift == NO_SHIFT else f", shift {shift}"
     if len(wanted) == 1:
         title += f", rule {wanted[0]}"
     if out is not None:
@@ -230,7 +235,7 @@ def calibrate(
     check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
-    about, measured = _measured(split, name, camera, quiet=as_json)
+    about, measured = _measured(split, name, camera, NO_SHIFT, quiet=as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
     found = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['split']}"
@@ -244,20 +249,25 @@ def calibrate(
 
 
 def _measured(
-    split: Path, encoder: str, camera: str, *, quiet: bool
+    split: Path, encoder: str, camera: str, shift: str, *, quiet: bool
 ) -> tuple[dict[str, Any], list["Measured"]]:
     """Measure all buffers of a split that hold frames of the lesson; tell what they are of."""
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval.select import measure
+    from robomme_interference_data.views import shifted_embedding
     from robomme_interference_data.work_progress import WorkProgress
 
-    opened = load_split(split)
+    under, opened = parse_shift(shift), load_split(split)
+    look = None
+    if under is not None:
+        look = partial(shifted_embedding, opened, shift=under, encoder=encoder, camera=camera)
     measured = []
     with WorkProgress(unit="buffers", quiet=quiet) as progress:
         progress.start(encoder, len(opened))
         for buffer in opened.buffers():
             if buffer.manifest.lesson_frames:
-                measured.append(measure(buffer, encoder, camera))
+                query = None if look is None else look(buffer.episode_id)
+                measured.append(measure(buffer, encoder, camera, query))
             progress.advance(1)
     left_out = len(opened) - len(measured)
     if not measured:
@@ -268,4 +278,5 @@ def _measured(
     if left_out and not quiet:
         say(f"{left_out} of {len(opened)} buffers hold no lesson and are left out")
     about = {"split": opened.name, "revision": opened.revision, "encoder": encoder}
-    return about | {"camera": camera, "buffers": len(measured), "left_out": left_out}, measured
+    about |= {"camera": camera, "shift": shift}
+    return about | {"buffers": len(measured), "left_out": left_out}, measured

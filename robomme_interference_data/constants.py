@@ -92,9 +92,12 @@ RAW_DISTRACTORS = "distractors-raw"
 """The same episodes as the distractors', 256 frames at full rate."""
 CONTRADICTIONS = "contradictions"
 """Lessons in the scenes of the queries, with other answers."""
+SHIFTED = "shifted"
+"""What the queries look like under shifts: a frame each, in the order of `shifts.SHIFTS`."""
 
 LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
-"""Whose episodes are lessons, with the query frame after them; others' are units."""
+"""Whose episodes are lessons, with the query frame after them; those of
+`UNITS` are units."""
 
 
 class Unit(NamedTuple):
@@ -115,7 +118,7 @@ UNITS = {
 }
 """Of what the units of a dataset are."""
 
-FURTHER = (RAW_DISTRACTORS, CONTRADICTIONS)
+FURTHER = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
 """Datasets that a split may lack; on the Hub they are folders of its repository."""
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *FURTHER)

@@ -85,7 +85,7 @@ class Dataset:
 
     @property
     def kind(self) -> str:
-        """`demonstrations` or `distractors`."""
+        """Name of the dataset in a split, such as `demonstrations`."""
         return self.identity.kind
 
     @property

@@ -14,6 +14,7 @@ from robomme_interference_data.constants import (
     INDEX_HEADER,
     MANIFEST_PATH,
     MANIFESTS,
+    SHIFTED,
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
 from robomme_interference_data.files import atomic_path
@@ -143,6 +144,8 @@ def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
             and (numbers is None or episode.index in numbers)
         ):
             found[manifest.query.dataset].add(manifest.query.episode_index)
+            if SHIFTED in found:
+                found[SHIFTED].add(split.datasets[SHIFTED].index_of(episode))
             for entry in manifest.sessions:
                 found[entry.dataset].add(entry.episode_index)
     if not any(found.values()):

@@ -82,13 +82,13 @@ class EpisodeRecord:
         seed: Seed of the simulator, or None.
         difficulty: `easy`, `medium`, `hard`, or None.
         simulator: `robomme`, `tabletop`, …, or None.
-        exec_start_idx: Index of the query frame, which is the number of lesson frames; None in a
-            distractor unit.
+        exec_start_idx: Index of the query frame, which is the number of lesson frames; None where
+            there is no lesson.
         exact: False if a frame was ever lossily compressed.
         feature_sha256: Digest by feature over the session that the episode is: the lesson, or all
-            frames of a unit; see `digest.py`.
+            frames where there is none; see `digest.py`.
         span_sha256: Digests of the spans that parts of a lesson are, and of the query frame, by
-            name, see `spans`; None in a unit.
+            name, see `spans`; None where there is no lesson.
     """
 
     episode_index: int
@@ -163,7 +163,7 @@ class DatasetIdentity:
 
     Attributes:
         format_version: Of the files.
-        kind: `demonstrations` or `distractors`.
+        kind: Name of the dataset in a split, such as `demonstrations`.
         version: Such as `1.0.0`.
         revision: Identity of the content: SHA-256 over all episode records.
         exact: Whether all episodes are.
@@ -355,7 +355,7 @@ class ManifestDataset:
     """A dataset that manifests name.
 
     Attributes:
-        kind: `demonstrations` or `distractors`.
+        kind: Name of the dataset in a split, such as `demonstrations`.
         version: Its version.
         revision: Its revision: sessions name it.
         identity: SHA-256 of its `meta/interference.json`.

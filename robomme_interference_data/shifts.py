@@ -16,8 +16,8 @@ NO_SHIFT = "none"
 """Stands for no shift: the live scene is that of the lesson."""
 
 SHIFT_HELP = (
-    "none, or how the live scene differs from the lesson's (tabletop): light, camera or clutter and "
-    "a strength from 1 to 3, such as light:2."
+    "none, or how the live scene differs from the lesson's (tabletop): light, camera or clutter "
+    "and a strength from 1 to 3, such as light:2."
 )
 """What the option of every command says."""
 

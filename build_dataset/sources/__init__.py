@@ -29,6 +29,7 @@ def open_source(
     columns: dict[str, str] | None = None,
     families_file: Path | None = None,
     robomme_python: str | None = None,
+    shifted: bool = False,
 ) -> Source:
     """Open a source.
 
@@ -37,9 +38,11 @@ def open_source(
         columns: `lerobot`: logical name to the dataset's column, where they differ.
         families_file: `lerobot`: file that names the family of every episode.
         robomme_python: `robomme`: the interpreter that has RoboMME.
+        shifted: Whether the first live views under shifts are wanted, not the episodes.
 
     Raises:
-        InvalidOptionError: The specification or kind is unknown, or there is no such folder.
+        InvalidOptionError: The specification or kind is unknown, there is no such folder, or the
+            kind has no shifts.
         SourceError: The place does not hold what the kind expects.
         MissingExtraError: The kind needs an extra that is not installed.
     """
@@ -50,6 +53,11 @@ def open_source(
         raise InvalidOptionError(
             f"--source {specification!r} is not one of {', '.join(KINDS.values())}",
             nearest(kind, KINDS, more=""),
+        )
+    if shifted and kind != "tabletop":
+        raise InvalidOptionError(
+            f"--source {specification}: only tabletop can show its episodes under shifts",
+            "Give --source tabletop, for demonstrations that were built from it.",
         )
     # Each in a module of its own, which brings libraries that the others do not need.
     if kind == "robomme-h5":
@@ -68,9 +76,9 @@ def open_source(
         from robomme_interference_data.build_dataset.sources.sample import SampleSource
 
         return SampleSource(tuple(location.split(","))) if location else SampleSource()
-    from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
+    from robomme_interference_data.build_dataset.sources import simulator
 
-    return SimulatorSource(kind, robomme_python)
+    return simulator.ShiftedSource() if shifted else simulator.SimulatorSource(kind, robomme_python)
 
 
 def _folder(location: str) -> Path:

@@ -1,4 +1,4 @@
-"""Source `tabletop` and `robomme`: a simulator plays the episodes while they are read."""
+"""Sources `tabletop` and `robomme`: a simulator plays the episodes while they are read."""
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
@@ -13,6 +13,7 @@ from robomme_interference_data.build_dataset.sources.base import (
     SourceEpisode,
 )
 from robomme_interference_data.records import Status
+from robomme_interference_data.shifts import SHIFTS
 from robomme_interference_data.simulators.base import (
     Demonstration,
     Observation,
@@ -84,6 +85,20 @@ class SimulatorSource(Source):
             self._simulator = make_simulator(self.name, cameras=cameras, **self._options)
             self._cameras = cameras
         return self._simulator
+
+
+class ShiftedSource(SimulatorSource):
+    """The first live views of the tabletop's episodes under each shift, instead of its frames."""
+
+    def __init__(self) -> None:
+        super().__init__("tabletop")
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        """Begin to look at an episode; see `Source.read`."""
+        simulator: Any = self._open(choose_cameras(cameras))
+        _, _, info = simulator.reset(str(episode.id), demonstration=False)
+        frames = (Frame(seen.images, seen.state, None, False) for seen in simulator.views(SHIFTS))
+        return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)
 
 
 def _play(

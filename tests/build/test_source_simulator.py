@@ -67,6 +67,21 @@ def test_robomme_plays_demonstrations_only_and_tells_no_actions(made: list[Doubl
     assert made[0].options == {"python": "/opt/python"}
 
 
+def test_the_tabletop_under_shifts(made: list[Double]) -> None:
+    source = open_source("tabletop", shifted=True)
+    assert source.provenance == open_source("tabletop").provenance
+    recording = read(source, ("front",))
+    frames = list(recording.frames)
+    assert (recording.goals, recording.seed) == (("goal", "other"), 9)
+    assert [int(frame.images["front"][0, 0, 0]) for frame in frames] == list(range(10, 19))
+    assert {(frame.is_demonstration, frame.action, *frame.state) for frame in frames} == {
+        (False, None, *[10.0] * 8)
+    }
+    for other in ("robomme", "sample"):
+        with pytest.raises(InvalidOptionError, match=f"{other}: only tabletop"):
+            open_source(other, shifted=True)
+
+
 def test_one_simulator_is_kept_for_the_same_cameras(made: list[Double]) -> None:
     source = open_source("tabletop")
     for cameras in (("front",), ("front",), None, ("wrist", "front")):

@@ -63,9 +63,14 @@ class Interrupted(Thumbnail):
         return prepared
 
 
-def make_index(split: Path, encoder: Any = None, **options: Any) -> list[int]:
+def make_index(
+    split: Path,
+    encoder: Any = None,
+    names: Sequence[str] = (DEMONSTRATIONS, DISTRACTORS),
+    **options: Any,
+) -> list[int]:
     """Make the index; returns how many frames of each dataset were embedded now."""
-    roots = [split / DEMONSTRATIONS, split / DISTRACTORS]
+    roots = [split / name for name in names]
     reports = build_index(roots, encoder or Thumbnail(), QUIET, **options)
     return [report.embedded for report in reports]
 

@@ -1,5 +1,6 @@
 """A simulator without physics."""
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
+from robomme_interference_data.shifts import Shift
 from robomme_interference_data.simulators.base import (
     Begun,
     Demonstration,
@@ -45,6 +47,12 @@ class Double(Simulator):
 
     def act(self, policy: str) -> np.ndarray:
         return np.full(8, self._steps, np.float32)
+
+    def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
+        episode = self._running()
+        for number, _ in enumerate(shifts, 1):
+            images = {name: image + number for name, image in self._images(episode).items()}
+            yield Observation(images, np.full(8, 10, np.float32))
 
     def close(self) -> None:
         super().close()

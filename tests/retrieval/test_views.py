@@ -1,0 +1,83 @@
+"""Retrieval under shifts: the query frame is the stored first live view of the changed scene."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.retrieval import make_index
+from support.shifted import add_shifted
+from support.splits import GOLDEN, QUERIES, dataset
+
+from robomme_interference_data import EpisodeId, load_split
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.constants import SHIFTED
+from robomme_interference_data.errors import SourceError
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden split with views under shifts beside it, indexed; read-only."""
+    folder = shutil.copytree(GOLDEN, tmp_path_factory.mktemp("seen") / "split")
+    add_shifted(folder)
+    make_index(folder, names=("demonstrations", "distractors", SHIFTED))
+    return folder
+
+
+def test_views_are_frames_in_the_order_of_shifts(seen: Path) -> None:
+    views, split = dataset(seen, SHIFTED), load_split(seen)
+    assert (views.kind, len(views), views.identity.counts.frames) == ("shifted", 3, 27)
+    assert views.identity.unit is None
+    for episode in QUERIES:
+        index, query = views.index_of(EpisodeId.parse(episode)), split.query(episode)
+        record = views.record(index)
+        assert (record.length, record.exec_start_idx, record.seed) == (9, None, query.seed)
+        for place, image in enumerate(views.iter_frames(index, "front", 0, 9)):
+            assert np.array_equal(image, query.frame() >> place)
+    assert split.revision != load_split(GOLDEN).revision
+    assert list(verify_split(split)) == []
+
+
+def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
+    def scored(*options: str) -> dict[str, object]:
+        value: dict[str, object] = json.loads(run("retrieval-score", seen, "--json", *options)[1])
+        return value
+
+    plain, first, last = (scored("--shift", name) for name in ("none", "light:1", "clutter:3"))
+    assert [one["shift"] for one in (plain, first, last)] == ["none", "light:1", "clutter:3"]
+    assert plain == scored()
+    assert first["cells"] == plain["cells"]  # the view that looks as always
+    assert last["cells"] != plain["cells"]  # a black one
+    title = run("retrieval-score", seen, "--shift", "camera:2")[1].splitlines()[0]
+    assert title.endswith("encoder thumbnail, camera front, shift camera:2, rule max/adaptive")
+
+
+def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split: Path) -> None:
+    code, _, err = run("retrieval-score", own_split, "--shift", "light:2")
+    assert code == 1 and f"--source tabletop --split test --out {own_split}/shifted" in err
+    assert "such as light:2" in run("retrieval-score", seen, "--shift", "dark")[2]
+
+
+@pytest.mark.parametrize(
+    ("families", "kind", "told"),
+    [
+        (("MoveCube",), "sample", "lacks VideoRepick/test/0"),
+        ((), "other", "was built from .*'kind': 'other'"),
+    ],
+)
+def test_views_of_other_scenes_are_refused(
+    own_split: Path, families: tuple[str, ...], kind: str, told: str
+) -> None:
+    with pytest.raises(SourceError, match=told):
+        add_shifted(own_split, *families, kind=kind)
+
+
+def test_damage_is_found(seen: Path, tmp_path: Path) -> None:
+    split = shutil.copytree(seen, tmp_path / "split")
+    (split / SHIFTED / "meta" / "tasks.parquet").write_bytes(b"damaged")
+    where = [one.where for one in verify_split(load_split(split), decode=False)]
+    assert "shifted/meta/tasks.parquet" in where

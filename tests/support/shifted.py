@@ -1,0 +1,43 @@
+"""First live views under shifts beside the golden split, made up."""
+
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.cut import cut_demonstration
+from robomme_interference_data.build_dataset.manifests import write_manifests
+from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.constants import SHIFTED
+from robomme_interference_data.execution import Serial
+from robomme_interference_data.shifts import SHIFTS
+from robomme_interference_data.work_progress import WorkProgress
+
+
+class ShiftedSample(SampleSource):
+    """Under the first shift the sample's queries look as always, under the n-th dimmed n times."""
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        recording = super().read(episode, cameras)
+        return replace(recording, frames=self._views(recording))
+
+    def _views(self, recording: Recording) -> Generator[Frame]:
+        *_, seen = cut_demonstration(recording.frames)
+        for place in range(len(SHIFTS)):
+            images = {camera: image >> place for camera, image in seen.images.items()}
+            yield Frame(images, seen.state, None, False)
+
+
+def add_shifted(split: Path, *families: str, kind: str = "sample") -> None:
+    """Build the views of the golden split's queries, or of some families, and plan it again."""
+    source = ShiftedSample(size=32)
+    source.provenance["kind"] = kind
+    families = families or ("VideoRepick", "MoveCube", "PatternLock")
+    tasks = list_episodes((source,), families=families, split="test")
+    plan = BuildPlan(SHIFTED, (source,), tasks)
+    build_dataset(plan, split / SHIFTED, Serial(), WorkProgress(quiet=True))
+    for _ in write_manifests(plan_manifests(in_folder(split)), split):
+        pass
