@@ -21,6 +21,7 @@ from robomme_interference_data.console import (
 )
 from robomme_interference_data.fetch import FetchConfig
 from robomme_interference_data.settings import with_settings
+from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 
 def list_buffers(
@@ -93,6 +94,7 @@ def show(
     split: SplitOption = Path(),
     out: Picture = None,
     camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
+    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Drawn with --out.")] = NO_SHIFT,
     as_json: AsJson = False,
 ) -> None:
     """Show one buffer: its sessions as a table, or as a film strip with --out.
@@ -101,19 +103,23 @@ def show(
     ```
     robomme-interference show VideoRepick/test/7 k3 --split my-split
     robomme-interference show VideoRepick/test/7 k7 --split my-split --out strip.png
+    robomme-interference show MoveCube/test/0 k1 --split my-split --shift light:2 --out strip.png
     ```
     """
-    from robomme_interference_data.loading import load_buffer
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.tables import Table
+    from robomme_interference_data.views import shifted_frame
 
     check_output(out)
-    buffer = load_buffer(episode, condition, split=split)
+    under, opened = parse_shift(shift), load_split(split)
+    buffer = opened.load(episode, condition)
     buffer.query.dataset.shape(camera)  # refuses an unknown one
     if out is not None:
         from robomme_interference_data.strip import draw_strip
 
-        draw_strip(buffer, out, camera=camera)
+        live = under and shifted_frame(opened, buffer.episode_id, under, camera)
+        draw_strip(buffer, out, camera=camera, live=live)
         say(f"{out} written")
     manifest = buffer.manifest
     if as_json:

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
 from robomme_interference_data.drawing import Hue, Page, ink_on, open_page, tint
@@ -99,7 +102,9 @@ def session_colors(sessions: Sequence[Session]) -> list[str]:
     return [LESSON_COLOR if s.role == "lesson" else by_family[s.family] for s in sessions]
 
 
-def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
+def draw_strip(
+    buffer: Buffer, out: Path, *, camera: str = "front", live: NDArray[np.uint8] | None = None
+) -> None:
     """Draw a buffer: its sessions, a timeline to scale, and the first live observation.
 
     Decodes only the frames that are shown. The same buffer gives the same bytes with the same
@@ -109,6 +114,8 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
         buffer: The buffer.
         out: File to write, `.png` or `.svg`.
         camera: Name of the camera.
+        live: Picture of the first live observation, such as one under a shift; None for the stored
+            one.
 
     Raises:
         InvalidOptionError, MissingExtraError: See `open_page`.
@@ -123,7 +130,8 @@ def draw_strip(buffer: Buffer, out: Path, *, camera: str = "front") -> None:
         right = _WIDTH - _MARGIN
         page.text(right, top, "what the robot sees now", 6.5, align="right", bold=True)
         bottom = top + 0.15
-        bottom += page.picture(buffer.query.frame(camera), right - _LIVE, bottom, _LIVE, line=1.5)
+        seen = buffer.query.frame(camera) if live is None else live
+        bottom += page.picture(seen, right - _LIVE, bottom, _LIVE, line=1.5)
         middle = right - _LIVE / 2
         page.text(middle, bottom + 0.03, str(len(buffer)), 5.5, color=_GREY)
         page.text(middle, bottom + 0.13, "first live observation", 6, width=_LIVE)

@@ -56,6 +56,16 @@ def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
     assert title.endswith("encoder thumbnail, camera front, shift camera:2, rule max/adaptive")
 
 
+def test_the_film_strip_shows_what_the_robot_sees(run: Run, seen: Path, tmp_path: Path) -> None:
+    pictures = []
+    for shift in ("none", "light:1", "clutter:3"):
+        out = tmp_path / f"{shift[:5]}.png"
+        words = ("show", QUERIES[0], "k1", "--split", seen, "--shift", shift, "--out", out)
+        assert run(*words)[0] == 0
+        pictures.append(out.read_bytes())
+    assert pictures[0] == pictures[1] != pictures[2]
+
+
 def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split: Path) -> None:
     code, _, err = run("retrieval-score", own_split, "--shift", "light:2")
     assert code == 1 and f"--source tabletop --split test --out {own_split}/shifted" in err
