@@ -139,6 +139,7 @@ def write_rows(path: Path, repeats: int) -> Path:
         "family": (list(FAMILIES), family),
         "condition": (list(CONDITIONS), condition),
         "episode_split": (["test"], same),
+        "shift": (["none"], same),
         "difficulty": (["easy", "medium", "hard"], episode % 3),
         "goal": (["do it"], same),
     }

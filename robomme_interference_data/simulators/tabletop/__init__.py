@@ -9,7 +9,8 @@ on, so that `gymnasium.make("tabletop/MoveCube-v1")` finds them. Gymnasium impor
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 
 SUITE_VERSION = 2
-"""Version of the episodes; raised with every change to scenes, shifts, motions, goals or judgements.
+"""Version of the episodes; raised with every change to scenes, shifts, motions, goals or
+judgements.
 
 Datasets and runs of another version do not fit this one: see `docs/simulators.md`.
 """
