@@ -118,7 +118,9 @@ def show(
     if out is not None:
         from robomme_interference_data.strip import draw_strip
 
-        live = under and shifted_frame(opened, buffer.episode_id, under, camera)
+        live = None
+        if under is not None:
+            live = shifted_frame(opened, buffer.episode_id, under, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         say(f"{out} written")
     manifest = buffer.manifest
