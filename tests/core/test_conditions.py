@@ -124,7 +124,7 @@ def test_what_a_split_must_hold() -> None:
     assert needed("no-history", "before-k3") == ("demonstrations", "distractors")
     every = "demonstrations", "distractors", "distractors-raw", "contradictions"
     assert needed("misled-k0", "k0", "raw-k1") == every
-    assert DATASETS == (*every, "shifted")  # which no condition needs
+    assert (*every, "shifted") == DATASETS  # which no condition needs
 
 
 def test_the_registry() -> None:
