@@ -3,12 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DEMONSTRATIONS, SHIFTED
+from robomme_interference_data.constants import DISTRACTORS, SHIFTED
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.errors import MissingFileError, StaleIndexError
+from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.shifts import SHIFTS, Shift
 from robomme_interference_data.split import Split
+from robomme_interference_data.split_index import SplitIndex
 
 
 def shifted_frame(
@@ -28,25 +29,19 @@ def shifted_frame(
 
 def shifted_embedding(
     split: Split, episode_id: EpisodeId, shift: Shift, encoder: str, camera: str = "front"
-) -> NDArray[np.float16]:
-    """Look up the embedding of a query's first live view under a shift, `(D,) float16`.
+) -> NDArray[np.float32]:
+    """Look up the embedding of a query's first live view under a shift, `(D,) float32`.
 
     For grading without a simulator: in a rollout, what the robot sees is embedded then.
 
     Raises:
         MissingFileError: The split has no such views.
-        MissingIndexError, StaleIndexError, FormatError: See `Dataset.index`.
+        MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
     """
-    dataset, place = _views(split), SHIFTS.index(shift)
-    own, base = (one.index(encoder, camera) for one in (dataset, split.datasets[DEMONSTRATIONS]))
-    if own.made != base.made:
-        raise StaleIndexError(
-            f"the embeddings of encoder {encoder!r} were made differently in "
-            f"{dataset.files.describe()} and in the demonstrations",
-            "Make them again, all at once: robomme-interference index "
-            f"{split.location} --encoder {encoder}",
-        )
-    return own.span(dataset.index_of(episode_id), place, place + 1)[0]
+    views, place = _views(split), SHIFTS.index(shift)
+    needed = {name: split.datasets[name] for name in (DISTRACTORS, SHIFTED)}
+    index = SplitIndex(needed, encoder, camera)
+    return index.span(SHIFTED, views.index_of(episode_id), place, place + 1)[0]
 
 
 def _views(split: Split) -> Dataset:
