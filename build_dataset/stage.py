@@ -168,6 +168,7 @@ class StageTask:
             exact=recording.exact and codec.exact,
             feature_sha256=session,
             span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
+            evidence=None if lesson is None else recording.evidence,
         )
         stats = {
             feature: {name: tuple(map(float, values)) for name, values in one.result().items()}

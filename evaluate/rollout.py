@@ -21,7 +21,13 @@ from robomme_interference_data.evaluate.policies.policy import Policy, RolloutIn
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
-from robomme_interference_data.sampling import even_sample, lesson_frames, lesson_share
+from robomme_interference_data.sampling import (
+    even_sample,
+    evidence_kept,
+    kept_frames,
+    lesson_frames,
+    lesson_share,
+)
 from robomme_interference_data.shifts import NO_SHIFT
 from robomme_interference_data.simulators.base import Observation, Simulator, action_array
 from robomme_interference_data.split import Split
@@ -113,6 +119,7 @@ def run_rollout(
         history_frames=stop - start,
         lesson_frames=lesson_frames(buffer.sessions, start, stop),
         lesson_share=lesson_share(buffer.sessions, start, stop) if stop > start else None,
+        evidence_kept=_evidence_kept(run.system, buffer, start, stop),
         **_retrieval_columns(selector, buffer, start, stop),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
@@ -173,6 +180,14 @@ def _retrieval_columns(
         for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
             columns[f"retrieval_selected_{part}_fraction"] = fraction
     return columns
+
+
+def _evidence_kept(system: str, buffer: Buffer, start: int, stop: int) -> float | None:
+    """Return the share of the evidence that the memory of a system holds of a span of a buffer."""
+    memory = name_system(system).sampling
+    if memory is None or buffer.evidence is None:
+        return None
+    return evidence_kept(buffer.evidence, kept_frames(memory, start, stop))
 
 
 def _decode(

@@ -33,6 +33,8 @@ class System:
         subgoals: What a vision-language model in front of the policy writes:
             `simple_subgoal`, `grounded_subgoal`, or None where there is none.
         retrieval: Whether a retrieval step chooses what the memory gets.
+        sampling: By which of `sampling.MEMORIES` it keeps frames; None where that is not known, or
+            it keeps none.
         position_limit: History and live frames together that the memory holds; None: no limit.
         paper: Whether the paper reports it.
         bound: Whether it uses no memory at all, and only shows what can be reached with the
@@ -46,6 +48,7 @@ class System:
     with_history: bool = True
     subgoals: str | None = None
     retrieval: bool = False
+    sampling: str | None = None
     position_limit: int | None = None
     paper: bool = False
     bound: bool = False
@@ -60,6 +63,7 @@ def _released(
 ) -> System:
     """A system whose server keeps the frames, with an embedding for each of 4096 positions."""
     own: dict[str, Any] = {"retrieval": retrieval, "position_limit": POSITION_LIMIT, "paper": True}
+    own["sampling"] = "framesamp" if memory == "frames" else None
     return System(name, display, memory, integration, **own)
 
 
@@ -89,14 +93,26 @@ PAPER_SYSTEMS: tuple[System, ...] = (
 )
 """The twelve systems of the paper's main table in its order, then the one with retrieval."""
 
-_REPLAY = {"Full": "all frames", "FrameSamp": "frames", "Window": "last frames"}
+_KEPT = {"Full": "all frames", "FrameSamp": "frames", "Window": "last frames"}
+
+
+def _control(kind: str, *, retrieval: bool) -> tuple[System, ...]:
+    """A control with each memory rule."""
+    name = f"Retrieval-{kind}" if retrieval else kind
+    return tuple(
+        System(
+            *(f"{name}-{rule}".lower(), f"{name}-{rule}", frames),
+            retrieval=retrieval,
+            sampling=rule.lower(),
+        )
+        for rule, frames in _KEPT.items()
+    )
+
+
 _CONTROLS = (
     *(System(name.lower(), name, "none", bound=True) for name in ("Oracle", "Guess", "Hold")),
-    *(System(f"replay-{n.lower()}", f"Replay-{n}", memory) for n, memory in _REPLAY.items()),
-    *(
-        System(f"retrieval-replay-{n.lower()}", f"Retrieval-Replay-{n}", memory, retrieval=True)
-        for n, memory in _REPLAY.items()
-    ),
+    *_control("Replay", retrieval=False),
+    *_control("Replay", retrieval=True),
 )
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}

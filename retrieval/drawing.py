@@ -11,7 +11,7 @@ from robomme_interference_data.drawing import GREY, INK, Page, ink_on, open_page
 from robomme_interference_data.retrieval.reasons import Reasons
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import MIN_FRAMES, Choice, Measured
-from robomme_interference_data.strip import LESSON_COLOR, session_colors
+from robomme_interference_data.strip import LESSON_COLOR, mark_evidence, session_colors
 
 # Inches.
 _WIDTH, _HEIGHT = 7.2, 6.1
@@ -118,7 +118,8 @@ class _Picture:
             )
             if name := next(fitting, None):
                 ink = ink_on(color)
-                page.text(x + width / 2, top + 0.055, name, 5.5, width=room, bold=True, color=ink)
+                page.text(x + width / 2, top + 0.045, name, 5.5, width=room, bold=True, color=ink)
+        mark_evidence(page, self.buffer, _LEFT, _SPAN / len(self.buffer), top + _BAR)
         return top + _BAR
 
     def segments(self, top: float) -> float:
@@ -155,7 +156,9 @@ class _Picture:
         marks = {"color": "black", "markersize": 4, "ls": "", "label": f"{int(cut.sum())} cuts"}
         axes.plot(places[cut], values[cut], "v", **marks)
         axes.tick_params(labelbottom=False)
-        _name(axes, "cosine of each frame with the next; shaded: the true lesson")
+        shaded = "cosine of each frame with the next; shaded: the true lesson"
+        line = "; dark line above: shows the answer" if self.buffer.evidence else ""
+        _name(axes, shaded + line)
 
     def alike(self, axes: Any) -> None:
         """Draw the cosine of each frame with what the robot sees, and each segment's score."""

@@ -16,6 +16,7 @@ from robomme_interference_data.bootstrap import bootstrap, mean
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.select import Measured, Rule, choose
+from robomme_interference_data.sampling import evidence_kept
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 
@@ -43,6 +44,8 @@ class Grade:
         hit: Whether any frame of the lesson was chosen.
         purity: Share of the chosen frames that are of the lesson, in however many parts.
         coverage: Share of the lesson's frames that were chosen; None where there are none.
+        evidence_kept: Share of the lesson's evidence spans of which a frame was chosen; None where
+            there are none, or none are known.
         false_sessions: Sessions that are no lesson of which a frame was chosen.
         true_cuts: Borders between true sessions.
         found_cuts: How many of them are borders of segments.
@@ -61,6 +64,7 @@ class Grade:
     hit: bool
     purity: float
     coverage: float | None
+    evidence_kept: float | None
     false_sessions: int
     true_cuts: int
     found_cuts: int
@@ -72,13 +76,14 @@ class Cell:
     """How well one rule chose for all queries of a family under one condition.
 
     Shares and means have 95% intervals, from `…_low` to `…_high`: Wilson's for `hit`, BCa bootstrap
-    over episodes for the others, None for a single episode.
+    over episodes for the others, None for a single episode. `evidence_kept` is of the
+    queries of which it is known, None if of none.
 
     Attributes:
         family: A family, or `ALL`.
         queries: Query episodes.
         hit: Share of them with a frame of the lesson chosen.
-        purity, coverage, false_sessions: Means of what `Grade` has.
+        purity, coverage, evidence_kept, false_sessions: Means of what `Grade` has.
         true_cuts, found_cuts, false_cuts: Sums of what `Grade` has.
         passed: Whether mean purity and mean coverage reach the pass mark.
     """
@@ -96,6 +101,9 @@ class Cell:
     coverage: float
     coverage_low: float | None
     coverage_high: float | None
+    evidence_kept: float | None
+    evidence_kept_low: float | None
+    evidence_kept_high: float | None
     false_sessions: float
     false_sessions_low: float | None
     false_sessions_high: float | None
@@ -131,6 +139,7 @@ def grade(measured: Measured, rule: Rule) -> Grade:
         hit=inside > 0,
         purity=inside / len(frames),
         coverage=inside / lesson if lesson else None,
+        evidence_kept=evidence_kept(measured.evidence or (), set(frames.tolist())),
         false_sessions=sum(sessions[number - 1].role != "lesson" for number in touched),
         true_cuts=len(borders),
         found_cuts=len(borders & cuts),
@@ -158,9 +167,10 @@ def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
 
 def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Cell:
     count, hits = len(grades), sum(one.hit for one in grades)
-    values = np.array([(g.purity, g.coverage, g.false_sessions) for g in grades], float)
+    means = [(g.purity, g.coverage, g.evidence_kept, g.false_sessions) for g in grades]
+    values = np.array(means, float)  # NaN for None
     # One key: equal values have equal intervals, whatever the rule, family and condition.
-    drawn = bootstrap(values, [mean(column) for column in range(3)], "retrieval")
+    drawn = bootstrap(values, [mean(column) for column in range(4)], "retrieval")
     bounds = (None if math.isnan(number) else number for one in drawn for number in one)
     cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
     passed = min(one.value for one in drawn[:2]) >= PASS_MARK
@@ -173,7 +183,8 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
 _NOTE = (
     "hit: queries for which any lesson frame was chosen, with the 95% Wilson interval. Means over "
     "queries with 95% BCa bootstrap intervals (none for a single query): purity, the share of the "
-    "chosen frames that are lesson; coverage, the share of the lesson that was chosen; false "
+    "chosen frames that are lesson; coverage, the share of the lesson that was chosen; evidence "
+    "kept, the share of the spans that show the answer of which a frame was chosen; false "
     "sessions, how many others were touched. cuts found: of all cuts between true sessions, in all "
     "queries together; false cuts: those inside one. pass: mean purity and mean coverage are both "
     f"at least {PASS_MARK:.0%}."
@@ -194,14 +205,14 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
     several = len({cell.rule for cell in cells}) > 1
     columns = (
         f"{'rule' if several else 'family'} condition queries:count hit purity coverage "
-        "false_sessions:ratio cuts_found false_cuts:count pass:flag"
+        "evidence_kept false_sessions:ratio cuts_found false_cuts:count pass:flag"
     )
     rows = (
         (
             cell.rule if several else cell.family,
             cell.condition,
             cell.queries,
-            *(_share(cell, name) for name in ("hit", "purity", "coverage")),
+            *(_share(cell, name) for name in ("hit", "purity", "coverage", "evidence_kept")),
             cell.false_sessions,
             f"{cell.found_cuts} of {cell.true_cuts}",
             cell.false_cuts,
@@ -213,6 +224,8 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
     return Table.make("retrieval", title, columns, rows, _NOTE)
 
 
-def _share(cell: Cell, name: str) -> str:
+def _share(cell: Cell, name: str) -> str | None:
     value, low, high = (getattr(cell, name + suffix) for suffix in ("", "_low", "_high"))
+    if value is None:
+        return None
     return percent(value) + ("" if low is None else f" ({100 * low:.1f} to {100 * high:.1f})")

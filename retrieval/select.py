@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Session
 from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines, segments
@@ -116,6 +117,7 @@ class Measured:
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
         alike: Cosine of each frame with the query frame, `(T,) float32`.
         typical: Median cosine of two frames of different distractor units.
+        evidence: Which frames show the hidden answer; None where that is unknown.
     """
 
     episode_id: EpisodeId
@@ -124,6 +126,7 @@ class Measured:
     adjacent: NDArray[np.float32]
     alike: NDArray[np.float32]
     typical: float
+    evidence: tuple[Evidence, ...] | None = None
 
     @property
     def lesson(self) -> tuple[Span, ...]:
@@ -157,6 +160,7 @@ def measure(
         adjacent_cosines(embeddings),
         cosines(embeddings, buffer.query_embedding(encoder, camera) if query is None else query),
         buffer.index(encoder, camera).typical_cosine,
+        buffer.evidence,
     )
 
 

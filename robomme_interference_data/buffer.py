@@ -24,6 +24,7 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     UnknownNameError,
 )
+from robomme_interference_data.evidence import Evidence, place_evidence
 from robomme_interference_data.ids import EpisodeId, whole_number
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
@@ -144,6 +145,17 @@ class Buffer:
         states = np.concatenate(parts)
         states.setflags(write=False)
         return states
+
+    @cached_property
+    def evidence(self) -> tuple[Evidence, ...] | None:
+        """Which frames of the buffer show a part of the hidden answer, session by session.
+
+        None where that is unknown of a lesson that it holds, or of one that contradicts it.
+        """
+        return place_evidence(
+            self.sessions,
+            lambda entry: self._datasets[entry.dataset].record(entry.episode_index).evidence,
+        )
 
     def fetch(self, cameras: Sequence[str] | None = None) -> None:
         """Bring the files of the buffer and its query to this machine, if they lie elsewhere.

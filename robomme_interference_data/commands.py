@@ -123,9 +123,10 @@ def show(
             live = shifted_frame(opened, buffer.episode_id, under, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         say(f"{out} written")
-    manifest = buffer.manifest
+    manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
-        print_json(to_dict(manifest))
+        told = None if evidence is None else [one.told() for one in evidence]
+        print_json(to_dict(manifest) | {"evidence": told})
         return
     table = Table.make(
         "sessions",
@@ -139,6 +140,18 @@ def show(
         f"{manifest.lesson_share:.0%} lesson",
     )
     typer.echo(table.text())
+    if evidence:
+        spans = Table.make(
+            "evidence",
+            "What shows the answer",
+            "part:count text session frames",
+            (
+                (one.span.part, one.span.text, one.session.role, f"{one.start} to {one.stop - 1}")
+                for one in evidence
+            ),
+            "frames: in the buffer",
+        )
+        typer.echo(f"\n{spans.text()}")
 
 
 @with_settings

@@ -224,6 +224,16 @@ class RowSpan:
         with reading(self.path):  # a number too large
             return np.asarray(pc.cast(column, pa.int64()).to_numpy())
 
+    def texts(self, name: str) -> list[str]:
+        """Return a column of texts; one that is missing is empty."""
+        column = self.table([name])[name]
+        if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
+            raise FormatError(
+                f"{self.path}: column {name!r} is of type {column.type}; expected texts"
+            )
+        with reading(self.path):  # what is no UTF-8
+            return [text or "" for text in column.to_pylist()]
+
     def vectors(self, name: str) -> NDArray[np.float32]:
         """Return a column of lists of numbers as `(T, D) float32`."""
         column, what = self.table([name])[name], f"{self.path}: column {name!r}"

@@ -33,6 +33,15 @@ _MOST_SESSIONS = 1 << 12
 _MOST_GOALS = 1 << 16
 """Characters of all wordings of a goal, at most: they are shown, and handed to policies."""
 
+_MOST_PARTS = 1 << 10
+"""Parts of an answer, at most; the embedded suite's longest has six."""
+
+_MOST_SPANS = 1 << 12
+"""Evidence spans of a lesson, at most."""
+
+_MOST_TEXT = 1 << 10
+"""Characters of a part in words, at most: they are shown."""
+
 
 class Status(StrEnum):
     """How an episode stands after a step.
@@ -71,6 +80,35 @@ class SpanDigests:
 
 
 @dataclass(frozen=True)
+class EvidenceSpan:
+    """Stored frames of a lesson that show a part of the hidden answer.
+
+    Attributes:
+        part: Number of the part, from 0.
+        text: The part in words, such as `lifts cube 2`.
+        start: First frame that shows it.
+        stop: Frame after the last one.
+    """
+
+    part: int
+    text: str
+    start: int
+    stop: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.part < _MOST_PARTS or not 0 <= self.start < self.stop:
+            raise FormatError(
+                f"evidence of part {self.part} in frames [{self.start}, {self.stop}); expected "
+                f"part 0 to {_MOST_PARTS - 1}, and frames"
+            )
+        if not 0 < len(self.text) <= _MOST_TEXT:
+            raise FormatError(
+                f"evidence of part {self.part} has {len(self.text)} letters; expected 1 to "
+                f"{_MOST_TEXT}"
+            )
+
+
+@dataclass(frozen=True)
 class EpisodeRecord:
     """An episode of a dataset, with what its source recorded of it.
 
@@ -89,6 +127,8 @@ class EpisodeRecord:
             frames where there is none; see `digest.py`.
         span_sha256: Digests of the spans that parts of a lesson are, and of the query frame, by
             name, see `spans`; None where there is no lesson.
+        evidence: Frames of the lesson that show the hidden answer, part by part; None where that
+            is unknown, and where there is no lesson.
     """
 
     episode_index: int
@@ -102,6 +142,7 @@ class EpisodeRecord:
     exact: bool
     feature_sha256: dict[str, str]
     span_sha256: SpanDigests | None
+    evidence: tuple[EvidenceSpan, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.goals or sum(map(len, self.goals)) > _MOST_GOALS:
@@ -114,6 +155,18 @@ class EpisodeRecord:
             raise FormatError(
                 f"{self.episode_id} has length {self.length} and exec_start_idx {start}"
             )
+        spans = self.evidence or ()
+        if (start is None and self.evidence is not None) or len(spans) > _MOST_SPANS:
+            raise FormatError(
+                f"{self.episode_id} has {len(spans)} evidence spans; expected none in a unit, and "
+                f"at most {_MOST_SPANS} in a lesson"
+            )
+        for span in spans:
+            if start is None or span.stop > start:
+                raise FormatError(
+                    f"{self.episode_id} has evidence in frames [{span.start}, {span.stop}) of a "
+                    f"lesson of {start}"
+                )
 
     @property
     def goal(self) -> str:
@@ -442,6 +495,9 @@ class Rollout:
         lesson_frames: Those of them that are of the lesson.
         lesson_share: Share of lesson frames in an even 32-frame sample of what was given and the
             first live observation (see `sampling.lesson_share`); None without history.
+        evidence_kept: Share of the lesson's evidence spans of which the system's memory holds a
+            frame at the first step (see `sampling.evidence_kept`); None where the evidence or the
+            memory's rule is unknown, and without a lesson.
         retrieval_model: Encoder and rule of the retrieval step, or None.
         retrieval_start: First frame in the buffer of the retrieved span, or None.
         retrieval_stop: Frame after its last one, or None.
@@ -480,6 +536,7 @@ class Rollout:
     history_frames: int
     lesson_frames: int
     lesson_share: float | None
+    evidence_kept: float | None = None
     retrieval_model: str | None = None
     retrieval_start: int | None = None
     retrieval_stop: int | None = None

@@ -1,10 +1,11 @@
 """What a sample of a history holds, whatever sessions the history is made of: pure."""
 
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
+from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.records import Session
 
 
@@ -25,6 +26,29 @@ def even_sample(history_frames: int) -> list[int]:
         return list(range(history_frames + 1))
     # Exact integers: index j of linspace(0, t, n) is floor(j·t / (n − 1)).
     return [j * history_frames // (SAMPLE_FRAMES - 1) for j in range(SAMPLE_FRAMES)]
+
+
+MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
+    "full": range,
+    "framesamp": lambda live: even_sample(live)[:-1],
+    "window": lambda live: range(max(0, live - SAMPLE_FRAMES + 1), live),
+}
+"""Memory rule: which frames it keeps when the live observation has index `live`, itself apart.
+
+`full` keeps all; `framesamp` all while they are fewer than 32 with the live one, else those of
+the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last 32.
+"""
+
+
+def kept_frames(memory: str, start: int, stop: int) -> list[int]:
+    """Return the frames of a buffer that a memory keeps of a span of it, at the first step.
+
+    Args:
+        memory: One of `MEMORIES`.
+        start: First frame of the span.
+        stop: Frame after its last one; the live observation comes then.
+    """
+    return [start + frame for frame in MEMORIES[memory](stop - start)]
 
 
 def spread(start: int, stop: int, count: int) -> list[int]:
@@ -64,3 +88,24 @@ def lesson_share(sessions: Sequence[Session], start: int, stop: int) -> float:
     lessons = (one for one in sessions if one.role == "lesson")
     inside = sum(before(one.stop - start) - before(one.start - start) for one in lessons)
     return inside / len(sample)
+
+
+def evidence_kept(evidence: Iterable[Evidence], kept: Collection[int]) -> float | None:
+    """Return the share of a lesson's evidence spans of which at least one frame is kept, 0 to 1.
+
+    A span that several sessions show, such as two halves of the lesson, counts once; what a
+    contradicting lesson shows does not count.
+
+    Args:
+        evidence: The buffer's evidence.
+        kept: Frames of the buffer that a sample holds.
+
+    Returns:
+        The share; None where there is no evidence to keep.
+    """
+    found: dict[object, bool] = {}
+    for one in evidence:
+        if one.session.role != "contradiction":
+            key = one.session.source, one.span
+            found[key] = found.get(key, False) or one.seen(kept)
+    return sum(found.values()) / len(found) if found else None

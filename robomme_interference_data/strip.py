@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
-from robomme_interference_data.drawing import Hue, Page, ink_on, open_page, tint
+from robomme_interference_data.drawing import INK, Hue, Page, ink_on, open_page, tint
 from robomme_interference_data.records import Session
 from robomme_interference_data.sampling import even_sample, spread
 
@@ -30,6 +30,7 @@ _BAND = 0.16  # coloured head of a session
 _FOOT = 0.42  # indices, family and episode id under the frames of a session
 _LIVE = 0.95  # live observation
 _BAR = 0.28  # timeline
+_MARK = 0.045  # dark line under what shows the answer
 
 _GREY = "#555555"
 _COLUMNS = 12
@@ -100,6 +101,22 @@ def session_colors(sessions: Sequence[Session]) -> list[str]:
     families = dict.fromkeys(s.family for s in sessions if s.role != "lesson")
     by_family = {family: COLORS[n % len(COLORS)] for n, family in enumerate(families)}
     return [LESSON_COLOR if s.role == "lesson" else by_family[s.family] for s in sessions]
+
+
+def mark_evidence(page: Page, buffer: Buffer, left: float, scale: float, bottom: float) -> None:
+    """Draw a dark line along the foot of a bar wherever the buffer's frames show the answer.
+
+    Args:
+        page: The page.
+        buffer: The buffer that the bar stands for.
+        left: Left edge of the bar, in inches.
+        scale: Inches of a frame.
+        bottom: The bar's foot, in inches.
+    """
+    for one in buffer.evidence or ():
+        width = (one.stop - one.start) * scale
+        place = left + one.start * scale, bottom - _MARK, width, _MARK
+        page.box(*place, fill=INK, edge="white", line=0.3)
 
 
 def draw_strip(
@@ -190,6 +207,9 @@ def _draw_sessions(
         _draw_card(page, session, number, colors[number], (x, y, width, height))
         for index, image in zip(indices, images, strict=True):
             page.picture(image, x, y + _BAND, size)
+            if any(one.seen([index]) for one in buffer.evidence or ()):
+                foot = y + _BAND + tall - _MARK
+                page.box(x, foot, size, _MARK, fill=INK, edge="white", line=0.3)
             page.text(x + size / 2, y + _BAND + tall + 0.015, str(index), 5.5, color=_GREY)
             x += step
     return y + height + _GAP if blocks else top
@@ -220,6 +240,8 @@ def _draw_timeline(page: Page, buffer: Buffer, colors: Sequence[str], top: float
     width = _INNER - _LIVE - 0.42
     scale = width / (len(buffer) + 1)
     caption = "history to scale; ticks: the even sample, and how many of it fall in each session"
+    if buffer.evidence:
+        caption += "; dark line: shows the answer"
     page.text(_MARGIN, top, caption, 6.5, align="left", color=_GREY)
     bar = top + 0.44
     sample = even_sample(len(buffer))
@@ -241,6 +263,7 @@ def _draw_timeline(page: Page, buffer: Buffer, colors: Sequence[str], top: float
         inside = sum(session.start <= index < session.stop for index in sample)
         if inside or span > 0.1:  # noughts would run into each other
             page.text(x + span / 2, bar - 0.21, str(inside), 6, bold=True)
+    mark_evidence(page, buffer, _MARGIN, scale, bar + _BAR)
     end = _MARGIN + width
     page.box(end - scale, bar, scale, _BAR, fill="black", edge="black", line=0.8)
     page.text(end + 0.02, bar - 0.21, "+1 live", 6, align="left", color=_GREY)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import EvidenceSpan
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ class Recording:
         exact: False if the frames were lossily compressed before they came here.
         frames: The frames in order, a bounded number in memory at a time. Closing it early
             releases the files.
+        evidence: Which frames of the demonstration show the hidden answer, part by part; None
+            where the source does not say.
 
     Raises:
         SourceError: There is no goal, or no such difficulty.
@@ -71,6 +74,7 @@ class Recording:
     simulator: str | None
     exact: bool
     frames: Generator[Frame]
+    evidence: tuple[EvidenceSpan, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.goals or not all(goal.strip() for goal in self.goals):

@@ -13,6 +13,7 @@ _USUAL = {
     "action": ("action", "actions"),
     "is_demo": ("is_demo",),
     "exec_start_idx": ("exec_start_idx",),
+    "subgoal": ("simple_subgoal", "grounded_subgoal"),
 }
 """Names by which each is looked for, in this order: LeRobot's and this project's usual ones, then
 those of `lerobot/robomme` and `Yinpei/robomme_data_lerobot`."""
@@ -75,6 +76,8 @@ def _unmet(name: str, kind: str, shape: tuple[int, ...]) -> str | None:
         fits, expected = colours and kind in ("video", "image"), "images or video, three channels"
     elif name in ("state", "action"):
         fits, expected = len(shape) == 1 and kind.startswith("float"), "a vector of floats a frame"
+    elif name == "subgoal":
+        fits, expected = kind == "string", "a text a frame"
     else:
         fits, expected = kind == "bool" or "int" in kind, "booleans or whole numbers"
     return None if fits else expected

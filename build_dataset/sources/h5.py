@@ -24,6 +24,7 @@ from robomme_interference_data.build_dataset.sources.base import (
 )
 from robomme_interference_data.build_dataset.sources.robomme_families import ROBOMME
 from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
+from robomme_interference_data.evidence import spans_of_texts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.base import choose_cameras
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 _FILE = re.compile(r"record_dataset_(?P<family>.+)\.h5")
 _CAMERAS = {"front": "front_rgb", "wrist": "wrist_rgb"}
+_SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 _AGAIN = "Record or download the file again, or move it out of the folder."
 
 _SEEDS = (("val", 1_000_000, 10_000), ("test", 500_000, 10_000), ("train", 0, 1000))
@@ -121,6 +123,7 @@ class H5Source(Source):
             if not there:
                 raise SourceError(f"{where} has no {' or '.join(_CAMERAS.values())}", _AGAIN)
             chosen = choose_cameras(cameras, there)
+            texts = (_subgoal(group[f"timestep_{step}/info"]) for step in steps[:lesson])
             return Recording(
                 goals=tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()])),
                 seed=_seed(group),
@@ -128,6 +131,7 @@ class H5Source(Source):
                 simulator="robomme",
                 exact=True,
                 frames=_frames(path, number, steps, lesson, chosen),
+                evidence=spans_of_texts(texts),
             )
 
 
@@ -178,6 +182,11 @@ def _numbers(group: "h5py.Group", prefix: str) -> list[int]:
 
 def _seed(group: "h5py.Group") -> int | None:
     return int(group["setup/seed"][()]) if "setup/seed" in group else None
+
+
+def _subgoal(info: "h5py.Group") -> str:
+    name = next((one for one in _SUBGOALS if one in info), None)
+    return _text(info[name][()]) if name else ""
 
 
 def _text(value: Any) -> str:

@@ -37,10 +37,12 @@ from robomme_interference_data.build_dataset.sources.robomme_families import (
     families_for_goal,
 )
 from robomme_interference_data.errors import FormatError, SourceError
+from robomme_interference_data.evidence import spans_of_texts
 from robomme_interference_data.hub import HubFiles, locate
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
 from robomme_interference_data.parquet import RowSpan
+from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.rows import from_dict
 from robomme_interference_data.simulators.base import CAMERAS, choose_cameras
 
@@ -63,6 +65,7 @@ class _Told:
     simulator: str | None
     exact: bool | None
     exec_start_idx: int | None
+    evidence: tuple[EvidenceSpan, ...] | None
 
     @property
     def wordings(self) -> tuple[str, ...]:
@@ -75,8 +78,8 @@ class LeRobotSource(Source):
 
     Args:
         location: A folder, or a dataset repository on the Hub, as `hub.locate` reads it.
-        columns: Logical name (`front`, `wrist`, `state`, `action`, `is_demo`, `exec_start_idx`)
-            to the dataset's column, where that is not named as usual.
+        columns: Logical name (`front`, `wrist`, `state`, `action`, `is_demo`, `exec_start_idx`,
+            `subgoal`) to the dataset's column, where that is not named as usual.
         families_file: File that names the family of every episode, see `docs/sources.md`.
 
     Raises:
@@ -140,6 +143,11 @@ class LeRobotSource(Source):
         exact = told.exact
         if exact is None:
             exact = all(self._is_exact(rows, columns[camera]) for camera in chosen)
+        evidence = told.evidence
+        if evidence is None and lesson is not None and "subgoal" in columns:
+            evidence = spans_of_texts(
+                rows.part(rows.start, rows.start + lesson).texts(columns["subgoal"])
+            )
         streams = {camera: self._images(index, rows, columns[camera], exact) for camera in chosen}
         return Recording(
             goals=told.wordings,
@@ -148,6 +156,7 @@ class LeRobotSource(Source):
             simulator=simulator,
             exact=exact,
             frames=compose(streams, states, actions, lesson),
+            evidence=evidence,
         )
 
     @cached_property

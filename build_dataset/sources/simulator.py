@@ -70,7 +70,8 @@ class SimulatorSource(Source):
         lesson, first, info = simulator.reset(str(episode.id))
         act = (lambda: simulator.act("oracle")) if self.whole else None
         frames = _play(simulator, lesson, first, act)
-        return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)
+        told = info.goals, info.seed, info.difficulty, info.simulator
+        return Recording(*told, True, frames, lesson.evidence)
 
     def close(self) -> None:
         """End the simulator."""

@@ -1,27 +1,15 @@
 """The built-in policies, none with learned weights: the benchmark's controls."""
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION_CHUNK, SAMPLE_FRAMES
+from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
-from robomme_interference_data.sampling import even_sample
+from robomme_interference_data.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation, Simulator
-
-MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
-    "full": range,
-    "framesamp": lambda live: even_sample(live)[:-1],
-    "window": lambda live: range(max(0, live - SAMPLE_FRAMES + 1), live),
-}
-"""Memory rule: which frames it keeps when the live observation has index `live`, itself apart.
-
-`full` keeps all; `framesamp` all while they are fewer than 32 with the live one, else those of
-the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last 32.
-"""
 
 THUMBNAIL = 16
 """Side of the small image by which frames are compared."""

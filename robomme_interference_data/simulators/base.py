@@ -14,7 +14,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Status
+from robomme_interference_data.records import EvidenceSpan, Status
 
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""
@@ -48,11 +48,14 @@ class Demonstration:
         states: `(T, 8) float32`, as `Observation.state`; `states[t]` belongs to frame t.
         actions: `(T, 8) float32`: the action taken at time step t, after frame t was seen: 7
             absolute joint targets in rad, then the gripper, −1 closed to 1 open.
+        evidence: Which frames show the hidden answer, part by part; None where the simulator
+            does not say. Never handed to a policy.
     """
 
     images: dict[str, NDArray[np.uint8]]
     states: NDArray[np.float32]
     actions: NDArray[np.float32]
+    evidence: tuple[EvidenceSpan, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.states)

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.builtin import (
-    MEMORIES,
     Hold,
     Privileged,
     ReplayPolicy,
     follow,
 )
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation
 
 Vector = NDArray[np.float32]

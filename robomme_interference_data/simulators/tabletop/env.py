@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, FPS
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evidence import spans_of_parts
 from robomme_interference_data.records import Status
 from robomme_interference_data.shifts import Shift
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
@@ -202,8 +203,9 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         return self._sensors[name].camera._render_cameras[0]
 
     def _demonstrate(self) -> Demonstration:
-        seen, actions = [], []
+        seen, actions, shown = [], [], []
         for _ in self.episode.demonstrate(self.arm, self.answer):
+            shown.append(self.episode.showing)
             seen.append(self.observe(self.demonstrated))
             actions.append(self.arm.action.copy())
             super()._step_action(actions[-1])
@@ -213,6 +215,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             {name: np.stack([one.images[name] for one in seen]) for name in seen[0].images},
             np.stack([one.state for one in seen]),
             np.stack(actions),
+            spans_of_parts(shown, self.episode.parts(self.answer)),
         )
 
     def _rest(self) -> None:

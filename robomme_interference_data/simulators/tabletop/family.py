@@ -1,7 +1,7 @@
 """What a task family is: a scene, a hidden answer, a script that shows it, and a judge."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, ClassVar
 
 from numpy.random import RandomState
@@ -26,6 +26,8 @@ class Family(ABC):
 
     Attributes:
         answers: All answers that the scene allows; one is the hidden one.
+        showing: Numbers of the parts of the answer that the demonstration shows now; its script
+            sets them.
     """
 
     table: ClassVar[Colour]
@@ -37,6 +39,7 @@ class Family(ABC):
     """Speed of the scripted motion: 1 is 0.25 m/s at the middle of a move."""
 
     answers: Sequence[Any]
+    showing: tuple[int, ...] = ()
 
     def __init__(self, difficulty: str, rng: RandomState):
         self.level = DIFFICULTIES.index(difficulty)
@@ -55,8 +58,38 @@ class Family(ABC):
         """The goal in words, in one wording or more."""
 
     @abstractmethod
+    def told(self, answer: Any) -> tuple[str, ...]:
+        """The parts of an answer in words, in the order in which the demonstration shows them."""
+
+    def parts(self, answer: Any) -> tuple[str, ...]:
+        """All parts of a demonstration that must be seen to know the answer, in words, in order."""
+        return self.told(answer)
+
+    def lessons(self) -> Iterable[tuple[Any, tuple[str, ...]]]:
+        """Every answer with what is told of it; several times, if in several ways."""
+        return ((answer, self.told(answer)) for answer in self.answers)
+
+    def agreeing(self, answer: Any, known: Collection[int]) -> list[Any]:
+        """The answers that somebody cannot rule out who has seen some parts of a demonstration.
+
+        The more is known, the fewer they are: from all of them down to the one that was shown,
+        which is always among them.
+
+        Args:
+            answer: The answer that was shown.
+            known: Numbers of the parts that were seen.
+        """
+        seen = [(part, text) for part, text in enumerate(self.told(answer)) if part in known]
+        fits = {
+            other
+            for other, told in self.lessons()
+            if all(told[part] == text for part, text in seen)
+        }
+        return [other for other in self.answers if other in fits]
+
+    @abstractmethod
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
-        """Show the answer."""
+        """Show the answer, and keep `showing`: it must not change what is done."""
 
     def react(self, arm: Arm) -> None:
         """Let the scene answer to the arm after a step: lamps, the cap of a button."""

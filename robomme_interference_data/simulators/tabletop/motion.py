@@ -127,9 +127,18 @@ class Arm:
 
     def pick(self, at: Point, yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
         """Grasp what is at a point, from above, and lift it by `lift`, in m."""
+        yield from self.go_above(at, yaw)
+        yield from self.take(at, yaw, lift)
+
+    def go_above(self, at: Point, yaw: float = 0.0) -> Script:
+        """Go to where `take` begins."""
         x, y, z = at
         yield from self.move((x, y, max(z + CLEARANCE, self._goal[2])), yaw)
         yield from self.move((x, y, z + CLEARANCE), yaw)
+
+    def take(self, at: Point, yaw: float = 0.0, lift: float = CLEARANCE) -> Script:
+        """Go down to what is at a point below, grasp it, and lift it by `lift`, in m."""
+        x, y, z = at
         if self._gripper < 0:
             yield from self.grip(close=False)
         yield from self.move((x, y, z), yaw, SLOW)

@@ -36,13 +36,13 @@ def shuffled(rng: RandomState, count: int) -> list[int]:
     return [int(number) for number in rng.permutation(count)]
 
 
-def exchanges(rng: RandomState, count: int) -> list[tuple[int, int]]:
-    """Pairs of numbers below `count` that change places one after the other: none returns.
+def exchanges(order: Sequence[int]) -> list[tuple[int, int]]:
+    """Pairs of numbers that change places one after the other, as their order has it: none returns.
 
     Of three, one pair does and the third stays. Of four or more every one ends elsewhere: two
     and two, and with an odd count three in a ring.
     """
-    order = shuffled(rng, count)
+    count = len(order)
     pairs = list(zip(order[0:-1:2], order[1::2], strict=False))
     if count % 2 and count > 3:
         pairs.append((order[-3], order[-1]))

@@ -49,6 +49,14 @@ class InsertPeg(Family):
             "box",
         )
 
+    def told(self, answer: tuple[int, int, int]) -> tuple[str, ...]:
+        number, end, side = answer
+        return (
+            f"takes peg {number}",
+            f"holds it at its {'head' if end == HEAD else 'tail'}",
+            f"inserts it from the {'left' if side == LEFT else 'right'}",
+        )
+
     def demonstrate(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
         yield from arm.wait(5)
         yield from self.solve(arm, answer)
@@ -57,12 +65,16 @@ class InsertPeg(Family):
 
     def solve(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
         number, end, side = answer
-        yield from arm.pick(self.pegs[number].point(end * GRIP, 0, 0), lift=0.15)
+        at = self.pegs[number].point(end * GRIP, 0, 0)
+        yield from arm.go_above(at)
+        self.showing = (0, 1)
+        yield from arm.take(at, lift=0.15)
         x, y, _ = self.box.p
         free = GRIP + LENGTH / 2  # from the grip to the end that goes in
         yaw = math.copysign(math.pi / 2, end * side)
         ready = y + side * (DEPTH / 2 + 0.03 + free)
         yield from arm.move((x, ready, 0.16), yaw)
+        self.showing = (0, 1, 2)  # and it stays in the box, to be seen there
         yield from arm.move((x, ready, self.box.size), speed=SLOW)
         yield from arm.wait(3)
         yield from arm.move((x, y + side * (DEPTH / 2 - 0.05 + free), self.box.size), speed=0.06)

@@ -16,6 +16,11 @@ Vector = NDArray[np.float64]
 
 HANDLE, CROSS = 0.17, 0.065  # m, of the hook
 STILL, SLACK = 1e-5, 0.002  # m: a cube at rest in a step; its way in wrong manners, in all
+_WORDS = {
+    "push": "pushes the cube with the closed gripper",
+    "grasp": "grasps the cube",
+    "hook": "hooks the cube",
+}
 BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
 
 
@@ -46,11 +51,16 @@ class MoveCube(Family):
     def goals(self) -> tuple[str, ...]:
         return ("move the cube to the target in the same manner as in the video",)
 
+    def told(self, answer: str) -> tuple[str, ...]:
+        return (_WORDS[answer],)
+
     def demonstrate(self, arm: Arm, answer: str) -> Script:
         yield from arm.wait(20)
         yield from self.solve(arm, answer)
         if answer == "hook":
-            yield from arm.grip(close=False)  # leaves it on the table
+            yield from arm.grip(close=False)  # leaves it on the table, to be seen there
+        else:
+            self.showing = ()
         yield from arm.go_home()
 
     def solve(self, arm: Arm, answer: str) -> Script:
@@ -63,18 +73,23 @@ class MoveCube(Family):
         behind = start - 0.055 * self.way
         yield from arm.move((behind[0], behind[1], 0.12), self.turn)
         yield from arm.grip(close=True)
+        self.showing = (0,)
         yield from arm.move(behind, speed=SLOW)
         yield from arm.move(end - 0.031 * self.way + (0, 0, CUBE / 2), speed=SLOW)
         yield from arm.wait(6)
 
     def grasp(self, arm: Arm, start: Vector, end: Vector) -> Script:
-        yield from arm.pick(start, self.turn)
+        yield from arm.go_above(start, self.turn)
+        self.showing = (0,)
+        yield from arm.take(start, self.turn)
         yield from arm.put((end[0], end[1], CUBE / 2 + 0.002))
 
     def use_hook(self, arm: Arm, start: Vector, end: Vector) -> Script:
         grip = 0.025  # m from the handle's end
         at = self.hook.point(grip, 0, 0.004)
-        yield from arm.pick(at)
+        yield from arm.go_above(at)
+        self.showing = (0,)
+        yield from arm.take(at)
         left = np.array([math.sin(self.turn), -math.cos(self.turn), 0.0])
         reach = HANDLE - 0.018 - grip - CUBE / 2  # from the grip to the cube's middle
         hold = (BESIDE * left) + (0, 0, at[2] + 0.003)

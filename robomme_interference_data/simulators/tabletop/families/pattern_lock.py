@@ -78,11 +78,16 @@ class PatternLock(StickFamily):
     def goals(self) -> tuple[str, ...]:
         return ("retrace the pattern with the stick, button by button in the same order",)
 
+    def told(self, answer: tuple[int, ...]) -> tuple[str, ...]:
+        return tuple(f"goes to button {number}" for number in answer)
+
     def solve(self, arm: Arm, answer: tuple[int, ...]) -> Script:
         yield from arm.move((*self.spots[answer[0]], HIGH))
-        for number in answer:
+        for part, number in enumerate(answer):
+            self.showing = (part,)
             yield from arm.move((*self.spots[number], TALL + ABOVE), speed=0.15)
             yield from arm.wait(8)
+        self.showing = ()
         yield from arm.move((*self.spots[answer[-1]], HIGH))
 
     def judge(self, arm: Arm, answer: tuple[int, ...]) -> Status:

@@ -19,6 +19,7 @@ COUNT, SPACING = 5, 0.105  # targets; m from one to the next, with a post in the
 RADIUS, POST, TALL = 0.024, 0.010, 0.07  # m
 ASIDE = 0.06  # m, how far from a post the stick goes round it
 FLAT = 0.003  # m, the height of a target
+_SIDES = {1: "far", -1: "near"}  # seen from the arm
 LOW, HIGH = FLAT + ABOVE, 0.13  # m, the stick's tip on the targets and above the posts
 
 
@@ -53,16 +54,30 @@ class RouteStick(StickFamily):
     def goals(self) -> tuple[str, ...]:
         return ("follow the same path round the posts with the stick as in the video",)
 
+    def told(self, answer: Route) -> tuple[str, ...]:
+        targets, sides = answer
+        turns = zip(pairwise(targets), sides, strict=True)
+        return (
+            f"starts on target {targets[0]}",
+            *(
+                f"goes round post {min(pair)} on the {_SIDES[side]} side to target {pair[1]}"
+                for pair, side in turns
+            ),
+        )
+
     def solve(self, arm: Arm, answer: Route) -> Script:
         targets, sides = answer
         yield from arm.move((*self.spots[targets[0]], HIGH))
+        self.showing = (0,)
         yield from arm.move((*self.spots[targets[0]], LOW), speed=0.15)
         yield from arm.wait(3)
         for (one, other), side in zip(pairwise(targets), sides, strict=True):
             x, y = self.posts[min(one, other)]
+            self.showing = (self.showing[0] + 1,)
             yield from arm.move((x + side * ASIDE, y, LOW), speed=0.15)
             yield from arm.move((*self.spots[other], LOW), speed=0.15)
             yield from arm.wait(3)
+        self.showing = ()
         yield from arm.move((*self.spots[targets[-1]], HIGH))
 
     def judge(self, arm: Arm, answer: Route) -> Status:

@@ -15,6 +15,7 @@ class VideoPlaceOrder(PlaceFamily):
     table = (0.30, 0.36, 0.52)
     paint = (0.95, 0.72, 0.15)
     colours_at = (1, 2, 2)
+    times = ORDINALS
     row_of_targets = 0.03
     bow = 0.04
 
@@ -31,14 +32,17 @@ class VideoPlaceOrder(PlaceFamily):
             f"put the {self.colours[0]} cube on the {ORDINALS[self.asked]} target it was placed on",
         )
 
-    def demonstrate(self, arm: Arm, answer: int) -> Script:
+    def way(self, answer: int) -> tuple[int, ...]:
         visits = [number for number in self.order if number != answer]
         visits.insert(self.asked, answer)
-        first = visits[:3]
+        return tuple(visits[:3])
+
+    def demonstrate(self, arm: Arm, answer: int) -> Script:
+        first = self.way(answer)
         # A second cube goes its own way round, clear of where the first one stays.
         second = [number for number in self.order if number != first[-1]][:3]
         yield from arm.wait(10)
-        for cube, way in zip(self.cubes, (first, second), strict=False):
-            for number in way:
-                yield from self.place(arm, cube, self.targets[number])
+        for cube, way in zip(range(len(self.cubes)), (first, second), strict=False):
+            for part, number in enumerate(way):
+                yield from self.place(arm, cube, number, part)
         yield from self.exchange_targets(arm)

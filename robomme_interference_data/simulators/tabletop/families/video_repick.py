@@ -3,16 +3,16 @@
 from numpy.random import RandomState
 
 from robomme_interference_data.records import Status
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import exchanges, push_down, row, swap
+from robomme_interference_data.simulators.tabletop.stage import push_down, row
 
 LIFTED = 0.06  # m, height of the cube's middle
 TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 
 
-class VideoRepick(Family):
+class VideoRepick(ExchangeFamily):
     """The arm picks one of several cubes; pick the same one again, n times, then press the button.
 
     Easy: three cubes, each of its own colour. Medium: five of the same colour. Hard: they change
@@ -21,16 +21,17 @@ class VideoRepick(Family):
 
     table = (0.26, 0.30, 0.34)
     cubes_at = (3, 5, 5)
-    gap = 0.055  # m, from the row to the lanes beside it
+    gap = 0.055
     button_at = (0.06, 0.0)
 
     def draw(self, rng: RandomState) -> None:
-        count = self.cubes_at[self.level]
+        self.count = count = self.cubes_at[self.level]
         self.spots = row(rng, count, -0.10, 0.09, zigzag=0.025)
         names = [str(name) for name in rng.permutation(["red", "green", "blue", "yellow"])]
         self.colours = names[:count] if self.level == 0 else [names[0]] * count
         self.times = int(rng.randint(1, 4))
-        self.swaps = exchanges(rng, count) if self.level == 2 else []
+        if self.level == 2:
+            self.draw_swaps(rng)
         self.answers = list(range(count))
         self.lifts, self.raised = 0, False
 
@@ -42,6 +43,9 @@ class VideoRepick(Family):
         times = TIMES[self.times - 1]
         return (f"pick up the same cube as in the video, {times}, then press the button",)
 
+    def told(self, answer: int) -> tuple[str, ...]:
+        return (f"lifts cube {answer}",)
+
     def demonstrate(self, arm: Arm, answer: int) -> Script:
         yield from arm.wait(5)
         yield from self.lift(arm, answer)
@@ -49,16 +53,17 @@ class VideoRepick(Family):
         for cube in self.cubes:
             cube.restore()
             cube.hold(True)
-        for pair in self.swaps:
-            yield from swap([[cube] for cube in self.cubes], pair, self.gap)
-            yield from arm.wait(5)
+        yield from self.exchange(arm, [[cube] for cube in self.cubes], 1)
 
     def lift(self, arm: Arm, number: int) -> Script:
         """Pick a cube up and put it down where it was."""
         at = self.cubes[number].p
-        yield from arm.pick(at)
+        yield from arm.go_above(at)
+        self.showing = (0,)
+        yield from arm.take(at)
         yield from arm.wait(5)
         yield from arm.put((at[0], at[1], CUBE / 2 + 0.002))
+        self.showing = ()
 
     def react(self, arm: Arm) -> None:
         self.pressed = push_down(self.button, arm)

@@ -1,7 +1,7 @@
 """VideoUnmask: remember which container hides a cube."""
 
 from collections.abc import Sequence
-from itertools import permutations, product
+from itertools import chain, islice, permutations, product
 
 from numpy.random import RandomState
 
@@ -12,6 +12,7 @@ from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
 
 HIGH = 0.72  # m, above what the cameras see
+FALL, SEEN = 55, 47  # time steps: of the containers' way down, and until they hide the cubes
 LIFTED = 0.05  # m, of the right container
 PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
 
@@ -53,6 +54,10 @@ class VideoUnmask(Family):
         rest = [number for number in self.order if number not in answer]
         return [*answer, *rest][: len(self.colours)]
 
+    def told(self, answer: Sequence[int]) -> tuple[str, ...]:
+        cubes = (f"the {c} cube at place {n}" for c, n in zip(self.asked, answer, strict=True))
+        return (f"shows {' and '.join(cubes)}",)
+
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
         self.under = dict(zip(self.covered(answer), self.cubes, strict=True))
         for number, cube in self.under.items():
@@ -62,13 +67,19 @@ class VideoUnmask(Family):
             body.hold(True)
         for shell in self.shells:
             shell.put(Place((*shell.home.p[:2], HIGH)))
-        yield from arm.wait(45)
-        ways = [along(shell, shell.home, 55) for shell in self.shells]
+        cover = self.cover()
+        self.showing = (0,)
+        yield from chain(arm.wait(45), islice(cover, SEEN))
+        self.showing = ()
+        yield from chain(cover, arm.wait(50))
+
+    def cover(self) -> Script:
+        """The containers come down."""
+        ways = [along(shell, shell.home, FALL) for shell in self.shells]
         for places in zip(*ways, strict=True):
             for shell, place in zip(self.shells, places, strict=True):
                 shell.put(place)
             yield
-        yield from arm.wait(50)
 
     def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
         for number in answer:

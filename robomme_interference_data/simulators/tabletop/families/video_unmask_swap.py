@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 from numpy.random import RandomState
 
+from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
 from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
 from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import exchanges, swap
 
 
-class VideoUnmaskSwap(VideoUnmask):
+class VideoUnmaskSwap(ExchangeFamily, VideoUnmask):
     """As VideoUnmask, then containers change places in pairs, once, twice or three times.
 
     Of three containers one stays, whatever it hides; of four and five each ends elsewhere.
@@ -20,14 +20,13 @@ class VideoUnmaskSwap(VideoUnmask):
 
     def draw(self, rng: RandomState) -> None:
         super().draw(rng)
-        self.swaps = exchanges(rng, len(self.spots))
+        self.count = len(self.spots)
+        self.draw_swaps(rng)
 
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
         yield from super().demonstrate(arm, answer)
         groups = [self.group(number) for number in range(len(self.shells))]
-        for pair in self.swaps:
-            yield from swap(groups, pair, self.gap)
-            yield from arm.wait(5)
+        yield from self.exchange(arm, groups, 1)
         yield from arm.wait(10)
 
     def group(self, number: int) -> list[Body]:

@@ -1,0 +1,87 @@
+"""Things that look alike and change places at the end of a demonstration."""
+
+from collections.abc import Collection, Iterable, Sequence
+from functools import cache
+from itertools import permutations
+from typing import Any, ClassVar
+
+from numpy.random import RandomState
+
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.kit import Body
+from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.stage import exchanges, shuffled, swap
+
+Pair = tuple[int, int]
+
+
+class ExchangeFamily(Family):
+    """A family whose answer is one of several things, or several of them, by their numbers.
+
+    They may change places in pairs once the answer was shown. Then each exchange is a part to be
+    seen: who missed one knows where a thing was, and not where it is.
+
+    Attributes:
+        count: How many things there are.
+        swaps: Those that change places, one pair after the other.
+    """
+
+    gap: ClassVar[float]
+    """From their row to the lanes beside it, in m."""
+
+    count: int
+    swaps: Sequence[Pair] = ()
+
+    def draw_swaps(self, rng: RandomState) -> None:
+        """Choose what changes places."""
+        self.swaps = exchanges(shuffled(rng, self.count))
+
+    def exchange(self, arm: Arm, groups: Sequence[Sequence[Body]], first: int) -> Script:
+        """Let groups of bodies change places; the first exchange is the part `first`."""
+        for part, pair in enumerate(self.swaps, first):
+            self.showing = (part,)
+            yield from swap(groups, pair, self.gap)
+            self.showing = ()
+            yield from arm.wait(5)
+
+    def parts(self, answer: Any) -> tuple[str, ...]:
+        """What is told of the answer, and then each exchange; see `Family.parts`."""
+        return (*self.told(answer), *(_words(way) for way in _ways(self.swaps)))
+
+    def agreeing(self, answer: Any, known: Collection[int]) -> list[Any]:
+        """The answers that may have ended where the right one did; see `Family.agreeing`."""
+        shown = len(self.told(answer))
+        way = _ways(self.swaps)
+        seen = [(step, one) for step, one in enumerate(way, shown) if step in known]
+        possible = _all_ways(self.count) if self.swaps else {way}
+        fits = [one for one in possible if all(one[step - shown] == pair for step, pair in seen)]
+        places = {_end(other, one) for other in super().agreeing(answer, known) for one in fits}
+        return [other for other in self.answers if _end(other, way) in places]
+
+
+def _ways(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
+    """Return at which places things are exchanged: what can be seen of those that look alike."""
+    at: dict[int, int] = {}
+    found = []
+    for one, other in swaps:
+        places = at.get(one, one), at.get(other, other)
+        at[other], at[one] = places
+        found.append((min(places), max(places)))
+    return tuple(found)
+
+
+@cache
+def _all_ways(count: int) -> frozenset[tuple[Pair, ...]]:
+    return frozenset(_ways(exchanges(order)) for order in permutations(range(count)))
+
+
+def _end(answer: Any, way: Iterable[Pair]) -> tuple[int, ...]:
+    """Return where the things of an answer end."""
+    places = [answer] if isinstance(answer, int) else list(answer)
+    for one, other in way:
+        places = [other if at == one else one if at == other else at for at in places]
+    return tuple(places)
+
+
+def _words(pair: Pair) -> str:
+    return f"those at places {pair[0]} and {pair[1]} change places"
