@@ -34,7 +34,7 @@ from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.video import iter_frames
 
 _RECORD = "record.json"
-_LAYOUT = 4
+_LAYOUT = 5
 """Version of a staged episode's folder."""
 
 Task = tuple[int, SourceEpisode]
@@ -168,7 +168,7 @@ class StageTask:
             exact=recording.exact and codec.exact,
             feature_sha256=session,
             span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
-            evidence=None if lesson is None else recording.evidence,
+            evidence=None if start is None else recording.evidence,
         )
         stats = {
             feature: {name: tuple(map(float, values)) for name, values in one.result().items()}

@@ -20,6 +20,7 @@ from robomme_interference_data.build_dataset.sources.base import (
 )
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.simulators.base import choose_cameras
 
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
@@ -68,10 +69,12 @@ class SampleSource(Source):
         scene = _Scene(name, number, self._size)
         short = (number, name.split, name.index) == (0, "train", 1)
         chosen = choose_cameras(cameras)
-        frames = scene.frames(_SHORT if short else _FRAMES, 48 + 16 * (name.index % 2), chosen)
+        lesson = 48 + 16 * (name.index % 2)
+        frames = scene.frames(_SHORT if short else _FRAMES, lesson, chosen)
         goal = f"watch the video carefully, then do the {name.family} task again"
         difficulty = DIFFICULTIES[name.index % 3]
-        return Recording((goal,), scene.seed, difficulty, "sample", True, frames)
+        told = (goal,), scene.seed, difficulty, "sample"
+        return Recording(*told, True, frames, scene.evidence(lesson))
 
 
 class _Scene:
@@ -96,6 +99,13 @@ class _Scene:
         for step in range(length):
             images = {camera: getattr(self, camera)(step) for camera in cameras}
             yield Frame(images, self.state(step), self.state(step + 1), step < lesson)
+
+    def evidence(self, lesson: int) -> tuple[EvidenceSpan, ...]:
+        """Return when the gripper leaves the left edge, and turns at the right one."""
+        turn = self._periods[0] // 2
+        shown = ("leaves the left edge", 0, 4), ("turns at the right edge", turn - 4, turn + 4)
+        spans = (EvidenceSpan(part, *span) for part, span in enumerate(shown))
+        return tuple(span for span in spans if span.stop <= lesson)
 
     def _gripper(self, step: int) -> tuple[int, int]:
         """Column and row of the gripper at a step."""

@@ -1,8 +1,12 @@
 """Grades and cells against values worked out by hand, wherever the lesson lies."""
 
+from dataclasses import replace
+
 import pytest
 from support.retrieval import made
 
+from robomme_interference_data.evidence import place_evidence
+from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.retrieval.grade import ALL, Grade, cells, grade, verdict
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.stats import wilson
@@ -27,6 +31,7 @@ def test_a_grade_by_hand() -> None:
         hit=True,
         purity=2 / 5,
         coverage=2 / 6,
+        evidence_kept=None,
         false_sessions=1,
         true_cuts=2,  # before 6 and before 11; found are those before 4, 9 and 11
         found_cuts=1,
@@ -34,6 +39,16 @@ def test_a_grade_by_hand() -> None:
     )
     last = grade(one, Rule("last", 0.5))
     assert (last.start, last.stop, last.hit, last.purity, last.coverage) == (11, 15, False, 0, 0)
+
+
+def test_evidence_counts_where_a_frame_of_it_was_chosen() -> None:
+    one = made(cuts={4: 0.1, 9: 0.1, 11: 0.1}, high={7: 0.9})  # chosen are 4 to 8
+    spans = (EvidenceSpan(0, "first", 0, 4), EvidenceSpan(1, "then", 3, 5))
+    known = replace(one, evidence=place_evidence(one.sessions[:1], lambda entry: spans))
+    grades = [grade(known, MAX), grade(one, MAX)]
+    assert [found.evidence_kept for found in grades] == [0.5, None]
+    [*_, both], [*_, none] = cells(grades), cells(grades[1:])
+    assert (both.evidence_kept, none.evidence_kept) == (0.5, None)  # of those of which it is known
 
 
 @pytest.mark.parametrize(

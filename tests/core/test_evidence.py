@@ -1,0 +1,155 @@
+"""Evidence: its spans, where they lie in a buffer, and how much of it a sample holds."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.made_up import record
+from support.retrieval import remade
+from support.splits import LESSON, QUERIES
+
+from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load_split
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.evidence import (
+    Evidence,
+    place_evidence,
+    spans_of_parts,
+    spans_of_texts,
+)
+from robomme_interference_data.records import EvidenceSpan, place_sessions
+from robomme_interference_data.rows import from_dict, to_dict
+from robomme_interference_data.sampling import MEMORIES, evidence_kept, kept_frames
+
+ENTRY = SessionEntry(
+    "lesson", "MoveCube", EpisodeId("MoveCube", "test", 0), "demonstrations", "r", 0, 0, 20, 1, "s"
+)
+FIRST, THEN = EvidenceSpan(0, "takes peg 2", 2, 10), EvidenceSpan(1, "from the left", 8, 20)
+
+
+def placed(
+    *entries: SessionEntry, spans: Sequence[EvidenceSpan] = (FIRST, THEN)
+) -> tuple[Evidence, ...]:
+    known = {"demonstrations": spans}
+    found = place_evidence(place_sessions(entries), lambda entry: known.get(entry.dataset))
+    assert found is not None
+    return found
+
+
+def places(evidence: Sequence[Evidence]) -> list[tuple[int, int, int]]:
+    return [(one.span.part, one.start, one.stop) for one in evidence]
+
+
+# --- spans ---------------------------------------------------------------------------------------
+
+
+def test_spans_of_parts_are_the_frames_that_show_each() -> None:
+    shown = [(), (0,), (0, 1), (1,), (), (1,)]
+    assert spans_of_parts(shown, ("takes it", "turns it")) == (
+        EvidenceSpan(0, "takes it", 1, 3),
+        EvidenceSpan(1, "turns it", 2, 4),
+        EvidenceSpan(1, "turns it", 5, 6),
+    )
+
+
+def test_a_run_of_equal_texts_is_a_part() -> None:
+    texts = ["", "pick up the peg", "pick up the peg ", "static", "hook it", "pick up the peg"]
+    assert spans_of_texts(texts) == (
+        EvidenceSpan(0, "pick up the peg", 1, 3),
+        EvidenceSpan(1, "hook it", 4, 5),
+        EvidenceSpan(2, "pick up the peg", 5, 6),
+    )
+    assert spans_of_texts(["static"] * 3) is None  # says nothing of the answer
+    assert spans_of_texts([]) is None
+
+
+@pytest.mark.parametrize(
+    "span",
+    [(-1, "a", 0, 1), (1 << 20, "a", 0, 1), (0, "", 0, 1), (0, "a" * 2000, 0, 1), (0, "a", 3, 3)],
+)
+def test_what_is_no_span(span: tuple[int, str, int, int]) -> None:
+    with pytest.raises(FormatError, match="evidence of part"):
+        EvidenceSpan(*span)
+
+
+def test_a_record_keeps_its_evidence_inside_the_lesson() -> None:
+    known = record("demonstrations", "MoveCube/test/0", evidence=(FIRST, THEN))  # of 20 frames
+    assert from_dict(type(known), to_dict(known), "here") == known
+    unknown = record("demonstrations", "MoveCube/test/0")
+    assert from_dict(type(known), to_dict(unknown), "here").evidence is None
+    with pytest.raises(FormatError, match=r"evidence in frames \[20, 21\) of a lesson of 20"):
+        record("demonstrations", "MoveCube/test/0", evidence=(EvidenceSpan(0, "a", 20, 21),))
+    with pytest.raises(FormatError, match="none in a unit"):
+        record("distractors", "MoveCube/train/0", evidence=())
+
+
+# --- in a buffer ---------------------------------------------------------------------------------
+
+
+def test_evidence_lies_where_its_frames_do() -> None:
+    unit = replace(ENTRY, role="distractor", dataset="distractors", stop=5)
+    first, second = replace(ENTRY, stop=9), replace(ENTRY, start=9)
+    held = replace(ENTRY, role="filler", start=19, repeat=32)
+    assert places(placed(ENTRY)) == [(0, 2, 10), (1, 8, 20)]
+    assert places(placed(unit, ENTRY)) == [(0, 7, 15), (1, 13, 25)]
+    halves = placed(first, unit, second)  # the second half is frames 14 to 24
+    assert places(halves) == [(0, 2, 9), (1, 8, 9), (0, 14, 15), (1, 14, 25)]
+    assert [one.session.start for one in halves] == [0, 0, 14, 14]
+    assert places(placed(ENTRY, held)) == [(0, 2, 10), (1, 8, 20), (1, 20, 52)]
+    assert placed(unit) == ()
+
+
+@pytest.mark.parametrize("role", ["lesson", "contradiction"])
+def test_evidence_of_a_lesson_may_be_unknown(role: str) -> None:
+    unknown = replace(ENTRY, role=role, dataset="contradictions")
+    known = {"demonstrations": (FIRST,)}
+    sessions = place_sessions([ENTRY, unknown])
+    assert place_evidence(sessions, lambda entry: known.get(entry.dataset)) is None
+
+
+def test_a_buffer_tells_its_evidence(tiny_split: Path) -> None:
+    """The source `sample`: VideoRepick's gripper turns after 20 steps."""
+    opened = load_split(tiny_split)
+    [lesson] = opened.manifest(QUERIES[0], "k0").sessions
+    whole = load_buffer(QUERIES[0], "k3", split=tiny_split)
+    assert whole.evidence is not None
+    assert [(one.span.text, one.start, one.stop) for one in whole.evidence] == [
+        ("leaves the left edge", 0, 4),
+        ("turns at the right edge", 16, 24),
+    ]
+    parts = replace(lesson, stop=20), replace(lesson, start=20)
+    parted = remade(tiny_split, (parts[1], parts[0]))
+    assert parted.evidence is not None
+    turned = LESSON - 20
+    assert places(parted.evidence) == [(1, 0, 4), (0, turned, turned + 4), (1, turned + 16, LESSON)]
+    nothing = load_buffer(QUERIES[0], "no-history", split=tiny_split)
+    assert nothing.evidence == ()
+
+
+# --- kept ----------------------------------------------------------------------------------------
+
+
+def test_evidence_kept_by_hand() -> None:
+    evidence = placed(ENTRY)
+    assert evidence_kept(evidence, [1]) == 0
+    assert evidence_kept(evidence, [1, 2]) == 0.5
+    assert evidence_kept(evidence, [9]) == 1
+    assert evidence_kept((), [9]) is None
+    halves = placed(replace(ENTRY, stop=9), replace(ENTRY, start=9))
+    assert evidence_kept(halves, [3]) == 0.5  # a span in two halves counts once
+    wrong = replace(ENTRY, role="contradiction")
+    assert evidence_kept(placed(wrong, ENTRY), range(20)) == 0  # the lesson begins at 20
+    assert evidence_kept(placed(wrong), range(20)) is None
+
+
+def test_what_a_memory_keeps_of_a_span() -> None:
+    assert kept_frames("window", 10, 110) == list(range(79, 110))  # 32 with the live one
+    assert kept_frames("framesamp", 10, 320) == list(range(10, 320, 10))
+    assert kept_frames("full", 10, 13) == [10, 11, 12]
+
+
+@given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 30))
+def test_the_first_steps_keep_everything(memory: str, frames: int) -> None:
+    assert kept_frames(memory, 5, 5 + frames) == list(range(5, 5 + frames))

@@ -1,0 +1,98 @@
+"""What the suite's demonstrations show of the hidden answer, and what follows from a part of it."""
+
+from itertools import combinations
+from typing import Any
+
+import pytest
+from numpy.random import RandomState
+
+from robomme_interference_data.constants import FAMILIES
+
+pytest.importorskip("mani_skill", reason="needs the extra sim")
+
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
+from robomme_interference_data.simulators.tabletop.families import family_class
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+
+def drawn(family: str, index: int, split: str = "test") -> Any:
+    seed = seed_of(EpisodeId(family, split, index))
+    return family_class(family)(difficulty_of(seed), RandomState(seed))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_more_is_known_the_fewer_answers_agree(family: str) -> None:
+    """Exact at both ends, and the right one always among them."""
+    for index in range(12):
+        scene = drawn(family, index)
+        answer = scene.answers[7 * index % len(scene.answers)]
+        parts = range(len(scene.parts(answer)))
+        assert parts
+        assert scene.agreeing(answer, set()) == list(scene.answers)
+        assert scene.agreeing(answer, {*parts}) == [answer]
+        agreeing = {
+            frozenset(known): set(scene.agreeing(answer, known))
+            for count in range(len(parts) + 1)
+            for known in combinations(parts, count)
+        }
+        for known, found in agreeing.items():
+            assert answer in found
+            for more in parts:
+                assert agreeing[known | {more}] <= found
+
+
+@pytest.mark.parametrize(
+    ("family", "index", "known", "left"),
+    [
+        ("VideoRepick", 0, {0}, 1),
+        ("VideoRepick", 2, {0}, 4),  # each of five cubes ends elsewhere
+        ("VideoRepick", 2, {1, 2, 3}, 5),  # whose way is known, but not which one was lifted
+        ("VideoPlaceOrder", 0, {0, 1}, 1),  # of three targets the third is left
+        ("VideoPlaceButton", 1, {0}, 3),  # of four targets: asked is the other one
+        ("VideoUnmaskSwap", 1, {0}, 3),
+        ("MoveCube", 0, set(), 3),
+        ("InsertPeg", 0, {0}, 4),
+        ("InsertPeg", 0, {1, 2}, 2),
+        ("RouteStick", 0, {1, 2}, 1),  # where it starts follows from its first turn
+    ],
+)
+def test_what_is_left_to_guess(family: str, index: int, known: set[int], left: int) -> None:
+    """Counted by hand; `index` of the first easy, medium and hard test episode is 0, 1 and 2."""
+    scene = drawn(family, index)
+    for answer in scene.answers[:5]:
+        if family != "RouteStick" or len(set(answer[0])) == len(answer[0]):
+            assert len(scene.agreeing(answer, known)) == left
+
+
+def test_a_path_goes_on_to_a_neighbour() -> None:
+    """A corner of the grid has three."""
+    scene = drawn("PatternLock", 0)
+    answer = next(one for one in scene.answers if one[:2] == (0, 1))
+    assert scene.parts(answer)[:2] == ("goes to button 0", "goes to button 1")
+    first = scene.agreeing(answer, {0})
+    assert {one[1] for one in first} == {1, 4, 5} and {one[0] for one in first} == {0}
+
+
+@pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_part_is_shown_in_the_lesson(
+    blind: TabletopSimulator, family: str, index: int
+) -> None:
+    lesson, _, _ = blind.reset(f"{family}/test/{index}", demonstration=False)
+    parts = blind.env.episode.parts(blind.env.answer)
+    assert lesson.evidence is not None
+    assert {(span.part, span.text) for span in lesson.evidence} == {*enumerate(parts)}
+    assert all(span.stop <= len(lesson) for span in lesson.evidence)
+    for one, other in combinations(lesson.evidence, 2):  # in the order in which they are shown
+        assert one.part < other.part and one.start <= other.start
+
+
+def test_evidence_is_the_act_itself(blind: TabletopSimulator) -> None:
+    """A cube is lifted while, and only while, the lesson shows it."""
+    lesson, _, _ = blind.reset("VideoRepick/test/0", demonstration=False)
+    [span] = lesson.evidence or ()
+    closed = (lesson.states[:, 7] < 0.025).nonzero()[0]
+    assert span.text == "lifts cube 2"
+    assert span.start < closed.min() and closed.max() < span.stop
+    assert span.start > 0 and span.stop < len(lesson)
