@@ -16,6 +16,7 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     SourceError,
 )
+from robomme_interference_data.records import EvidenceSpan
 
 h5py = pytest.importorskip("h5py")
 
@@ -80,6 +81,21 @@ def test_seed_difficulty_and_a_camera_may_be_missing(path: Path) -> None:
     recording = read(path)
     assert (recording.seed, recording.difficulty) == (None, None)
     assert {tuple(frame.images) for frame in recording.frames} == {("front",)}
+
+
+def test_subgoals_of_the_demonstration_are_evidence(path: Path) -> None:
+    assert read(path).evidence is None  # there are none
+    said = ["static", "pick up the peg", "pick up the peg", "hook it", "hook it", "hook it"]
+    for name in ("grounded_subgoal", "simple_subgoal"):  # the second one counts
+        with h5py.File(path, "r+") as file:
+            for step, text in enumerate(said):
+                file[f"episode_0/timestep_{step}/info/{name}"] = (
+                    text if name[0] == "s" else f"{text} at <1, 2>"
+                )
+    assert read(path).evidence == (  # five frames are of the demonstration
+        EvidenceSpan(0, "pick up the peg", 1, 3),
+        EvidenceSpan(1, "hook it", 3, 5),
+    )
 
 
 # --- refusals ------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from robomme_interference_data.errors import (
     SourceError,
     UnknownNameError,
 )
+from robomme_interference_data.records import EvidenceSpan
 
 VERSIONS = ("v3.0", "v2.1")
 NAME = "MoveCube/train/0"
@@ -186,6 +187,36 @@ def test_marks(tmp_path: Path, columns: Any, lesson: int | str) -> None:
         return
     with pytest.raises((SourceError, FormatError), match=lesson):
         read(root)
+
+
+# --- evidence ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("column", ["simple_subgoal", "grounded_subgoal"])
+def test_subgoals_of_the_demonstration_are_evidence(tmp_path: Path, column: str) -> None:
+    root = write_lerobot(tmp_path, one(make_episode(1, 6, MOVE, 4)))
+    assert read(root).evidence is None
+    edit_columns(root / DATA, **{column: [None, "hook it", "hook it", "put it", "put it", "done"]})
+    assert read(root).evidence is None  # no column that info.json tells
+    told = {column: {"dtype": "string", "shape": [1]}}
+    edit_info(root, lambda info: info["features"].update(told))
+    assert read(root).evidence == (
+        EvidenceSpan(0, "hook it", 1, 3),
+        EvidenceSpan(1, "put it", 3, 4),  # cut by the end of the lesson
+    )
+    edit_columns(root / DATA, **{column: None})
+    edit_columns(root / DATA, **{column: [1] * 6})
+    with pytest.raises(FormatError, match=r"is of type int64; expected texts"):
+        read(root)
+
+
+def test_evidence_of_this_projects_datasets_goes_before_subgoals(tmp_path: Path) -> None:
+    spans = [{"part": 0, "text": "hooks it", "start": 0, "stop": 2}]
+    root = write_lerobot(tmp_path, one(), evidence=[spans])
+    assert read(root).evidence == (EvidenceSpan(0, "hooks it", 0, 2),)
+    other = write_lerobot(tmp_path / "other", one(), evidence=[[spans[0] | {"stop": 0}]])
+    with pytest.raises(FormatError, match="evidence of part 0"):
+        read(other)
 
 
 # --- refusals ------------------------------------------------------------------------------------

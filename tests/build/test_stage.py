@@ -28,9 +28,9 @@ from robomme_interference_data.constants import (
     RAW_DISTRACTORS,
 )
 from robomme_interference_data.digest import combine
-from robomme_interference_data.errors import BuildError, SourceError
+from robomme_interference_data.errors import BuildError, FormatError, SourceError
 from robomme_interference_data.execution import Worker
-from robomme_interference_data.records import SpanDigests
+from robomme_interference_data.records import EvidenceSpan, SpanDigests
 from robomme_interference_data.video import iter_frames
 
 NAME = "MoveCube/test/0"
@@ -55,6 +55,21 @@ def staged(
 def stored(folder: Path, source: MadeUpSource, **options: Any) -> StoredEpisode:
     made, place = staged(folder, source, **options)
     return made.stored(place)
+
+
+@pytest.mark.parametrize("kind", ["demonstrations", "distractors"])
+def test_evidence_is_of_a_lesson(tmp_path: Path, kind: str) -> None:
+    shown = (EvidenceSpan(0, "lifts cube 2", 5, 20),)
+    source = MadeUpSource({NAME: (260, 20)}, evidence=shown)
+    made, place = staged(tmp_path, source, kind)
+    assert made.record is not None and read_staged(place) == made
+    assert made.record.evidence == (shown if kind == "demonstrations" else None)
+
+
+def test_evidence_outside_the_lesson_is_refused(tmp_path: Path) -> None:
+    source = MadeUpSource({NAME: (40, 20)}, evidence=(EvidenceSpan(0, "lifts it", 5, 21),))
+    with pytest.raises(FormatError, match="of a lesson of 20"):
+        staged(tmp_path, source)
 
 
 def test_a_demonstration(tmp_path: Path) -> None:

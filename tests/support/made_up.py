@@ -20,7 +20,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.files import LocalFiles, write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord, SpanDigests
+from robomme_interference_data.records import EpisodeRecord, EvidenceSpan, SpanDigests
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 from robomme_interference_data.simulators.base import choose_cameras
 
@@ -82,12 +82,14 @@ class MadeUpSource(Source):
         lengths: Frames of each episode, of them demonstration: `{"MoveCube/test/0": (20, 5)}`.
         wrong: Of an episode, frame number to what is returned in its place, or raised.
         actions: Whether frames have actions.
+        evidence: What every episode says that it shows.
     """
 
     lengths: dict[str, tuple[int, int | None]]
     wrong: dict[str, dict[int, Any]] = field(default_factory=dict)
     actions: bool = True
     cameras: tuple[str, ...] = ("front",)
+    evidence: tuple[EvidenceSpan, ...] | None = None
     provenance: dict[str, Any] = field(default_factory=lambda: {"kind": "made-up"})
 
     def episodes(self) -> list[SourceEpisode]:
@@ -99,7 +101,8 @@ class MadeUpSource(Source):
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         chosen = choose_cameras(cameras, self.cameras)
         frames = self._frames(str(episode.id), chosen)
-        return Recording((f"do {episode.id}",), 7, "easy", "made-up", True, frames)
+        told = (f"do {episode.id}",), 7, "easy", "made-up"
+        return Recording(*told, True, frames, self.evidence)
 
     def _frames(self, name: str, cameras: tuple[str, ...]) -> Generator[Frame]:
         length, lesson = self.lengths[name]
