@@ -1,13 +1,13 @@
 """Things that look alike and change places at the end of a demonstration."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from itertools import permutations
 from typing import Any, ClassVar
 
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.family import Family, narrowed
 from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import exchanges, shuffled, swap
@@ -46,17 +46,16 @@ class ExchangeFamily(Family):
 
     def parts(self, answer: Any) -> tuple[str, ...]:
         """What is told of the answer, and then each exchange; see `Family.parts`."""
-        return (*self.told(answer), *(_words(way) for way in _ways(self.swaps)))
+        return (*self.told(answer), *_words(_ways(self.swaps)))
 
-    def agreeing(self, answer: Any, known: Collection[int]) -> list[Any]:
+    def agreeing(self, known: Mapping[int, str]) -> list[Any]:
         """The answers that may have ended where the right one did; see `Family.agreeing`."""
-        shown = len(self.told(answer))
         way = _ways(self.swaps)
-        seen = [(step, one) for step, one in enumerate(way, shown) if step in known]
-        possible = _all_ways(self.count) if self.swaps else {way}
-        fits = [one for one in possible if all(one[step - shown] == pair for step, pair in seen)]
-        places = {_end(other, one) for other in super().agreeing(answer, known) for one in fits}
-        return [other for other in self.answers if _end(other, way) in places]
+        possible = _all_ways(self.count) if self.swaps else {way: ()}
+        shown = len(self.told(self.answers[0]))
+        fits = narrowed([*possible.items()], known, shown)
+        places = {_end(answer, one) for answer in super().agreeing(known) for one in fits}
+        return [answer for answer in self.answers if _end(answer, way) in places]
 
 
 def _ways(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
@@ -71,8 +70,10 @@ def _ways(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
 
 
 @cache
-def _all_ways(count: int) -> frozenset[tuple[Pair, ...]]:
-    return frozenset(_ways(exchanges(order)) for order in permutations(range(count)))
+def _all_ways(count: int) -> dict[tuple[Pair, ...], tuple[str, ...]]:
+    """Return every way in which so many things may change places, and the same in words."""
+    ways = (_ways(exchanges(order)) for order in permutations(range(count)))
+    return {way: _words(way) for way in ways}
 
 
 def _end(answer: Any, way: Iterable[Pair]) -> tuple[int, ...]:
@@ -83,5 +84,5 @@ def _end(answer: Any, way: Iterable[Pair]) -> tuple[int, ...]:
     return tuple(places)
 
 
-def _words(pair: Pair) -> str:
-    return f"those at places {pair[0]} and {pair[1]} change places"
+def _words(way: Iterable[Pair]) -> tuple[str, ...]:
+    return tuple(f"those at places {one} and {other} change places" for one, other in way)

@@ -1,7 +1,8 @@
 """What a task family is: a scene, a hidden answer, a script that shows it, and a judge."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 from numpy.random import RandomState
@@ -62,30 +63,29 @@ class Family(ABC):
         """The parts of an answer in words, in the order in which the demonstration shows them."""
 
     def parts(self, answer: Any) -> tuple[str, ...]:
-        """All parts of a demonstration that must be seen to know the answer, in words, in order."""
+        """All that must be seen of a demonstration to know the answer, in words, in order."""
         return self.told(answer)
 
     def lessons(self) -> Iterable[tuple[Any, tuple[str, ...]]]:
         """Every answer with what is told of it; several times, if in several ways."""
         return ((answer, self.told(answer)) for answer in self.answers)
 
-    def agreeing(self, answer: Any, known: Collection[int]) -> list[Any]:
+    def agreeing(self, known: Mapping[int, str]) -> list[Any]:
         """The answers that somebody cannot rule out who has seen some parts of a demonstration.
 
-        The more is known, the fewer they are: from all of them down to the one that was shown,
-        which is always among them.
+        The more is known of one, the fewer they are: from all answers down to the one that was
+        shown, which is always among them. Parts of several demonstrations may contradict each
+        other: then those that come first are believed.
 
         Args:
-            answer: The answer that was shown.
-            known: Numbers of the parts that were seen.
+            known: What was seen: the number of a part, and the part in words.
         """
-        seen = [(part, text) for part, text in enumerate(self.told(answer)) if part in known]
-        fits = {
-            other
-            for other, told in self.lessons()
-            if all(told[part] == text for part, text in seen)
-        }
-        return [other for other in self.answers if other in fits]
+        fits = set(narrowed(self._told, known))
+        return [answer for answer in self.answers if answer in fits]
+
+    @cached_property
+    def _told(self) -> list[tuple[Any, tuple[str, ...]]]:
+        return list(self.lessons())
 
     @abstractmethod
     def demonstrate(self, arm: Arm, answer: Any) -> Script:
@@ -101,3 +101,21 @@ class Family(ABC):
     @abstractmethod
     def judge(self, arm: Arm, answer: Any) -> Status:
         """Say how the episode stands after a live step."""
+
+
+def narrowed[T](
+    told: Sequence[tuple[T, tuple[str, ...]]], known: Mapping[int, str], first: int = 0
+) -> list[T]:
+    """Return those that agree with what is known, passing over what none of them would.
+
+    Args:
+        told: What is possible, each with its parts in words.
+        known: Parts by number, in words.
+        first: Number of the first of these parts.
+    """
+    left = told
+    for part, text in known.items():
+        if part >= first:
+            place, wanted = slice(part - first, part - first + 1), (text,)
+            left = [one for one in left if one[1][place] == wanted] or left
+    return [one for one, _ in left]
