@@ -153,9 +153,17 @@ def check_plan(
         if (refusal := _refusal(system, policy, name)) is not None:
             raise refusal
         split.manifest(split.episode_ids[0], name)  # is refused with what there is
+    recalls = parse_policy(config.policy).kind == "recall"
     own = ":" in config.simulator  # a simulator of one's own may serve any episodes
     for episode in dict.fromkeys(item.episode for item in items):
-        recorded = split.query(episode).simulator
+        record = split.query(episode).record
+        if recalls and record.evidence is None:
+            raise InvalidOptionError(
+                f"{config.policy} needs to know which frames show the answer, and of {episode} "
+                "this is unknown",
+                "Build the demonstrations from a source with evidence: see docs/sources.md.",
+            )
+        recorded = record.simulator
         if not own and recorded not in (None, config.simulator):
             raise InvalidOptionError(
                 f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",

@@ -1,4 +1,4 @@
-"""The commands of rollouts: `evaluate` and `merge`."""
+"""The commands of rollouts: `ceiling`, `evaluate` and `merge`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,14 +7,43 @@ import typer
 
 from robomme_interference_data.console import (
     AsJson,
+    SplitFolder,
     check_output,
     command_line,
     print_json,
     say,
     stoppable,
 )
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.config import CeilingConfig, RunConfig
 from robomme_interference_data.settings import with_settings
+
+
+@with_settings
+def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
+    """Tell what a memory keeps of the answers, before anybody has rolled out anything.
+
+    The share of the evidence that is kept, and, on tabletop, how often the ideal observer
+    succeeds: no policy with that memory can do better.
+
+    Examples:
+    ```
+    robomme-interference ceiling my-split --memory window
+    robomme-interference ceiling my-split --retrieval thumbnail --conditions k0 k7
+    ```
+    """
+    from robomme_interference_data.evaluate import ceiling as module
+    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.rows import to_dict
+
+    opened = load_split(split)
+    cells = module.ceiling(opened, config)
+    if as_json:
+        print_json([to_dict(cell) for cell in cells])
+        return
+    title = f"Ceiling on {opened.name}, memory {config.memory}"
+    if config.retrieval is not None:
+        title += f", behind retrieval {config.retrieval}, rule {config.retrieval_rule}"
+    typer.echo(module.ceiling_table(cells, title).text())
 
 
 @with_settings

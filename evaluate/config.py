@@ -16,8 +16,9 @@ class RunConfig:
     """What to roll out, and how."""
 
     policy: str = setting(
-        help="replay, replay:framesamp, replay:window, oracle, guess, hold, websocket://HOST:PORT "
-        "(several with commas), lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
+        help="replay, recall (both also with :framesamp or :window), oracle, guess, hold, "
+        "websocket://HOST:PORT (several with commas), lerobot:REPO[@REVISION], lerobot:FOLDER or "
+        "python:module:factory."
     )
     split: Path = setting(help="Folder of the split of buffers.")
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
@@ -64,6 +65,21 @@ class RunConfig:
     history_chunk: int = setting(64, help="Frames of history handed over at a time.", metavar="N")
     max_errors: int = setting(10, help="Errors in a row after which the run stops.", metavar="N")
     no_resume: bool = setting(False, help="Refuse a folder that holds a run already.")
+
+
+@dataclass(frozen=True)
+class CeilingConfig:
+    """Of which memory a ceiling is, and of which buffers."""
+
+    memory: str = setting("framesamp", help="full, framesamp or window.")
+    conditions: tuple[str, ...] = setting((), help="Conditions; by default all that are planned.")
+    retrieval: str | None = setting(
+        None, help="Put a retrieval step with this encoder in front of the memory."
+    )
+    retrieval_rule: str = setting("max", help="METHOD or METHOD/CUT, as for retrieval-score.")
+    retrieval_camera: str = setting(
+        "front", help="Camera whose frames the retrieval step compares."
+    )
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,13 @@ from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.systems import check_history, name_system
+from robomme_interference_data.evidence import Evidence, counted_from
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.sampling import (
+    MEMORIES,
     even_sample,
     evidence_kept,
-    kept_frames,
     lesson_frames,
     lesson_share,
 )
@@ -100,8 +101,9 @@ def run_rollout(
         with clock.part("history_s"):
             if history is None:
                 history = stack.enter_context(_decode(buffer, start, stop, policy, run))
-            own = simulator if policy.privileged else None
-            policy.reset(RolloutInfo(info.goal, stop - start, config.model_seed, own))
+            evidence = buffer.evidence and counted_from(buffer.evidence, start)
+            own = (simulator, evidence) if policy.privileged else ()
+            policy.reset(RolloutInfo(info.goal, stop - start, config.model_seed, *own))
             for chunk in history:
                 policy.add_history(chunk.frames, chunk.states, stop - start)
     status, steps = _act(run, policy, simulator, first, info.goal, clock, clip, worker)
@@ -119,7 +121,7 @@ def run_rollout(
         history_frames=stop - start,
         lesson_frames=lesson_frames(buffer.sessions, start, stop),
         lesson_share=lesson_share(buffer.sessions, start, stop) if stop > start else None,
-        evidence_kept=_evidence_kept(run.system, buffer, start, stop),
+        evidence_kept=_evidence_kept(run.system, evidence, stop - start),
         **_retrieval_columns(selector, buffer, start, stop),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
@@ -182,12 +184,14 @@ def _retrieval_columns(
     return columns
 
 
-def _evidence_kept(system: str, buffer: Buffer, start: int, stop: int) -> float | None:
-    """Return the share of the evidence that the memory of a system holds of a span of a buffer."""
+def _evidence_kept(
+    system: str, evidence: tuple[Evidence, ...] | None, history_frames: int
+) -> float | None:
+    """Return the share of the evidence that the memory of a system holds at the first step."""
     memory = name_system(system).sampling
-    if memory is None or buffer.evidence is None:
+    if memory is None or evidence is None:
         return None
-    return evidence_kept(buffer.evidence, kept_frames(memory, start, stop))
+    return evidence_kept(evidence, MEMORIES[memory](history_frames))
 
 
 def _decode(

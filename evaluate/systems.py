@@ -37,8 +37,8 @@ class System:
             it keeps none.
         position_limit: History and live frames together that the memory holds; None: no limit.
         paper: Whether the paper reports it.
-        bound: Whether it uses no memory at all, and only shows what can be reached with the
-            answer, by chance, or by standing still: such a system is never ranked.
+        bound: Whether it only shows what can be reached: with the answer, with what a memory shows
+            of it, by chance, or by standing still. Such a system is never ranked.
     """
 
     name: str
@@ -96,7 +96,7 @@ PAPER_SYSTEMS: tuple[System, ...] = (
 _KEPT = {"Full": "all frames", "FrameSamp": "frames", "Window": "last frames"}
 
 
-def _control(kind: str, *, retrieval: bool) -> tuple[System, ...]:
+def _control(kind: str, *, retrieval: bool, bound: bool = False) -> tuple[System, ...]:
     """A control with each memory rule."""
     name = f"Retrieval-{kind}" if retrieval else kind
     return tuple(
@@ -104,6 +104,7 @@ def _control(kind: str, *, retrieval: bool) -> tuple[System, ...]:
             *(f"{name}-{rule}".lower(), f"{name}-{rule}", frames),
             retrieval=retrieval,
             sampling=rule.lower(),
+            bound=bound,
         )
         for rule, frames in _KEPT.items()
     )
@@ -113,6 +114,8 @@ _CONTROLS = (
     *(System(name.lower(), name, "none", bound=True) for name in ("Oracle", "Guess", "Hold")),
     *_control("Replay", retrieval=False),
     *_control("Replay", retrieval=True),
+    *_control("Recall", retrieval=False, bound=True),
+    *_control("Recall", retrieval=True, bound=True),
 )
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}

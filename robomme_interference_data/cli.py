@@ -80,7 +80,11 @@ _GROUPS = {
         ("retrieval-score", retrieving.retrieval_score),
         ("calibrate", retrieving.calibrate),
     ),
-    "Rollouts": (("evaluate", evaluating.evaluate), ("merge", evaluating.merge)),
+    "Rollouts": (
+        ("ceiling", evaluating.ceiling),
+        ("evaluate", evaluating.evaluate),
+        ("merge", evaluating.merge),
+    ),
     "Scores": (("score", scoring.score), ("compare", scoring.compare)),
     "Publish": (
         ("card", publishing.card),

@@ -4,8 +4,8 @@ A span is recorded with its episode; where no source says what a frame shows, ev
 (None), never guessed.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
@@ -95,6 +95,27 @@ def place_evidence(
                 )
                 placed.append(Evidence(first, last, session, span))
     return tuple(placed)
+
+
+def counted_from(evidence: Iterable[Evidence], start: int) -> tuple[Evidence, ...]:
+    """Return evidence as counted from a frame of the buffer on; what is before is negative."""
+    return tuple(replace(one, start=one.start - start, stop=one.stop - start) for one in evidence)
+
+
+def known_parts(evidence: Sequence[Evidence], kept: Collection[int]) -> dict[int, str]:
+    """Return the parts of the answer that some frames show, in words, what is newer first.
+
+    Of two sessions that show the same part the later one counts, whatever its role.
+
+    Args:
+        evidence: A buffer's evidence, in order.
+        kept: Frames of the buffer.
+    """
+    found: dict[int, str] = {}
+    for one in reversed(evidence):
+        if one.seen(kept):
+            found.setdefault(one.span.part, one.span.text)
+    return found
 
 
 def _runs[T](values: Iterable[T]) -> Iterator[tuple[T, int, int]]:

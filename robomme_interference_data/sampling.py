@@ -40,17 +40,6 @@ the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` th
 """
 
 
-def kept_frames(memory: str, start: int, stop: int) -> list[int]:
-    """Return the frames of a buffer that a memory keeps of a span of it, at the first step.
-
-    Args:
-        memory: One of `MEMORIES`.
-        start: First frame of the span.
-        stop: Frame after its last one; the live observation comes then.
-    """
-    return [start + frame for frame in MEMORIES[memory](stop - start)]
-
-
 def spread(start: int, stop: int, count: int) -> list[int]:
     """Return at most `count` evenly spread indices from `start` to `stop` (excluded).
 

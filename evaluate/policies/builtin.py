@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
+from robomme_interference_data.evidence import known_parts
 from robomme_interference_data.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation, Simulator
 
@@ -43,9 +44,7 @@ class ReplayPolicy(Policy):
     history_cameras = ("front",)
 
     def __init__(self, memory: str = "full"):
-        if memory not in MEMORIES:
-            raise UnknownNameError.among("memory", memory, "replay", MEMORIES)
-        self.memory = memory
+        self.memory = _memory(memory, "replay")
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget everything."""
@@ -82,6 +81,12 @@ class ReplayPolicy(Policy):
         nearest_view = int(np.argmin(((views - view) ** 2).mean(axis=(1, 2, 3))))
         kept = kept[nearest_view:]
         return follow(observation.state, kept, np.concatenate(self._states)[kept])
+
+
+def _memory(name: str, policy: str) -> str:
+    if name not in MEMORIES:
+        raise UnknownNameError.among("memory", name, policy, MEMORIES)
+    return name
 
 
 def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -157,13 +162,58 @@ class Privileged(Policy):
         Raises:
             PolicyError: It was given no simulator.
         """
-        if self._simulator is None:
-            raise PolicyError(f"the policy {self.name} needs the simulator itself")
-        return self._simulator.act(self.name)[None]
+        return self._asked().act(self.name)[None]
 
     def metadata(self) -> dict[str, Any]:
         """Return its name."""
         return {"policy": self.name}
+
+    def _asked(self) -> Simulator:
+        if self._simulator is None:
+            raise PolicyError(f"the policy {self.name} needs the simulator itself")
+        return self._simulator
+
+
+class Recall(Privileged):
+    """`recall`: the ideal observer, the ceiling of every policy with its memory rule.
+
+    It knows those parts of the hidden answer of whose evidence its memory keeps a frame, and
+    nothing else; of two lessons that show the same part the newer one counts. Among the answers
+    that agree it draws one from the episode's seed, and the simulator's script does that. It looks
+    at no picture.
+
+    Args:
+        memory: `full`, `framesamp` or `window`.
+
+    Raises:
+        UnknownNameError: There is no such memory rule.
+    """
+
+    def __init__(self, memory: str = "full"):
+        super().__init__("recall")
+        self.memory = _memory(memory, self.name)
+
+    def reset(self, info: RolloutInfo) -> None:
+        """See what the memory keeps.
+
+        Raises:
+            PolicyError: It is unknown what the frames show.
+        """
+        super().reset(info)
+        if info.evidence is None:
+            raise PolicyError(
+                "recall needs to know which frames show the answer, and this is unknown",
+                "Build the split from a source with evidence: see docs/sources.md.",
+            )
+        self._known = known_parts(info.evidence, MEMORIES[self.memory](info.history_frames))
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
+        return self._asked().act(self.name, self._known)[None]
+
+    def metadata(self) -> dict[str, Any]:
+        """Return name and memory rule."""
+        return {"policy": self.name, "memory": self.memory}
 
 
 class Hold(Policy):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 Frames = Mapping[str, NDArray[np.uint8]]
@@ -23,13 +24,16 @@ class RolloutInfo:
         history_frames: Frames of history that will follow; 0 under `no-history`.
         seed: Seed for whatever the policy draws at random.
         simulator: The running simulator, for the built-in policies that may ask it for actions
-            (`oracle`, `guess`); None for every other policy.
+            (`oracle`, `guess`, `recall`); None for every policy that is not privileged.
+        evidence: Which frames of the history that will follow show a part of the hidden answer,
+            for `recall`; None where that is unknown, and for every policy that is not privileged.
     """
 
     goal: str
     history_frames: int
     seed: int
     simulator: Simulator | None = None
+    evidence: tuple[Evidence, ...] | None = None
 
 
 class Policy(ABC):
@@ -48,7 +52,7 @@ class Policy(ABC):
             drawn.
         history_cameras: Cameras whose history it wants: no others are decoded.
         wants_history: Whether history makes a difference to it; if not, it runs `no-history` only.
-        privileged: Whether it gets `RolloutInfo.simulator`.
+        privileged: Whether it gets `RolloutInfo.simulator` and `RolloutInfo.evidence`.
         every_frame: Whether it wants what is seen after each action; if not, `observe` gets only
             the observation on which it acts next, and simulators need not draw the others.
     """

@@ -18,13 +18,16 @@ from robomme_interference_data.evaluate.policies.options import bind_options, si
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.simulators.base import CAMERAS
 
-BUILTINS = ("replay", "oracle", "guess", "hold")
+BUILTINS = ("replay", "recall", "oracle", "guess", "hold")
 """Policies without learned weights."""
 
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
 _KINDS = {
     **{name: ("", name) for name in BUILTINS},
-    "replay": (r"[a-z]+", "replay, replay:framesamp or replay:window"),
+    **{
+        name: (r"[a-z]+", f"{name}, {name}:framesamp or {name}:window")
+        for name in ("replay", "recall")
+    },
     "websocket": (
         rf"//{_SERVER}(?:,{_SERVER})*",
         "websocket://host:port, with commas between several servers, each once",
@@ -41,7 +44,8 @@ class PolicySpec:
 
     Attributes:
         kind: `websocket`, `lerobot`, `python`, or a built-in's name.
-        target: What follows it; of `replay` the memory rule, of other built-ins nothing.
+        target: What follows it; of `replay` and `recall` the memory rule, of other built-ins
+            nothing.
     """
 
     kind: str
@@ -60,7 +64,7 @@ class PolicySpec:
 
 
 def parse_policy(text: str) -> PolicySpec:
-    """Read a policy as it is written; `replay` alone stands for `replay:full`.
+    """Read a policy as it is written; `replay` alone stands for `replay:full`, and so on.
 
     Raises:
         UnknownNameError: There is no such policy.
@@ -72,7 +76,7 @@ def parse_policy(text: str) -> PolicySpec:
         raise UnknownNameError(
             f"there is no policy {text!r}; expected {forms}", nearest(kind, _KINDS, more="")
         )
-    if text == "replay":
+    if text in ("replay", "recall"):
         target = "full"
     pattern, form = _KINDS[kind]
     spec = PolicySpec(kind, target)
@@ -150,8 +154,9 @@ def _factory(text: str, worker: int) -> tuple[Callable[..., Policy], dict[str, A
         check_workers(spec, worker + 1)
         host, port = spec.servers[worker]
         return _load("websocket", "WebsocketPolicy"), {"host": host, "port": port}
-    if spec.kind == "replay":
-        return _load("builtin", "ReplayPolicy"), {"memory": spec.target}
+    if spec.kind in ("replay", "recall"):
+        name = {"replay": "ReplayPolicy", "recall": "Recall"}[spec.kind]
+        return _load("builtin", name), {"memory": spec.target}
     if spec.kind == "hold":
         return _load("builtin", "Hold"), {}
     return _load("builtin", "Privileged"), {"name": spec.kind}

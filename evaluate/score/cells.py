@@ -168,7 +168,7 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         errors = sum(cell.errors for cell in found)
         bounds = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
         note = _NOTE
-        note += f" Not ranked either, as they use no memory: {', '.join(bounds)}." * bool(bounds)
+        note += f" Not ranked either, as they only show bounds: {', '.join(bounds)}." * bool(bounds)
         note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
         title = f"Success by system and condition, {simulator}"
         grids.append(Table.make(simulator, title, " ".join(["system", *conditions]), rows, note))

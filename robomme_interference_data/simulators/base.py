@@ -1,7 +1,7 @@
 """What every simulator serves, whatever engine is behind it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -156,12 +156,15 @@ class Simulator(ABC):
         return seen, status
 
     @abstractmethod
-    def act(self, policy: str) -> NDArray[np.float32]:
+    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
         """Return the next action, `(8,) float32`, of a built-in policy.
 
         Args:
-            policy: `oracle`, which reads the hidden answer, or `guess`, which draws one at random
-                from the episode's seed. Keep to one of them throughout an episode.
+            policy: `oracle`, which reads the hidden answer; `guess`, which draws one at random
+                from the episode's seed; or `recall`, which draws one of those that agree with
+                what is known. Keep to one of them throughout an episode.
+            known: For `recall`, at its first action: parts of the answer by number, in words as
+                the evidence of a demonstration has them; those that are believed most come first.
 
         Raises:
             UnknownNameError: The simulator has no such policy.

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Pipe
 from typing import Any
@@ -111,11 +111,11 @@ class RoboMMESimulator(Simulator):
         """Versions in its interpreter: `robomme_python`, `robomme_numpy`, `robomme` if known."""
         return self._process.versions
 
-    def act(self, policy: str) -> NDArray[np.float32]:
+    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
         """Refuse with `UnknownNameError`: RoboMME has no built-in policy."""
         raise UnknownNameError(
             f"the robomme simulator has no built-in policy {policy!r}",
-            "oracle and guess play on the embedded suite only: --simulator tabletop.",
+            "oracle, guess and recall play on the embedded suite only: --simulator tabletop.",
         )
 
     @property

@@ -15,13 +15,15 @@ from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evidence import (
     Evidence,
+    counted_from,
+    known_parts,
     place_evidence,
     spans_of_parts,
     spans_of_texts,
 )
 from robomme_interference_data.records import EvidenceSpan, place_sessions
 from robomme_interference_data.rows import from_dict, to_dict
-from robomme_interference_data.sampling import MEMORIES, evidence_kept, kept_frames
+from robomme_interference_data.sampling import evidence_kept
 
 ENTRY = SessionEntry(
     "lesson", "MoveCube", EpisodeId("MoveCube", "test", 0), "demonstrations", "r", 0, 0, 20, 1, "s"
@@ -144,12 +146,34 @@ def test_evidence_kept_by_hand() -> None:
     assert evidence_kept(placed(wrong), range(20)) is None
 
 
-def test_what_a_memory_keeps_of_a_span() -> None:
-    assert kept_frames("window", 10, 110) == list(range(79, 110))  # 32 with the live one
-    assert kept_frames("framesamp", 10, 320) == list(range(10, 320, 10))
-    assert kept_frames("full", 10, 13) == [10, 11, 12]
+def test_a_part_of_a_buffer_counts_from_its_own_beginning() -> None:
+    part = counted_from(placed(ENTRY), 5)
+    assert places(part) == [(0, -3, 5), (1, 3, 15)]
+    assert evidence_kept(part, range(3)) == 0.5
 
 
-@given(st.sampled_from(sorted(MEMORIES)), st.integers(0, 30))
-def test_the_first_steps_keep_everything(memory: str, frames: int) -> None:
-    assert kept_frames(memory, 5, 5 + frames) == list(range(5, 5 + frames))
+# --- known ---------------------------------------------------------------------------------------
+
+
+def test_known_are_the_parts_of_which_a_frame_is_kept() -> None:
+    evidence = placed(ENTRY)
+    assert known_parts(evidence, [1]) == {}
+    assert known_parts(evidence, [7]) == {0: "takes peg 2"}
+    assert known_parts(evidence, [9]) == {1: "from the left", 0: "takes peg 2"}
+
+
+def test_of_two_lessons_the_newer_one_counts() -> None:
+    wrong = replace(ENTRY, role="contradiction", dataset="contradictions")
+    spans = {"demonstrations": (FIRST,), "contradictions": (replace(FIRST, text="peg 1"), THEN)}
+    for order, text in (([wrong, ENTRY], "takes peg 2"), ([ENTRY, wrong], "peg 1")):
+        found = place_evidence(place_sessions(order), lambda entry: spans[entry.dataset])
+        assert known_parts(found or (), range(40)) == {0: text, 1: "from the left"}
+
+
+@given(st.sets(st.integers(0, 39)), st.sets(st.integers(0, 39)))
+def test_more_frames_tell_more(some: set[int], more: set[int]) -> None:
+    evidence = placed(ENTRY, replace(ENTRY, role="filler", start=19, repeat=20))
+    fewer, all_known = known_parts(evidence, some), known_parts(evidence, some | more)
+    assert fewer.items() <= all_known.items()
+    assert (evidence_kept(evidence, some) or 0) <= (evidence_kept(evidence, some | more) or 0)
+    assert (evidence_kept(evidence, some) == 1) == (len(fewer) == 2)

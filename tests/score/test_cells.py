@@ -129,7 +129,7 @@ def test_systems_without_a_memory_are_not_ranked(tmp_path: Path) -> None:
     found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
     ranks = {r["system"]: r["rank"] for r in made.records(found, "main")}
     assert ranks == {"oracle": None, "guess": None, made.OWN: 1}
-    assert "Not ranked either, as they use no memory: Oracle, Guess." in found.grids[0].note
+    assert "Not ranked either, as they only show bounds: Oracle, Guess." in found.grids[0].note
 
 
 def test_a_condition_of_another_kind_is_a_cell_and_no_contrast(

@@ -8,9 +8,6 @@ import pytest
 from numpy.random import RandomState
 
 from robomme_interference_data.constants import FAMILIES
-
-pytest.importorskip("mani_skill", reason="needs the extra sim")
-
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
 from robomme_interference_data.simulators.tabletop.families import family_class

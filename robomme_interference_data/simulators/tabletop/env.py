@@ -1,7 +1,7 @@
 """The ManiSkill environment behind all nine families."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs.types import SimConfig
-from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, FPS
@@ -22,8 +21,7 @@ from robomme_interference_data.shifts import Shift
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, turn_of
-from robomme_interference_data.simulators.tabletop.families import family_class
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.look import FRONT_EYE, FRONT_TARGET, Look
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
@@ -144,8 +142,9 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         difficulty = options.get("difficulty", difficulty_of(number))
         if difficulty not in DIFFICULTIES:
             raise InvalidOptionError.one_of("difficulty", difficulty, DIFFICULTIES)
-        episode: Family = family_class(self.family)(difficulty, RandomState(number))
+        episode = draw_episode(self.family, number, difficulty)
         answers = episode.answers
+        self.number = number
         turn = turn_of(number, len(answers))
         answer = _index(options.get("answer", turn), -len(answers), len(answers), "answer")
         self.episode, self.answer = episode, answers[answer]
@@ -169,10 +168,13 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             self.status = self.episode.judge(self.arm, self.answer)
         return done
 
-    def act(self, policy: str) -> NDArray[np.float32]:
-        """Return the next action of the policy `oracle` or `guess`, `(8,) float32`."""
+    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+        """Return the next action of a policy, `(8,) float32`; see `Simulator.act`."""
         if policy not in self._scripts:
-            answer = self.answer if policy == "oracle" else self.guess
+            if policy == "recall":
+                answer = self.episode.recalled(known or {}, self.number)
+            else:
+                answer = self.answer if policy == "oracle" else self.guess
             self.arm.reset()
             self._scripts[policy] = self.episode.solve(self.arm, answer)
         next(self._scripts[policy], None)  # a script that is through holds its last pose

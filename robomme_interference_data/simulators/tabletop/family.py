@@ -9,9 +9,11 @@ from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.records import Status
-from robomme_interference_data.simulators.tabletop.drawing import Colour
-from robomme_interference_data.simulators.tabletop.kit import Kit
+from robomme_interference_data.simulators.tabletop.kit import Colour, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+
+_RECALLED = 2
+"""Stream of random numbers; see `episodes.turn_of` for the others."""
 
 
 class Family(ABC):
@@ -82,6 +84,16 @@ class Family(ABC):
         """
         fits = set(narrowed(self._told, known))
         return [answer for answer in self.answers if answer in fits]
+
+    def recalled(self, known: Mapping[int, str], seed: int) -> Any:
+        """Draw one of the agreeing answers.
+
+        It is the first of them in an order that the seed alone decides: who knows more keeps to
+        the right answer, if it was drawn.
+        """
+        order = RandomState([seed, _RECALLED]).permutation(len(self.answers))
+        left = set(self.agreeing(known))
+        return next(self.answers[place] for place in order if self.answers[place] in left)
 
     @cached_property
     def _told(self) -> list[tuple[Any, tuple[str, ...]]]:

@@ -1,5 +1,7 @@
 """The scene kit: the bodies that the families are made of, built once here.
 
+sapien is imported where something is built, so that families can be drawn without it.
+
 Lengths are in m. The table's top is z = 0, the arm stands at x = −0.615 and faces +x; the front
 camera looks back at it. Colours are RGB from 0 to 1.
 """
@@ -7,14 +9,17 @@ camera looks back at it. Colours are RGB from 0 to 1.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import sapien
 from numpy.typing import NDArray
 
-from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, Colour, material
 from robomme_interference_data.simulators.tabletop.motion import Point
+
+if TYPE_CHECKING:
+    import sapien
+
+Colour = tuple[float, float, float]
 
 COLOURS: dict[str, Colour] = {
     "red": (0.85, 0.08, 0.08),
@@ -42,8 +47,10 @@ class Place:
     yaw: float = 0.0
 
     @property
-    def pose(self) -> sapien.Pose:
+    def pose(self) -> "sapien.Pose":
         """The same for sapien."""
+        import sapien
+
         return sapien.Pose(self.p, [math.cos(self.yaw / 2), 0, 0, math.sin(self.yaw / 2)])
 
 
@@ -57,6 +64,8 @@ class Body:
     """
 
     def __init__(self, entity: Any, home: Place, size: float = 0.0):
+        import sapien
+
         self.home = home
         self.size = size
         self._entity = entity
@@ -70,11 +79,15 @@ class Body:
 
     def point(self, x: float, y: float, z: float) -> NDArray[np.float64]:
         """Where a point of the body, given in its own axes, is on the table: `(3,) float64`."""
+        import sapien
+
         return np.asarray((self._entity.pose * sapien.Pose([x, y, z])).p, dtype=np.float64)
 
     @property
     def touched(self) -> bool:
         """Whether a part of the arm presses on the body."""
+        import sapien
+
         arm = sapien.physx.PhysxArticulationLinkComponent
         return any(
             self._rigid in contact.bodies
@@ -254,6 +267,10 @@ class Kit:
 
         A disc is `(z of its bottom, radius, height, colour)`.
         """
+        import sapien
+
+        from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, material
+
         builder = self._scene.create_actor_builder()
         for middle, half, colour in boxes:
             pose = sapien.Pose(middle)

@@ -1,6 +1,6 @@
 """The embedded suite as a simulator: nine families in one environment, an episode at a time."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from robomme_interference_data.simulators.base import (
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
 
-POLICIES = ("oracle", "guess")
+POLICIES = ("oracle", "guess", "recall")
 
 
 class TabletopSimulator(Simulator):
@@ -48,12 +48,12 @@ class TabletopSimulator(Simulator):
         self.env.shift = wanted
         self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
 
-    def act(self, policy: str) -> NDArray[np.float32]:
-        """Return the next action of `oracle` or `guess`; see `Simulator.act`."""
+    def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
+        """Return the next action of `oracle`, `guess` or `recall`; see `Simulator.act`."""
         self._running()
         if policy not in POLICIES:
             raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
-        return self.env.act(policy)
+        return self.env.act(policy, known)
 
     def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
         """Yield what is seen now as under each of several shifts; the scene stays what it is.

@@ -34,6 +34,15 @@ _FAMILIES: dict[str, type[Family]] = {
 }
 
 
+def draw_episode(family: str, seed: int, difficulty: str) -> Family:
+    """Return the episode of a seed, its hidden answer apart; nothing is simulated.
+
+    Raises:
+        UnknownNameError: There is no such family.
+    """
+    return family_class(family)(difficulty, RandomState(seed))
+
+
 def family_class(name: str) -> type[Family]:
     """Return the class of a task family.
 

@@ -1,0 +1,164 @@
+"""What a memory rule leaves of the answer: the ceiling of every policy with it, without a rollout.
+
+The ideal observer (`recall`) knows the parts of the answer of whose evidence its memory keeps a
+frame, and draws one of the answers that agree. So its expected success is 1 / (agreeing answers),
+and follows from manifests and records alone; nothing is decoded, nor simulated.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.conditions import in_order
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.evaluate.config import CeilingConfig
+from robomme_interference_data.evidence import counted_from, known_parts
+from robomme_interference_data.query import Query
+from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
+from robomme_interference_data.retrieval.select import Rule, choose, measure
+from robomme_interference_data.sampling import MEMORIES, evidence_kept
+from robomme_interference_data.simulators.tabletop.families import draw_episode
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.split import Split
+from robomme_interference_data.tables import Table
+
+ALL = "all"
+"""Stands for all families together."""
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a memory keeps of the answer of one buffer.
+
+    Attributes:
+        family: Of the query.
+        condition: Name of the condition.
+        evidence_kept: Share of the lesson's evidence spans of which it keeps a frame; None without
+            a lesson, and where evidence is unknown.
+        success: Chance that the ideal observer succeeds; None where the answers that agree with
+            what is known cannot be told: only those of `tabletop` can.
+    """
+
+    family: str
+    condition: str
+    evidence_kept: float | None
+    success: float | None
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Means over the queries of a family, or of `ALL`, under one condition.
+
+    Attributes:
+        queries: How many there are.
+        evidence_kept, success: Means of what `Left` has, over the queries that have it; None if
+            none has.
+    """
+
+    family: str
+    condition: str
+    queries: int
+    evidence_kept: float | None
+    success: float | None
+
+
+def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
+    """Return the ceiling of a memory on a split, by family and condition, and of all families.
+
+    Raises:
+        UnknownNameError: There is no such memory, condition, encoder or method.
+        InvalidOptionError: No lesson of the split has evidence.
+        MissingIndexError, StaleIndexError: See `measure`.
+    """
+    if config.memory not in MEMORIES:
+        raise UnknownNameError.none("memory", config.memory, MEMORIES)
+    names = [one.name for one in in_order(config.conditions or split.conditions)]
+    found = [
+        what_is_left(buffer, config.memory, *span)
+        for name in names
+        for buffer in split.buffers(condition=name)
+        if (span := _span(buffer, config)) is not None
+    ]
+    if all(one.evidence_kept is None for one in found):
+        raise InvalidOptionError(
+            f"it is unknown which frames of {split.location} show the answer",
+            "Build it from tabletop, or from recordings with subgoals: see docs/sources.md.",
+        )
+    return [*_cells(found, split.families), *_cells(found, (ALL,))]
+
+
+def what_is_left(buffer: Buffer, memory: str, start: int, stop: int) -> Left:
+    """Return what a memory keeps of the answer at the first step, given a span of a buffer."""
+    told = buffer.episode_id.family, buffer.condition
+    if buffer.evidence is None:
+        return Left(*told, None, None)
+    evidence = counted_from(buffer.evidence, start)
+    kept = MEMORIES[memory](stop - start)
+    success = chance(buffer.query, known_parts(evidence, kept))
+    return Left(*told, evidence_kept(evidence, kept), success)
+
+
+def chance(query: Query, known: dict[int, str]) -> float | None:
+    """Return the chance of a draw among the answers that agree with what is known to be right.
+
+    Args:
+        query: The query episode.
+        known: Parts of the answer in words, see `evidence.known_parts`.
+
+    Returns:
+        The chance; None where the answers of the query's simulator cannot be told.
+    """
+    spans, difficulty = query.record.evidence, query.difficulty
+    if query.simulator != "tabletop" or None in (spans, difficulty, query.seed):
+        return None
+    scene = _scene(query.episode_id.family, int(query.seed or 0), str(difficulty))
+    [right] = scene.agreeing({span.part: span.text for span in spans or ()})
+    left = scene.agreeing(known)
+    return (right in left) / len(left)
+
+
+@lru_cache(256)
+def _scene(family: str, seed: int, difficulty: str) -> Family:
+    return draw_episode(family, seed, difficulty)
+
+
+def _span(buffer: Buffer, config: CeilingConfig) -> tuple[int, int] | None:
+    """Return which frames the memory is given; None where there is nothing to retrieve from."""
+    if config.retrieval is None:
+        return 0, len(buffer)
+    if not len(buffer):
+        return None
+    name = encoder_name(config.retrieval)
+    rule = Rule.parse(config.retrieval_rule, published_threshold(name))
+    return choose(measure(buffer, name, config.retrieval_camera), rule).span
+
+
+def _cells(found: Sequence[Left], families: Iterable[str]) -> Iterator[Ceiling]:
+    for family in families:
+        groups: dict[str, list[Left]] = {}
+        for one in found:
+            if family in (ALL, one.family):
+                groups.setdefault(one.condition, []).append(one)
+        for condition, those in groups.items():
+            kept = _mean(one.evidence_kept for one in those)
+            success = _mean(one.success for one in those)
+            yield Ceiling(family, condition, len(those), kept, success)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def ceiling_table(cells: Sequence[Ceiling], title: str) -> Table:
+    """Return the table for the terminal."""
+    return Table.make(
+        "ceiling",
+        title,
+        "family condition queries:count evidence_kept:rate expected_success:rate",
+        ((c.family, c.condition, c.queries, c.evidence_kept, c.success) for c in cells),
+        "evidence kept: mean share of the lesson's evidence spans of which the memory keeps a "
+        "frame at the first step; expected success: of the ideal observer (recall), which knows "
+        "these parts of the answer and draws one of those that agree. Empty where unknown.",
+    )
