@@ -10,10 +10,14 @@ from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.builtin import (
     Hold,
     Privileged,
+    Recall,
     ReplayPolicy,
     follow,
 )
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.evidence import place_evidence
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import EvidenceSpan, SessionEntry, place_sessions
 from robomme_interference_data.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation
 
@@ -132,3 +136,41 @@ def test_hold_holds_and_a_script_needs_the_simulator() -> None:
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, 1], (16, 1)))
     with pytest.raises(PolicyError, match="needs the simulator itself"):
         Privileged("oracle").act(seen(0, 0.0), "goal")
+
+
+# --- recall --------------------------------------------------------------------------------------
+
+
+class Asked:
+    """A simulator that keeps what it is asked."""
+
+    def act(self, policy: str, known: dict[int, str] | None = None) -> Vector:
+        self.asked = policy, known
+        return np.zeros(8, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("memory", "known"),
+    [
+        ("full", {1: "from the left", 0: "takes peg 2"}),
+        ("framesamp", {1: "from the left"}),  # every tenth frame of 310
+        ("window", {}),  # from 279 on
+    ],
+)
+def test_recall_knows_what_its_memory_keeps(memory: str, known: dict[int, str]) -> None:
+    entry = SessionEntry("lesson", "A", EpisodeId("A", "test", 0), "d", "r", 0, 0, 300, 1, "s")
+    spans = EvidenceSpan(0, "takes peg 2", 11, 20), EvidenceSpan(1, "from the left", 20, 31)
+    evidence = place_evidence(place_sessions([entry]), lambda entry: spans)
+    simulator, policy = Asked(), Recall(memory)
+    policy.reset(RolloutInfo("goal", 310, 0, simulator, evidence))  # type: ignore[arg-type]
+    assert policy.act(seen(0, 0), "goal").shape == (1, 8)
+    assert simulator.asked == ("recall", known)
+    assert policy.metadata() == {"policy": "recall", "memory": memory}
+    assert (policy.cameras, policy.history_cameras) == ((), ())  # it looks at nothing
+
+
+def test_recall_must_be_told_what_frames_show() -> None:
+    with pytest.raises(PolicyError, match="unknown"):
+        Recall().reset(RolloutInfo("goal", 0, 0, Asked(), None))  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match="framesamp"):
+        Recall("framesmap")

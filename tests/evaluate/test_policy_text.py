@@ -31,6 +31,7 @@ OWN = "python:support.own_policies:"
     [
         ("oracle", PolicySpec("oracle"), ()),
         ("replay:window", PolicySpec("replay", "window"), ()),
+        ("recall:framesamp", PolicySpec("recall", "framesamp"), ()),
         ("lerobot:me/act", PolicySpec("lerobot", "me/act"), ()),
         ("lerobot:out/last:1", PolicySpec("lerobot", "out/last:1"), ()),
         ("python:my.policies:make", PolicySpec("python", "my.policies:make"), ()),
@@ -46,14 +47,15 @@ def test_what_is_read(text: str, spec: PolicySpec, servers: tuple[tuple[str, int
     assert str(spec) == text
     assert spec.servers == servers
     assert str(parse_policy("replay")) == "replay:full"
+    assert str(parse_policy("recall")) == "recall:full"
 
 
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        ("orcale", UnknownNameError, "Did you mean 'oracle'?"),
+        ("orcale", UnknownNameError, "Did you mean 'oracle'"),
         ("websockets://a:1", UnknownNameError, "Did you mean 'websocket'?"),
-        ("zzz", UnknownNameError, "expected replay, replay:framesamp or replay:window, oracle,"),
+        ("zzz", UnknownNameError, "expected replay, replay:framesamp or replay:window, recall,"),
         ("", UnknownNameError, "there is no policy ''"),
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")

@@ -96,6 +96,26 @@ def test_a_cache_that_cannot_be_written_costs_no_rollout(
     assert [str(blocked) in str(one.message) for one in told] == [True]  # once
 
 
+@pytest.mark.parametrize(
+    ("system", "kept"),
+    [("replay-window", 0.5), ("perceptual-framesamp-modul", 1), ("mine", None), ("oracle", None)],
+)
+def test_evidence_kept_where_the_rule_is_known(system: str, kept: float | None) -> None:
+    """MoveCube's lesson of 48 frames shows the answer in frames 0 to 3, and in 31 to 38."""
+    assert roll("k0", Cheat(), system=system).evidence_kept == kept
+    assert roll("no-history", Cheat(), system=system).evidence_kept is None
+
+
+def test_only_a_privileged_policy_is_told_what_frames_show() -> None:
+    policy = Cheat()
+    roll("k0", policy)
+    assert policy.info.evidence is None and policy.info.simulator is None
+    policy = Cheat()
+    policy.privileged = True
+    roll("k0", policy)
+    assert [(one.start, one.stop) for one in policy.info.evidence or ()] == [(0, 4), (31, 39)]
+
+
 # --- retrieval ---------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ from numpy.random import RandomState
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.records import Status
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
@@ -84,6 +85,49 @@ def test_of_parts_that_contradict_each_other_the_first_are_believed() -> None:
     apart = {0: "goes to button 0", 1: "goes to button 15"}  # which no path does
     assert {found[0] for found in path.agreeing(apart)} == {0}
     assert {found[1] for found in path.agreeing(dict(reversed(apart.items())))} == {15}
+
+
+# --- the ideal observer --------------------------------------------------------------------------
+
+
+def test_recall_draws_among_what_is_left() -> None:
+    """Of 600 draws 600 / 4 are right, give or take four standard deviations; more is no worse."""
+    right = fuller = 0
+    for seed in range(600):
+        scene = drawn("InsertPeg", 0)  # two pegs, two ends, two sides
+        answer = scene.answers[seed % 8]
+        fewer, more = (scene.recalled(seen(scene, answer, known), seed) for known in ([0], [0, 1]))
+        assert fewer[0] == answer[0] and more[:2] == answer[:2]
+        right += fewer == answer
+        fuller += more == answer
+        assert more == answer or fewer != answer
+        assert scene.recalled(seen(scene, answer, range(3)), seed) == answer
+    assert abs(right - 150) < 4 * (600 * 3 / 16) ** 0.5
+    assert abs(fuller - 300) < 4 * (600 / 4) ** 0.5
+
+
+@pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "family", ["VideoUnmask", *(pytest.param(one, marks=pytest.mark.slow) for one in FAMILIES)]
+)
+def test_played_as_computed(blind: TabletopSimulator, family: str, index: int) -> None:
+    """With all parts it succeeds; without any when what it draws happens to be right."""
+    env = blind.env
+    for known_parts in (True, False):
+        blind.reset(f"{family}/test/{index}", demonstration=False)
+        scene, answer = env.episode, env.answer
+        known = dict(enumerate(scene.parts(answer))) if known_parts else {}
+        expected = Status.SUCCESS
+        if scene.recalled(known, env.number) != answer:
+            expected = Status.FAIL
+        assert known_parts <= (expected is Status.SUCCESS)
+        status = Status.ONGOING
+        while status is Status.ONGOING:
+            _, status = blind.step(blind.act("recall", known), observe=False)
+        assert status is expected
+
+
+# --- what demonstrations show --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])

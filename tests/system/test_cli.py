@@ -54,7 +54,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
         *("Data", "doctor", "build", "new-split", "verify", "audit", "fetch"),
         *("Look", "list", "show", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
-        *("Rollouts", "evaluate", "merge"),
+        *("Rollouts", "ceiling", "evaluate", "merge"),
         *("Scores", "score", "compare"),
         *("Publish", "card", "publish", "publish-results"),
     ]

@@ -12,7 +12,7 @@ from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
 
 HIGH = 0.72  # m, above what the cameras see
-FALL, SEEN = 55, 47  # time steps: of the containers' way down, and until they hide the cubes
+FALL, SEEN = 55, 49  # time steps: of the containers' way down, and until they hide the cubes
 LIFTED = 0.05  # m, of the right container
 PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
 

@@ -1,0 +1,121 @@
+"""What a memory leaves of the answer, counted by hand, without a simulator."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.made_up import record
+from support.retrieval import make_index
+from support.splits import copy_split
+
+from robomme_interference_data import load_split
+from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.evaluate.ceiling import ALL, ceiling, chance
+from robomme_interference_data.evaluate.config import CeilingConfig
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.query import Query
+from robomme_interference_data.records import EvidenceSpan
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
+from robomme_interference_data.simulators.tabletop.families import draw_episode
+
+
+def kept(split: Path, **settings: Any) -> dict[tuple[str, str], float | None]:
+    cells = ceiling(load_split(split), CeilingConfig(**settings))
+    assert all(cell.success is None for cell in cells)  # made-up episodes have no answers
+    return {(cell.family, cell.condition): cell.evidence_kept for cell in cells}
+
+
+def test_evidence_kept_by_hand(tiny_split: Path) -> None:
+    """Lessons of 48 frames show the answer in frames 0 to 3, and in eight round 20, 35 and 41."""
+    families = ("VideoRepick", "MoveCube", "PatternLock")
+    window = kept(tiny_split, memory="window", conditions=("k0", "k1"))
+    # Of 48 frames the last 31 begin with 17; of 80 none is of the lesson.
+    assert window == {
+        **{(family, "k0"): 0.5 for family in (*families, ALL)},
+        **{(family, "k1"): 0 for family in (*families, ALL)},
+    }
+    # Of 272 frames every ninth: 0, 8, 17, 26, 35, 43.
+    assert set(kept(tiny_split, conditions=("k7",)).values()) == {1}
+    nothing = kept(tiny_split, conditions=("no-history", "k0"))
+    assert nothing["MoveCube", "no-history"] is None
+
+
+def test_a_retrieval_step_in_front(tmp_path: Path) -> None:
+    split = copy_split(tmp_path / "split")
+    make_index(split)
+    found = kept(split, memory="window", retrieval="thumbnail", retrieval_rule="oracle")
+    assert {condition for _, condition in found} == {"k0", "k1", "k3", "k7"}  # without a history
+    assert set(found.values()) == {0.5}  # of the lesson alone, whatever follows it
+    last = kept(split, memory="full", retrieval="thumbnail", retrieval_rule="last")
+    assert last["MoveCube", "k7"] == 0
+
+
+def test_what_cannot_be_told(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    split = load_split(tiny_split)
+    with pytest.raises(UnknownNameError, match=r"'framesmap'(.|\n)*framesamp"):
+        ceiling(split, CeilingConfig("framesmap"))
+    with pytest.raises(UnknownNameError, match="k9"):
+        ceiling(split, CeilingConfig(conditions=("k9",)))
+    monkeypatch.setattr(Buffer, "evidence", None)
+    with pytest.raises(InvalidOptionError, match="unknown which frames"):
+        ceiling(split, CeilingConfig())
+
+
+# --- the ideal observer --------------------------------------------------------------------------
+
+
+def query(family: str, index: int, answer: int) -> tuple[Query, tuple[str, ...]]:
+    """A query of the tabletop whose lesson showed an answer; and the parts of that."""
+    seed = seed_of(EpisodeId(family, "test", index))
+    scene = draw_episode(family, seed, difficulty_of(seed))
+    parts = scene.parts(scene.answers[answer])
+    spans = tuple(EvidenceSpan(part, text, part, part + 1) for part, text in enumerate(parts))
+    told: dict[str, Any] = {"seed": seed, "difficulty": difficulty_of(seed), "evidence": spans}
+    known = record("demonstrations", f"{family}/test/{index}", simulator="tabletop", **told)
+    return Query(None, known), parts  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("family", "index", "known", "expected"),
+    [
+        ("MoveCube", 0, (), 1 / 3),
+        ("MoveCube", 0, (0,), 1),
+        ("InsertPeg", 2, (), 1 / 16),  # four pegs, two ends, two sides
+        ("InsertPeg", 2, (0, 2), 1 / 2),
+        ("VideoRepick", 2, (0,), 1 / 4),  # of five cubes each ends elsewhere
+        ("PatternLock", 0, (), 1 / 1764),
+    ],
+)
+def test_a_draw_among_what_is_left(
+    family: str, index: int, known: tuple[int, ...], expected: float
+) -> None:
+    asked, parts = query(family, index, 1)
+    assert chance(asked, {part: parts[part] for part in known}) == expected
+
+
+def test_what_another_lesson_said_is_believed() -> None:
+    asked, _ = query("MoveCube", 0, 0)
+    _, wrong = query("MoveCube", 0, 1)
+    assert chance(asked, dict(enumerate(wrong))) == 0
+
+
+@pytest.mark.parametrize("unknown", ["simulator", "seed", "difficulty", "evidence"])
+def test_no_chance_where_answers_are_unknown(unknown: str) -> None:
+    asked, _ = query("MoveCube", 0, 0)
+    assert chance(replace(asked, record=replace(asked.record, **{unknown: None})), {}) is None
+
+
+def test_it_needs_neither_simulator_nor_weights() -> None:
+    code = (
+        "import sys\n"
+        "for name in ('sapien', 'mani_skill', 'torch', 'gymnasium', 'transformers'):\n"
+        "    sys.modules[name] = None\n"
+        "from robomme_interference_data.evaluate.ceiling import draw_episode\n"
+        "print(len(draw_episode('VideoUnmaskSwap', 3, 'hard').agreeing({})))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    assert done.stdout == "20\n"
