@@ -1,6 +1,7 @@
 """What is found out before a run: what cannot work, the simulator, the names of rows."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,14 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.checks import (
+    check_plan,
     check_settings,
     check_simulator,
     default_system,
 )
+from robomme_interference_data.evaluate.plan import plan_work
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.execution import Serial
 from robomme_interference_data.simulators.registry import SIMULATORS
 
@@ -190,6 +194,19 @@ def test_only_what_somebody_looks_at_is_drawn(monkeypatch: pytest.MonkeyPatch) -
         "cameras": ("front",),
         "answer_s": 90.0,
     }
+
+
+def test_recall_needs_evidence(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    split = load_split(tiny_split)
+    queries = {one: split.query(one) for one in split.episode_ids}
+    known = {one: replace(q, record=replace(q.record, evidence=None)) for one, q in queries.items()}
+    monkeypatch.setattr(split, "query", lambda episode: known[episode])
+    settings = config(policy="recall:window")
+    plan = plan_work(split.episode_ids, conditions=("k0",))
+    policy = make_policy(settings.policy)
+    with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
+        check_plan(settings, name_system("recall-window"), split, policy, plan)
+    assert "docs/sources.md" in (raised.value.hint or "")
 
 
 # --- names -------------------------------------------------------------------------------------

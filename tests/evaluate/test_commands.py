@@ -20,6 +20,7 @@ pytestmark = pytest.mark.usefixtures("trouble", "_serial")
 APP = typer.Typer(rich_markup_mode="markdown", pretty_exceptions_enable=False)
 APP.command()(commands.evaluate)
 APP.command()(commands.merge)
+APP.command()(commands.ceiling)
 SEVERAL = ("--families", "--conditions", "--policy-option")
 USUAL = "--simulator support.worlds:World --system mine --episodes 0"
 
@@ -31,6 +32,22 @@ def _serial(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def type_in(line: str) -> Any:
     return CliRunner().invoke(APP, spread_values(line.split(), SEVERAL))
+
+
+def test_ceiling_prints_a_table_or_json(tiny_split: Path) -> None:
+    line = f"ceiling {tiny_split} --memory window --conditions k0 k1"
+    done = type_in(line)
+    assert done.exit_code == 0, done.output
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert ["MoveCube", "k0", "1", "50.0%"] in lines and ["all", "k1", "3", "0.0%"] in lines
+    cells = json.loads(type_in(f"{line} --json").stdout)
+    assert cells[0] == {
+        "family": "VideoRepick",
+        "condition": "k0",
+        "queries": 1,
+        "evidence_kept": 0.5,
+        "success": None,
+    }
 
 
 @pytest.mark.parametrize("families", ["MoveCube VideoRepick", "MoveCube,VideoRepick"])

@@ -52,7 +52,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
     listed = [word for word in words if (word,) in ALL or word in GROUPS]
     assert listed == [
         *("Data", "doctor", "build", "new-split", "verify", "audit", "fetch"),
-        *("Look", "list", "show", "simulate"),
+        *("Look", "conditions", "list", "show", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "ceiling", "evaluate", "merge"),
         *("Scores", "score", "compare"),
@@ -260,7 +260,11 @@ def test_show_as_json_and_as_a_picture(run: Run, tiny_split: Path, tmp_path: Pat
     code, out, err = run("show", EPISODE, "k1", "--split", tiny_split, "--out", picture, "--json")
     assert code == 0
     manifest = to_dict(load_split(tiny_split).manifest(EPISODE, "k1"))
-    assert json.loads(out) == json.loads(json.dumps(manifest))
+    shown = json.loads(out)
+    leaves, turns = shown.pop("evidence")
+    assert shown == json.loads(json.dumps(manifest))
+    told = {"part": 0, "text": "leaves the left edge", "role": "lesson", "start": 0, "stop": 4}
+    assert leaves == told and turns["part"] == 1
     assert str(picture) in err
     assert picture.read_bytes().startswith(b"\x89PNG")
 

@@ -63,7 +63,6 @@ def other_answer(episode: EpisodeId) -> int:
         UnknownNameError: There is no such episode.
     """
     seed = seed_of(episode)
-    family = family_class(episode.family)(difficulty_of(seed), RandomState(seed))
-    count = len(family.answers)
+    count = len(draw_episode(episode.family, seed, difficulty_of(seed)).answers)
     other, own = turn_of(seed, count - 1, stream=2), turn_of(seed, count)
     return other + (other >= own)
