@@ -46,11 +46,11 @@ class ExchangeFamily(Family):
 
     def parts(self, answer: Any) -> tuple[str, ...]:
         """What is told of the answer, and then each exchange; see `Family.parts`."""
-        return (*self.told(answer), *_words(_ways(self.swaps)))
+        return (*self.told(answer), *_words(_way(self.swaps)))
 
     def agreeing(self, known: Mapping[int, str]) -> list[Any]:
         """The answers that may have ended where the right one did; see `Family.agreeing`."""
-        way = _ways(self.swaps)
+        way = _way(self.swaps)
         possible = _all_ways(self.count) if self.swaps else {way: ()}
         shown = len(self.told(self.answers[0]))
         fits = narrowed([*possible.items()], known, shown)
@@ -58,7 +58,7 @@ class ExchangeFamily(Family):
         return [answer for answer in self.answers if _end(answer, way) in places]
 
 
-def _ways(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
+def _way(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
     """Return at which places things are exchanged: what can be seen of those that look alike."""
     at: dict[int, int] = {}
     found = []
@@ -72,7 +72,7 @@ def _ways(swaps: Iterable[Pair]) -> tuple[Pair, ...]:
 @cache
 def _all_ways(count: int) -> dict[tuple[Pair, ...], tuple[str, ...]]:
     """Return every way in which so many things may change places, and the same in words."""
-    ways = (_ways(exchanges(order)) for order in permutations(range(count)))
+    ways = (_way(exchanges(order)) for order in permutations(range(count)))
     return {way: _words(way) for way in ways}
 
 
