@@ -56,7 +56,7 @@ class Look:
 
 
 # Of those that share no shape with the paper's, each has its own pair of marker and line.
-_FREE = [(marker, line) for line in _LINES for marker in "vPX<>dph"]
+_FREE = [(marker, line) for line in _LINES for marker in "vPX<>dph8"]
 _TABLE = {
     system.name: Look(
         system.display,

@@ -16,7 +16,8 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.shifts import KINDS, Shift
-from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, Colour, material
+from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, material
+from robomme_interference_data.simulators.tabletop.kit import Colour
 
 FRONT_EYE = (0.80, 0.0, 0.64)
 """Where the front camera stands, in m: the table up to x = 0.14 m, and at its home pose the whole
