@@ -35,6 +35,8 @@ class Cube:
         episodes: Those that have rows or are expected, in the canonical order.
         model_seeds: Seeds that policies were given, ascending.
         status: Place in `STATUSES` of each rollout, −1 where there is none, `(S, C, E, M) int8`.
+        evidence: Share of the lesson's evidence that the memory kept, NaN where that is not known,
+            `(S, C, E, M) float64`.
         difficulty: Place of each episode's in `DIFFICULTIES`, −1 unknown, `(E,) int64`.
         expected: The episodes of a complete cell, `(E,) bool`.
         due: The cells that are expected or have rows, `(S, C) bool`.
@@ -46,6 +48,7 @@ class Cube:
     episodes: tuple[EpisodeId, ...]
     model_seeds: tuple[int, ...]
     status: Statuses
+    evidence: NDArray[np.float64]
     difficulty: NDArray[np.int64]
     expected: Flags
     due: Flags
@@ -138,9 +141,12 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
     at = np.array([places[one] for one in ids])
 
     shape = (len(systems), len(conditions), len(episodes), len(model_seeds))
-    status, difficulty = np.full(shape, -1, np.int8), np.full(len(episodes), -1)
+    status, evidence = np.full(shape, -1, np.int8), np.full(shape, np.nan)
     axes = (rows.places("system", systems), rows.places("condition", conditions), at)
-    status[(*axes, rows.places("model_seed", model_seeds))] = rows.places("status", STATUSES)
+    axes += (rows.places("model_seed", model_seeds),)
+    status[axes] = rows.places("status", STATUSES)
+    evidence[axes] = np.array(rows.list("evidence_kept"), float)  # None becomes NaN
+    difficulty = np.full(len(episodes), -1)
     found = rows.places("difficulty", DIFFICULTIES)
     difficulty[at[found >= 0]] = found[found >= 0]
     known = [name_system(system) for system in systems]
@@ -152,6 +158,7 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
         tuple(episodes),
         model_seeds,
         status,
+        evidence,
         difficulty,
         expected=np.array([key in wanted for key in places]),
         due=applies | (status >= 0).any(axis=(2, 3)),

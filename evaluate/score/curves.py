@@ -3,12 +3,20 @@
 Systems are told apart without colour, too, and in print.
 """
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Container, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import Any, Self
 
-from robomme_interference_data.conditions import NO_HISTORY, in_order, parse_condition
+from robomme_interference_data.conditions import (
+    NO_HISTORY,
+    Condition,
+    Kind,
+    in_order,
+    parse_condition,
+)
 from robomme_interference_data.drawing import GREY, INK, Hue, tidy
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.scoring import Score
@@ -104,14 +112,15 @@ class Data:
         beside: Published ones of systems with rows: dashes beside their points.
         looks: Of all of them.
         conditions: Of all of them, in the order of tables.
-        lift: Each condition's lift.
+        least: The fewest sessions that one of them counts.
+        contrasts: The comparisons of the systems that have rows.
     """
 
     def __init__(self, score: Score, simulator: str):
         self.simulator = simulator
         found = [one for one in score.cells if one.simulator == simulator and one.n]
         self.systems = list(dict.fromkeys(one.system for one in found))
-        self.lift = [c for c in score.contrasts if c.simulator == simulator and c.is_lift]
+        self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
         self.looks = looks_of([*self.systems, *bases])
         self.cells: dict[tuple[str, str, str], Cell] = {
@@ -127,13 +136,29 @@ class Data:
                 self.looks[name] = Look(f"{look.label}, published", look.colour, "_", line, 1.2)
                 self.cells[name, one.condition, ""] = one
         conditions = {condition for _, condition, _ in self.cells}
-        self.conditions = [one.name for one in in_order(conditions)] if conditions else []
+        self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
+        self.least = min((one.k for one in self.conditions if one.kind.counted), default=0)
+
+    @property
+    def kinds(self) -> list[Kind]:
+        """The kinds of its conditions, in the order of tables."""
+        return list(dict.fromkeys(one.kind for one in self.conditions))
+
+    def of(self, kinds: Container[Kind]) -> Self:
+        """Return what there is of some kinds of conditions, with the same places on the x axis."""
+        found = copy(self)
+        found.conditions = [one for one in self.conditions if one.kind in kinds]
+        names = {one.name for one in found.conditions}
+        found.cells = {key: cell for key, cell in self.cells.items() if key[1] in names}
+        found.systems = [one for one in self.systems if any(one == key[0] for key in found.cells)]
+        return found
 
     def x(self, condition: str) -> float:
-        """Return the place on the x axis: even, with a gap before another kind."""
-        kinds = [parse_condition(one).kind.name for one in self.conditions]
-        place = self.conditions.index(condition)
-        return place + 0.3 * len({*kinds[: place + 1]})
+        """Return the place on the x axis: log2(k + 1), right of conditions that do not count."""
+        one, plain = parse_condition(condition), [c for c in self.conditions if not c.kind.counted]
+        if not one.kind.counted:
+            return 0.3 + 1.3 * plain.index(one)
+        return 0.3 + 1.3 * len(plain) + math.log2((one.k + 1) / (self.least + 1))
 
     def parts(self, names: Sequence[str]) -> list[str]:
         """Return those of some parts that any cell is of."""
@@ -142,7 +167,7 @@ class Data:
     def shown(self, systems: Sequence[str]) -> list[str]:
         """Return the conditions that any cell of some systems is of."""
         found = {condition for system, condition, _ in self.cells if system in systems}
-        return [condition for condition in self.conditions if condition in found]
+        return [one.name for one in self.conditions if one.name in found]
 
 
 def dodged(systems: Sequence[str]) -> Iterator[tuple[str, float]]:
@@ -163,7 +188,7 @@ def curve(
         The last rate in percent, and the system's look; nothing without any rate.
     """
     look = data.looks[system]
-    found = [c for name in data.conditions if (c := data.cells.get((system, name, part)))]
+    found = [c for one in data.conditions if (c := data.cells.get((system, one.name, part)))]
     if not found:
         return []
     points = [(c.condition, data.x(c.condition) + shift, 100 * c.rate) for c in found]
@@ -191,12 +216,16 @@ def curve(
 
 
 def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None:
-    """Name the conditions of some systems, start at zero, and take away what carries nothing."""
+    """Name the conditions of some systems, start at zero, and take away what carries nothing.
+
+    Conditions of counted kinds are named by their k alone: those of one kind are joined.
+    """
     tidy(axes)
     conditions = data.shown(systems)
-    places = [data.x(condition) for condition in conditions]
-    axes.set_xticks(places, [short(condition) for condition in conditions])
-    axes.set_xlim(places[0] - 0.4, places[-1] + 0.4)
+    # Of kinds beside each other equal k have one place: it is named once.
+    places = dict(sorted((data.x(one), short(one).rpartition("-")[2]) for one in conditions))
+    axes.set_xticks(list(places), list(places.values()))
+    axes.set_xlim(min(places) - 0.4, max(places) + 0.4)
     axes.set_ylim(0, min(max(axes.get_ylim()[1], 10), 103))
     if ylabel:
         axes.set_ylabel(ylabel, size=8, color=INK)

@@ -1,4 +1,4 @@
-"""What conditions do to a system: lift, decay, retention, and how much is noise.
+"""What conditions do to a system: lift, decay, retention, kinds of interference, and noise.
 
 All comparisons are paired: they use the episodes that count under both conditions, and the
 episode is what is drawn in the bootstrap.
@@ -6,7 +6,6 @@ episode is what is drawn in the bootstrap.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,65 +22,36 @@ from robomme_interference_data.bootstrap import (
     slope,
 )
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
+from robomme_interference_data.evaluate.score.contrasts import START, SURE, Contrast, asked
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
-from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
-from robomme_interference_data.stats import cohens_h, wilson
+from robomme_interference_data.evaluate.score.pairs import pair
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table
-
-START = "k0"
-"""The condition that retention and contrasts begin at."""
-
-SURE = 0.05
-"""Below this p of McNemar's exact test, a lift is one that retention can be a share of."""
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """One paired comparison: what changes from `against` to the condition.
-
-    Attributes:
-        simulator, system, condition: Their names.
-        against: System and condition that it is compared with: the first side.
-        pairs: The comparison.
-        complete: Whether both cells are complete.
-        retention: Of a lift: what is left at the condition of the lift at k0.
-    """
-
-    simulator: str
-    system: str
-    condition: str
-    against: tuple[str, str]
-    pairs: Pairs
-    complete: bool
-    retention: Interval
-
-    @property
-    def is_lift(self) -> bool:
-        """Whether history is compared with none."""
-        return self.against[1] == NO_HISTORY != self.condition
 
 
 def effects_of(
-    cube: Cube, system: str, base: str | None, draws: int
+    cube: Cube, system: str, base: str | None, ceiling: str | None, draws: int
 ) -> tuple[list[Contrast], list[tuple[Any, ...]]]:
     """Compare a system's conditions with each other, all intervals from the same draws.
 
-    Each `k<n>` is compared with `no-history` and with k0, and under each condition a system with
-    retrieval with the one without. Other kinds of conditions are in no other comparison.
+    Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as `QUESTIONS` has
+    it, and under each condition a system with retrieval with the one without, and any with the
+    ceiling of its memory.
 
     Args:
         cube: What came of the rollouts.
         system: Name of the system.
         base: For a system with retrieval the one without: its `no-history` is both systems'. None
             if the two are not paired.
+        ceiling: The ideal observer with the same memory (see `access.ceiling_of`), or None.
         draws: Bootstrap samples.
 
     Returns:
         The comparisons, and the row of `decay_table`, if there are at least two `k<n>`.
     """
-    cells = [(name, c) for name in (system, base) if name for c in cube.ran(name)]
+    cells = [(name, c) for name in (system, base, ceiling) if name for c in cube.ran(name)]
     at = {cell: place for place, cell in enumerate(cells)}
-    here = np.logical_or.reduce([cube.there[cube.systems.index(name)] for name, _ in cells])
+    here = np.logical_or.reduce([cube.there[cube.systems.index(n)] for n in (system, base) if n])
     sides = [cube.status[cube.cell(*cell)][here] for cell in cells]
     values = np.stack([success(side) for side in sides], axis=1)
     complete = [bool(cube.complete[cube.cell(*cell)]) for cell in cells]
@@ -89,12 +59,15 @@ def effects_of(
     own = cube.ran(system)
     ks = [c for c in own if parse_condition(c).kind.name == "k"]
     later = [c for c in ks if c != START] if START in ks else []
-    floors = [(name, NO_HISTORY) for name in (system, base) if name and (name, NO_HISTORY) in at]
-    compared = [(c, floor) for floor in floors[:1] for c in ks]
-    compared += [(c, (system, START)) for c in later]
-    compared += [(c, (base, c)) for c in own if base and (base, c) in at]
+    floors = ((name, NO_HISTORY) for name in (system, base) if name)
+    floor = next((one for one in floors if one in at), None)
+    compared = {(c, floor): "lift" for c in ks if floor}
+    compared |= {(c, (system, START)): "effects" for c in later}
+    compared |= {(c, (base, c)): "effects" for c in own if base and (base, c) in at}
+    compared |= {(c, there): "interference" for c, there in asked(system, own, floor)}
+    compared |= {(c, (ceiling, c)): "ceiling" for c in own if ceiling and (ceiling, c) in at}
     places = [(at[there], at[system, c]) for c, there in compared]
-    kept = {c: (at[floor], at[system, START], at[system, c]) for floor in floors[:1] for c in later}
+    kept = {c: (at[floor], at[system, START], at[system, c]) for c in later if floor}
     falling = [at[system, c] for c in ks] if len(ks) > 1 else []
     line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
 
@@ -106,20 +79,19 @@ def effects_of(
         for one, (first, second) in zip(compared, places, strict=True)
     }
     retained = {
-        (c, floors[0]): _retained(_together(values, three), next(drawn))
-        for c, three in kept.items()
+        (c, floor): _retained(_together(values, three), next(drawn)) for c, three in kept.items()
     }
     # A lift that is not above zero beyond doubt is nothing to have a share of.
-    lift = pairs.get((START, floors[0])) if floors else None
+    lift = pairs.get((START, floor)) if floor else None
     if lift is None or not (lift.change.value > 0 and lift.p < SURE):
         retained = {}
     contrasts = [
         Contrast(
-            *(cube.simulator, system, c, there, pairs[c, there]),
+            *(cube.simulator, system, c, there, table, pairs[c, there]),
             complete=complete[first] and complete[second],
             retention=retained.get((c, there), Interval(math.nan)),
         )
-        for (c, there), (first, second) in zip(compared, places, strict=True)
+        for ((c, there), table), (first, second) in zip(compared.items(), places, strict=True)
     ]
     decays = []
     for one, fall in zip(line, drawn, strict=True):
@@ -145,54 +117,6 @@ def _retained(values: Floats, drawn: Interval) -> Interval:
 
 
 # --- tables ------------------------------------------------------------------------------------
-
-
-def lift_table(contrasts: Iterable[Contrast]) -> Table:
-    """Return each condition's lift over the system's own rate without history."""
-    found = [one for one in contrasts if one.is_lift]
-    pairs = [one.pairs for one in found]
-    rows = [
-        (
-            *(c.simulator, c.system, c.condition, c.against[0]),
-            *(c.pairs.n, c.pairs.second, c.pairs.first, *test, *c.retention, c.complete),
-        )
-        for c, test in zip(found, tested(pairs), strict=True)
-    ]
-    return Table.make(
-        "lift",
-        "Lift over no history",
-        "simulator system condition no_history_of n:count rate:rate no_history_rate:rate "
-        f"lift:points {COLUMNS} retention:ratio retention_low:ratio retention_high:ratio "
-        "complete:flag",
-        rows,
-        "Over the n episodes that count on both sides. "
-        f"{how_to_read(pairs)} retention: lift divided by the lift at k0, "
-        f"where that one is above zero with p < {SURE}; its BCa interval, where any two of "
-        f"no-history, k0 and the condition differ in at least {LEAST} episodes. A system with "
-        "retrieval is, without history, the system without it.",
-    )
-
-
-def contrast_table(contrasts: Iterable[Contrast]) -> Table:
-    """Return effect sizes between conditions, and of retrieval."""
-    found = [one for one in contrasts if not one.is_lift]
-    pairs = [one.pairs for one in found]
-    rows = [
-        (
-            *(c.simulator, c.system, c.condition, *c.against),
-            *(c.pairs.n, c.pairs.second, c.pairs.first, *test),
-            *(cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
-        )
-        for c, test in zip(found, tested(pairs), strict=True)
-    ]
-    return Table.make(
-        "effects",
-        "Effects between conditions",
-        "simulator system condition against_system against_condition n:count rate:rate "
-        f"against_rate:rate difference:points {COLUMNS} cohens_h:ratio complete:flag",
-        rows,
-        f"Over the n episodes that count on both sides. {how_to_read(pairs)}",
-    )
 
 
 def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cells import Cell
-from robomme_interference_data.evaluate.score.effects import START, Contrast
+from robomme_interference_data.evaluate.score.contrasts import START, Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.tables import percent, points
@@ -33,8 +33,12 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
     """Say what the best system reaches at k0 and how far it falls, or the best rate there is."""
     best = _best(complete, START) or _best(complete, _best(complete)[0].condition)
     leader, others = best[0], best[1:]
-    own = (leader.simulator, leader.system, (leader.system, START))
-    falls = [c for c in score.contrasts if (c.simulator, c.system, c.against) == own and c.pairs.n]
+    own = ("effects", leader.simulator, leader.system, (leader.system, START))
+    falls = [
+        c
+        for c in score.contrasts
+        if (c.table, c.simulator, c.system, c.against) == own and c.pairs.n
+    ]
     if leader.condition != START or not falls:
         first = (
             f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} "

@@ -7,7 +7,16 @@ from typing import Any
 
 from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import BadRowsError
-from robomme_interference_data.evaluate.score import Against, Grid, Settings, cells, effects, paper
+from robomme_interference_data.evaluate.score import (
+    Against,
+    Grid,
+    Settings,
+    access,
+    cells,
+    contrasts,
+    effects,
+    paper,
+)
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.evaluate.systems import base_of
@@ -15,7 +24,10 @@ from robomme_interference_data.files import write_text
 from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import load_jinja2
 
-TABLES = ("main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage", "paper")
+TABLES = (
+    *("main", "family", "difficulty", "lift", "effects", "interference", "access", "ceiling"),
+    *("decay", "noise", "coverage", "paper"),
+)
 """Every table that a score may have."""
 
 
@@ -29,7 +41,7 @@ class Score:
         rows: The rows.
         notes: What a reader must know, such as that two systems are not paired.
         cubes: What came of the rollouts, by simulator.
-        contrasts: Lifts and effects of all systems, in the order of tables.
+        contrasts: All comparisons of all systems, in the order of tables.
         published: Rates of the paper, if the score is set against them.
         cells: System × condition, over all episodes, by family and by difficulty.
         tables: All tables by name, the paper's main table aside.
@@ -41,7 +53,7 @@ class Score:
     rows: Rows
     notes: tuple[str, ...]
     cubes: Mapping[str, Cube]
-    contrasts: Sequence[effects.Contrast]
+    contrasts: Sequence[contrasts.Contrast]
     published: Sequence[cells.Cell]
     cells: Sequence[cells.Cell]
     tables: Mapping[str, Table]
@@ -68,29 +80,38 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             "Without any sound row there is nothing to score.",
         )
     cubes = cubes_of(rows, settings.grid)
-    contrasts: list[effects.Contrast] = []
+    compared: list[contrasts.Contrast] = []
     decays: list[tuple[Any, ...]] = []
     notes: list[str] = []
     for cube in cubes.values():
         for system in cube.systems:
-            base = base_of(system)
-            pair = [system, base] if base in cube.systems else []
-            # Of a split that one names and the other does not, nobody knows that it is the same.
-            unpinned = [one for one in pair if (cube.simulator, one) in rows.unpinned]
-            if len(unpinned) == 1:
-                pair = []
-                notes.append(
-                    f"{system} and {base} in {cube.simulator} are not paired: the rows of "
-                    f"{unpinned[0]} name no revision of a split, so their histories may differ."
-                )
-            found, decay = effects.effects_of(cube, system, base if pair else None, draws)
-            contrasts += found
+            beside: list[str | None] = []  # the systems that it is paired with
+            for other in (base_of(system), access.ceiling_of(system)):
+                pair = [system, other] if other in cube.systems else []
+                # Of a split that one names and the other does not, nobody knows whether it is one.
+                unpinned = [one for one in pair if (cube.simulator, one) in rows.unpinned]
+                if len(unpinned) == 1:
+                    pair = []
+                    notes.append(
+                        f"{system} and {other} in {cube.simulator} are not paired: the rows of "
+                        f"{unpinned[0]} name no revision of a split, so their histories may differ."
+                    )
+                beside.append(other if pair else None)
+            base, ceiling = beside
+            found, decay = effects.effects_of(cube, system, base, ceiling, draws)
+            compared += found
             decays += decay
     every = cells.cells_of(cubes.values())
+    beyond = [
+        contrasts.contrast_table(compared, "interference"),
+        access.access_table(cubes.values()),
+        contrasts.contrast_table(compared, "ceiling"),
+    ]
     tables = [
         *(cells.rate_table(every, name) for name in ("main", "family", "difficulty")),
-        effects.lift_table(contrasts),
-        effects.contrast_table(contrasts),
+        contrasts.lift_table(compared),
+        contrasts.contrast_table(compared, "effects"),
+        *(one for one in beyond if one.rows),
         effects.decay_table(decays),
         effects.noise_table(cubes.values()),
         cells.coverage_table(every),
@@ -107,7 +128,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         rows,
         tuple(notes),
         cubes,
-        contrasts,
+        compared,
         published,
         every,
         {table.name: table for table in tables},

@@ -1,5 +1,6 @@
 """What each column of a row of a rollout may hold."""
 
+import math
 import re
 from typing import Any
 
@@ -26,7 +27,7 @@ _NUMBERS = {
     "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION),
 }
 _WORDS = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
-_FRACTIONS = {name for name in COLUMNS if name.endswith("_fraction")}
+_FRACTIONS = {"evidence_kept", *(name for name in COLUMNS if name.endswith("_fraction"))}
 _OPTIONAL = {"seed", "difficulty", "steps", "success", "video", "retrieval_model", *_FRACTIONS}
 
 _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # programs save some whole numbers as floats
@@ -62,7 +63,17 @@ def parsed(name: str, value: Any) -> Any:
         if text.lower() not in _WORDS:
             raise ValueError("1, 0, true, false or nothing")
         return _WORDS[text.lower()]
-    return float(text) if name in _FRACTIONS else text
+    return _fraction(text) if name in _FRACTIONS else text
+
+
+def _fraction(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 1:
+        raise ValueError("a fraction from 0 to 1")
+    return value
 
 
 def shifted(simulator: str, shift: str) -> str:

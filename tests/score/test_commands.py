@@ -53,7 +53,8 @@ def test_score_and_export_on_the_command_line(
     assert value["rows"] == 1800 and value["grid"] == "benchmark"
     assert [one["successes"] for one in value["tables"]["main"]] == [202, 201, 202, 202]
     assert f"Report: {out / 'report.html'}" in done.stderr
-    assert {path.stem for path in (out / "tables").glob("*.csv")} == set(TABLES)
+    beyond = {"interference", "access", "ceiling"}  # what the paper's conditions do not have
+    assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
     kinds = ("difficulty", "families", "heatmap", "retrieval", "success")
     assert drawn == [f"{kind}-robomme{s}" for kind in kinds for s in (".png", ".svg")]

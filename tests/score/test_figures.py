@@ -113,11 +113,14 @@ def test_the_retention_figure_names_whom_it_leaves_out(tmp_path: Path, figure: A
 
 def test_only_conditions_of_a_kind_are_joined(tmp_path: Path, figure: Any, filler: None) -> None:
     given = {(OWN, c): "sf" for c in (NO_HISTORY, "k0", "k7", "filler-k1", "filler-k3")}
-    assert draw_figure("success", figure, data(tmp_path, cells(given)))
-    (axes,) = figure.axes
-    joined = [len(line.get_xdata()) for line in axes.lines if line.get_linewidth() == 1.6]
-    assert joined == [2, 2]
-    assert [text.get_text() for text in axes.get_xticklabels()][3:] == ["filler-k1", "filler-k3"]
+    assert draw_figure("kinds", figure, data(tmp_path, cells(given)))
+    panels = [axes for axes in figure.axes if axes.axison]
+    for axes in panels:
+        joined = [len(line.get_xdata()) for line in axes.lines if line.get_linewidth() == 1.6]
+        assert joined == [2]
+    assert [axes.get_title() for axes in panels] == ["k<n>", "filler-k<n>"]
+    names = [text.get_text() for text in panels[-1].get_xticklabels()]
+    assert names == ["none", "k0", "k1", "k3", "k7"]
     for kind in FIGURES:
         with open_figure() as other:
             draw_figure(kind, other, data(tmp_path, cells(given)))

@@ -163,7 +163,8 @@ def test_the_report_and_figures_are_the_same_bytes_each_time(
 ) -> None:
     folder = report.parent / "figures"
     suffixes = (".png", ".svg")
-    names = [f"{kind}-tabletop" for kind in FIGURES]
+    # Rows of the paper's conditions have no figures of others.
+    names = [f"{kind}-tabletop" for kind in FIGURES if kind not in ("kinds", "interference")]
     assert {p.name for p in folder.iterdir()} == {n + s for n in names for s in suffixes}
     again = {name: folder / f"{name}.svg" for name in names}
     write_report(small, again, report.parent / "again.html")

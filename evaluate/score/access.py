@@ -1,0 +1,63 @@
+"""Access against use: what came of rollouts whose memory kept the evidence, and of the others.
+
+A memory fails because the frames that show the answer are no longer in it (access), or because
+they are not used. Success where all of the evidence was kept tells the second; the gap to the
+ideal observer with the same memory is all that better use could win.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from robomme_interference_data.evaluate.score.cube import Cube, counting, success
+from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.stats import wilson
+from robomme_interference_data.tables import Table
+
+_CEILINGS = {
+    "frames": "recall-framesamp",
+    "all frames": "recall-full",
+    "last frames": "recall-window",
+}
+"""What a memory is made of, to the ideal observer whose memory keeps the same frames."""
+
+
+def ceiling_of(system: str) -> str | None:
+    """Return the ideal observer with a system's memory; None for itself, and where none is known.
+
+    Of a system with retrieval it is the observer behind the same step.
+    """
+    known = SYSTEMS.get(system)
+    if known is None or known.representation not in _CEILINGS:
+        return None
+    name = "retrieval-" * known.retrieval + _CEILINGS[known.representation]
+    return name if name != system else None
+
+
+def access_table(cubes: Iterable[Cube]) -> Table:
+    """Return the rates where all, some and none of the evidence was kept, by system and condition.
+
+    Cells of which no rollout tells what was kept are left out, and so are levels without episodes.
+    """
+    rows = []
+    for cube in cubes:
+        kept = cube.evidence
+        levels = {"all": kept == 1, "some": (kept > 0) & (kept < 1), "none": kept == 0}
+        for s, c in np.argwhere(cube.has_rows).tolist():
+            for name, chosen in levels.items():
+                status = np.where(chosen[s, c], cube.status[s, c], np.int8(-1))
+                rates = success(status)[counting(status).any(axis=-1)]
+                if n := len(rates):
+                    rate = float(rates.mean())
+                    cell = (cube.simulator, cube.systems[s], cube.conditions[c], name)
+                    rows.append((*cell, n, rate, *wilson(rate * n, n)))
+    return Table.make(
+        "access",
+        "Success by the evidence that was kept",
+        "simulator system condition kept n:count rate:rate low:rate high:rate",
+        rows,
+        "kept: whether all, some or none of the lesson's evidence spans have a frame in the memory "
+        "at the first step. Rates over the n episodes of which that is known, with 95% Wilson "
+        "intervals. They are of different episodes: where all was kept, failures are of use; "
+        "beside `none`, luck and what can be seen without a memory.",
+    )

@@ -1,0 +1,166 @@
+"""What is compared with what, episode by episode, and the tables of it."""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from robomme_interference_data.bootstrap import LEAST, Interval
+from robomme_interference_data.conditions import KINDS, NO_HISTORY, parse_condition
+from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, tested
+from robomme_interference_data.stats import cohens_h
+from robomme_interference_data.tables import Table
+
+START = "k0"
+"""The condition that retention and contrasts begin at."""
+
+SURE = 0.05
+"""Below this p of McNemar's exact test, a lift is one that retention can be a share of."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What two kinds of conditions, with equally many sessions, are compared for.
+
+    Attributes:
+        kind: Name of the kind whose conditions are compared.
+        against: Name of the kind that they are compared with: the first side.
+        asks: What is asked by it.
+    """
+
+    kind: str
+    against: str
+    asks: str
+
+
+_QUESTIONS = (
+    Question("k", "held", "content beyond dilution"),
+    Question("before", "k", "order"),
+    Question("middle", "k", "position"),
+    Question("same", "k", "similarity"),
+    Question("parts", "k", "scattered evidence"),
+    Question("raw", "k", "full rate"),
+    Question("absent", NO_HISTORY, "false memory"),
+    Question("stale", "k", "updating"),
+    Question("misled", NO_HISTORY, "belief"),
+)
+
+QUESTIONS: dict[str, Question] = {one.kind: one for one in _QUESTIONS}
+"""Kind to what its conditions are compared for, in the order of tables."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One paired comparison: what changes from `against` to the condition.
+
+    Attributes:
+        simulator, system, condition: Their names.
+        against: System and condition that it is compared with: the first side.
+        table: Name of the table that it stands in: `lift`, or one of `contrast_table`.
+        pairs: The comparison.
+        complete: Whether both cells are complete.
+        retention: Of a lift: what is left at the condition of the lift at k0.
+    """
+
+    simulator: str
+    system: str
+    condition: str
+    against: tuple[str, str]
+    table: str
+    pairs: Pairs
+    complete: bool
+    retention: Interval
+
+    @property
+    def asks(self) -> str:
+        """What is asked by a comparison of two kinds of conditions; empty for any other."""
+        kind = parse_condition(self.condition).kind.name
+        return QUESTIONS[kind].asks if self.table == "interference" else ""
+
+
+def asked(
+    system: str, conditions: Iterable[str], floor: tuple[str, str] | None
+) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield each condition that a question is about, with the system and condition it is against.
+
+    Args:
+        system: Name of a system.
+        conditions: Those under which it has rows.
+        floor: The system and condition that are its `no-history`, if there is one.
+    """
+    own = [parse_condition(name) for name in conditions]
+    cells = {(one.kind.name, one.k): (system, one.name) for one in own}
+    cells |= {(NO_HISTORY, 0): floor} if floor else {}
+    for one in own:
+        if question := QUESTIONS.get(one.kind.name):
+            k = one.k if KINDS[question.against].counted else 0
+            if there := cells.get((question.against, k)):
+                yield one.name, there
+
+
+# --- tables ------------------------------------------------------------------------------------
+
+
+def lift_table(contrasts: Iterable[Contrast]) -> Table:
+    """Return each condition's lift over the system's own rate without history."""
+    found = [one for one in contrasts if one.table == "lift"]
+    pairs = [one.pairs for one in found]
+    rows = [
+        (
+            *(c.simulator, c.system, c.condition, c.against[0]),
+            *(c.pairs.n, c.pairs.second, c.pairs.first, *test, *c.retention, c.complete),
+        )
+        for c, test in zip(found, tested(pairs), strict=True)
+    ]
+    return Table.make(
+        "lift",
+        "Lift over no history",
+        "simulator system condition no_history_of n:count rate:rate no_history_rate:rate "
+        f"lift:points {COLUMNS} retention:ratio retention_low:ratio retention_high:ratio "
+        "complete:flag",
+        rows,
+        "Over the n episodes that count on both sides. "
+        f"{how_to_read(pairs)} retention: lift divided by the lift at k0, "
+        f"where that one is above zero with p < {SURE}; its BCa interval, where any two of "
+        f"no-history, k0 and the condition differ in at least {LEAST} episodes. A system with "
+        "retrieval is, without history, the system without it.",
+    )
+
+
+_CONTRASTS = {
+    "effects": ("Effects between conditions", ""),
+    "interference": (
+        "Which interference hurts",
+        "Two kinds of conditions with equally many sessions, which differ in what is asked. ",
+    ),
+    "ceiling": (
+        "Gap to the ceiling",
+        "The ceiling is the ideal observer with the same memory: it uses all of the evidence that "
+        "the memory kept. ",
+    ),
+}
+
+
+def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
+    """Return effect sizes as the table `effects`, `interference` or `ceiling`."""
+    title, note = _CONTRASTS[name]
+    found = [one for one in contrasts if one.table == name]
+    pairs = [one.pairs for one in found]
+    asks = any(one.asks for one in found)
+    rows = [
+        (
+            *(c.simulator, c.system, c.condition, *c.against),
+            *([c.asks] if asks else []),
+            *(c.pairs.n, c.pairs.second, c.pairs.first, *test),
+            *(cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
+        )
+        for c, test in zip(found, tested(pairs), strict=True)
+    ]
+    return Table.make(
+        name,
+        title,
+        f"simulator system condition against_system against_condition {'asks' if asks else ''} "
+        f"n:count rate:rate against_rate:rate difference:points {COLUMNS} cohens_h:ratio "
+        "complete:flag",
+        rows,
+        f"{note}Over the n episodes that count on both sides. {how_to_read(pairs)}",
+    )
