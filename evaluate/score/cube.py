@@ -142,8 +142,8 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
 
     shape = (len(systems), len(conditions), len(episodes), len(model_seeds))
     status, evidence = np.full(shape, -1, np.int8), np.full(shape, np.nan)
-    axes = (rows.places("system", systems), rows.places("condition", conditions), at)
-    axes += (rows.places("model_seed", model_seeds),)
+    cell = (rows.places("system", systems), rows.places("condition", conditions))
+    axes = (*cell, at, rows.places("model_seed", model_seeds))
     status[axes] = rows.places("status", STATUSES)
     evidence[axes] = np.array(rows.list("evidence_kept"), float)  # None becomes NaN
     difficulty = np.full(len(episodes), -1)

@@ -3,7 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, product
+from itertools import accumulate, groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class Rows:
         sources: The files that were read (see `sources.find_sources`).
         revisions: Simulator to the revision of its split, where rows name one.
         unpinned: Simulator and system of rows that name no revision, as released ones.
+        retrieval: Simulator and system to the retrieval steps in front of it, if there are any.
         refusals: The first bad rows that were left out: place and reason.
         refused: How many were.
     """
@@ -53,6 +54,7 @@ class Rows:
     sources: Mapping[Path, RunHeader | None]
     revisions: dict[str, str] = field(default_factory=dict)
     unpinned: frozenset[tuple[str, str]] = frozenset()
+    retrieval: Mapping[tuple[str, str], str] = field(default_factory=dict)
     refusals: tuple[str, ...] = ()
     refused: int = 0
 
@@ -120,7 +122,15 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
             f"{revisions[simulator]}, others name no revision, as released rows do",
             "Their histories may differ: score the files apart, or compare them.",
         )
-    return replace(rows, sources=sources, revisions=revisions, unpinned=unpinned)
+    names = ("simulator", "system", "retrieval_model")
+    steps = sorted({one for one in zip(*map(rows.list, names), strict=True) if one[-1] is not None})
+    retrieval = {
+        cell: ", ".join(step for *_, step in group)
+        for cell, group in groupby(steps, lambda one: one[:2])
+    }
+    return replace(
+        rows, sources=sources, revisions=revisions, unpinned=unpinned, retrieval=retrieval
+    )
 
 
 class _Joined:

@@ -85,20 +85,14 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     notes: list[str] = []
     for cube in cubes.values():
         for system in cube.systems:
-            beside: list[str | None] = []  # the systems that it is paired with
-            for other in (base_of(system), access.ceiling_of(system)):
-                pair = [system, other] if other in cube.systems else []
-                # Of a split that one names and the other does not, nobody knows whether it is one.
-                unpinned = [one for one in pair if (cube.simulator, one) in rows.unpinned]
-                if len(unpinned) == 1:
-                    pair = []
-                    notes.append(
-                        f"{system} and {other} in {cube.simulator} are not paired: the rows of "
-                        f"{unpinned[0]} name no revision of a split, so their histories may differ."
-                    )
-                beside.append(other if pair else None)
-            base, ceiling = beside
-            found, decay = effects.effects_of(cube, system, base, ceiling, draws)
+            beside = {"base": base_of(system), "ceiling": access.ceiling_of(system)}
+            for role, other in beside.items():
+                if other is None or other not in cube.systems:
+                    beside[role] = None
+                elif why := _unpaired(rows, cube.simulator, system, other):
+                    beside[role] = None
+                    notes.append(f"{system} and {other} in {cube.simulator} are not paired: {why}.")
+            found, decay = effects.effects_of(cube, system, **beside, draws=draws)
             compared += found
             decays += decay
     every = cells.cells_of(cubes.values())
@@ -134,6 +128,20 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         {table.name: table for table in tables},
         cells.main_grids(every),
     )
+
+
+def _unpaired(rows: Rows, simulator: str, system: str, other: str) -> str:
+    """Return why two systems' histories may differ; nothing if they are the same."""
+    # Of a split that one names and the other does not, nobody knows whether it is one.
+    unpinned = [one for one in (system, other) if (simulator, one) in rows.unpinned]
+    if len(unpinned) == 1:
+        return (
+            f"the rows of {unpinned[0]} name no revision of a split, so their histories may differ"
+        )
+    steps = [rows.retrieval.get((simulator, one)) for one in (system, other)]
+    if None not in steps and steps[0] != steps[1]:
+        return f"they are behind other retrieval steps, {' and '.join(map(str, steps))}"
+    return ""
 
 
 def write_score(

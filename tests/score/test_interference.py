@@ -198,6 +198,23 @@ def test_the_gap_to_the_ceiling_is_paired(small: Score) -> None:
     assert (k3["difference"], k3["lost"], k3["n"]) == (pytest.approx(-2 / 6), 2, 6)
 
 
+def test_a_ceiling_is_behind_the_same_retrieval_step(tmp_path: Path) -> None:
+    own, ceiling = "retrieval-replay-full", "retrieval-recall-full"
+    rows = made.cells({(own, "k0"): "sf", (ceiling, "k0"): "ss", ("replay-full", "k0"): "sf"})
+
+    def steps(*names: str | None) -> Score:
+        of = dict(zip((own, ceiling), names, strict=True))
+        given = [replace(row, retrieval_model=of.get(row.system)) for row in rows]
+        return made.score(made.write_parquet(tmp_path / "a.parquet", given))
+
+    assert record(steps("siglip", "siglip"), "ceiling")["system"] == own
+    found = steps("siglip", "thumbnail")
+    assert "ceiling" not in found.tables
+    (note,) = found.notes
+    assert "other retrieval steps, siglip and thumbnail" in note
+    assert record(found, "effects")["against_system"] == "replay-full"  # that one has none
+
+
 def test_a_ceiling_changes_nothing_of_the_other_tables(tmp_path: Path, small: Score) -> None:
     without = {cell: text for cell, text in OUTCOMES.items() if cell[0] == REPLAY}
     found = scored(tmp_path, without)
