@@ -58,6 +58,6 @@ def access_table(cubes: Iterable[Cube]) -> Table:
         rows,
         "kept: whether all, some or none of the lesson's evidence spans have a frame in the memory "
         "at the first step. Rates over the n episodes of which that is known, with 95% Wilson "
-        "intervals. They are of different episodes: where all was kept, failures are of use; "
-        "beside `none`, luck and what can be seen without a memory.",
+        "intervals. They are of different episodes. Where all was kept, a failure is one of use; "
+        "where none was, a success is luck, or needs no memory.",
     )
