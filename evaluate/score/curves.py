@@ -42,7 +42,7 @@ _SHAPES = {
     "expert": ("^", ":"),
     "subgoals": ("D", "-."),
 }
-_LINES = ("-", "--", "-.", ":")
+_LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
 
 
 @dataclass(frozen=True)
