@@ -14,13 +14,6 @@ from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table
 
-_CEILINGS = {
-    "frames": "recall-framesamp",
-    "all frames": "recall-full",
-    "last frames": "recall-window",
-}
-"""What a memory is made of, to the ideal observer whose memory keeps the same frames."""
-
 
 def ceiling_of(system: str) -> str | None:
     """Return the ideal observer with a system's memory; None for itself, and where none is known.
@@ -28,9 +21,9 @@ def ceiling_of(system: str) -> str | None:
     Of a system with retrieval it is the observer behind the same step.
     """
     known = SYSTEMS.get(system)
-    if known is None or known.representation not in _CEILINGS:
+    if known is None or known.sampling is None:
         return None
-    name = "retrieval-" * known.retrieval + _CEILINGS[known.representation]
+    name = f"{'retrieval-' * known.retrieval}recall-{known.sampling}"
     return name if name != system else None
 
 
