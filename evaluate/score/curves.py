@@ -88,9 +88,8 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
     own = [name for name in names if name not in SYSTEMS]
     for name in names:
         if name in own:
-            number = own.index(name)
-            colour = _OWN[(number + number // len(_FREE)) % len(_OWN)]
-            looks[name] = Look(name, colour, *_FREE[number % len(_FREE)])
+            round_, shape = divmod(own.index(name), len(_FREE))
+            looks[name] = Look(name, _OWN[(shape + round_) % len(_OWN)], *_FREE[shape])
         elif name in retrieving:
             system, number = SYSTEMS[name], retrieving.index(name)
             colour = _COLOURS[system.representation] if len(retrieving) > 1 else "#000000"

@@ -26,7 +26,7 @@ def row(item: WorkItem, status: str) -> Rollout:
     success = None if status == "error" else status == "success"
     return Rollout(
         *("mine", "world", "split", "r", item.episode.family, item.condition, "test"),
-        *(item.episode.index, 0, 1, 7, "easy", "a goal", status, success, 0, 0, 0, None),
+        *(item.episode.index, "none", 0, 1, 7, "easy", "a goal", status, success, 0, 0, 0, None),
         error="it broke" if status == "error" else None,
     )
 

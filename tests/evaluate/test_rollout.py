@@ -160,7 +160,7 @@ def test_the_row_says_what_was_given(tiny_split: Path) -> None:
     manifest = split.manifest(EPISODE, "k3")
     assert row.key == (
         *("mine", "support.worlds:World", "split", split.revision),
-        *("MoveCube", "k3", "test", 0, 0, 1),
+        *("MoveCube", "k3", "test", 0, "none", 0, 1),
     )
     assert (row.seed, row.difficulty, row.goal) == (
         manifest.seed,

@@ -116,6 +116,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         "revision": load_split(indexed).revision,
         "encoder": "thumbnail",
         "camera": "front",
+        "shift": "none",
         "buffers": 12,
         "left_out": 3,
         "rules": ["max/adaptive"],
