@@ -63,14 +63,16 @@ def simulate() -> None:
     played = "--source tabletop --split test --episodes 0"
     run(f"build demonstrations {played} --out {out}/demonstrations")
     run(f"build distractors --source tabletop --episodes 2 --out {out}/distractors")
-    run(f"build manifests {out}")
+    # Beside the paper's: the lesson after the units, delay without content, and no lesson at all.
+    paper, beyond = "no-history k0 k1 k3 k7", "before-k7 held-k7 absent-k7"
+    run(f"build manifests {out} --conditions {paper} {beyond}")
     run(f"show PatternLock/test/0 k7 --split {out} --out {DEMO}/tabletop.png")
 
 
 def evaluate() -> None:
     """Roll out the controls on a handful of episodes under all conditions, and score them."""
     policies = {f"replay-{m}": f"replay:{m}" for m in ("framesamp", "window")}
-    policies |= {"guess": "guess", "oracle": "oracle"}
+    policies |= {"recall-framesamp": "recall:framesamp", "guess": "guess", "oracle": "oracle"}
     runs = [DEMO / "runs" / system for system in policies]
     for out, policy in zip(runs, policies.values(), strict=True):
         run(
