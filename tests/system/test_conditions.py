@@ -13,7 +13,6 @@ from support.runs import run as evaluate
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.constants import DATASETS
 from robomme_interference_data.query import Query
 
 Login = Callable[..., None]
@@ -101,6 +100,7 @@ def test_rollouts_and_scores_of_other_kinds(split: Path, run: Run, tmp_path: Pat
 
 
 FURTHER = ("raw-k1", "stale-k1", "misled-k0")
+NEEDED = ("distractors-raw", "contradictions")
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_further_datasets_go_to_the_hub_and_back(
         code, out, err = run(command, root)
         assert code == 0, out + err
     here = load_split(root)
-    assert {*here.datasets} == {*DATASETS}
+    assert {*here.datasets} == {"demonstrations", "distractors", *NEEDED}
     lesson, unit = here.manifest(QUERY, "k1").sessions
     raw, stale = here.load(QUERY, "raw-k1"), here.load(QUERY, "stale-k1")
     assert raw.manifest.sessions[1].source == unit.source

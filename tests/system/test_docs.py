@@ -75,6 +75,7 @@ ELSEWHERE = (
     "--simulator robomme",  # the official simulator
     "simulate ",  # a renderer
     "--source ",  # recordings, or a renderer
+    "--shift ",  # a renderer
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
 )
