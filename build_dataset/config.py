@@ -150,8 +150,10 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
     Raises:
         InvalidOptionError: What is given as demonstrations is a folder, or of another kind; and as
             `plan_all`.
+        SourceError: A condition needs a dataset that the split lacks; and as `plan_all`.
         HubError, MissingFileError, FormatError: The demonstrations cannot be read.
     """
+    from robomme_interference_data.build_dataset.material import check_needs, in_folder
     from robomme_interference_data.dataset import Dataset
     from robomme_interference_data.hub import HubFiles, locate
 
@@ -165,6 +167,7 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             "demonstrations in a folder: robomme-interference build all, or build distractors and "
             "build manifests.",
         )
+    check_needs(in_order(plan.conditions), in_folder(config.out))
     cameras = config.cameras or base.cameras
     units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))
     queries = (record.episode_id for record in base.records())

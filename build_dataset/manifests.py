@@ -12,7 +12,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from robomme_interference_data.build_dataset.material import ManifestPlan, QueryMaterial
-from robomme_interference_data.conditions import Condition
 from robomme_interference_data.constants import (
     FORMAT_VERSION,
     IDENTITY_PATH,
@@ -36,13 +35,10 @@ from robomme_interference_data.parquet import writing
 from robomme_interference_data.query import Query
 from robomme_interference_data.records import (
     BufferManifest,
-    EpisodeRecord,
     ManifestDataset,
     ManifestHeader,
-    place_sessions,
 )
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
-from robomme_interference_data.sampling import lesson_frames, lesson_share
 
 _BATCH = 1024
 """Rows in a row group: few bytes find one buffer."""
@@ -63,41 +59,26 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
         if not e.exact
     }
     for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
-        place, material = Query(plan.demonstrations, record).place, QueryMaterial(plan, record)
+        query, material = Query(plan.demonstrations, record), QueryMaterial(plan, record)
         # The largest first: fewer units begin those that are drawn for it.
         sessions = {one.name: one.sessions(material) for one in reversed(plan.conditions)}
         for condition in plan.conditions:
             entries = sessions[condition.name]
-            lessons = place_sessions(entries, "lesson")
-            frames = sum(one.num_frames for one in entries)
-            _check_length(plan, record, condition, frames)
-            yield BufferManifest(
-                episode_id=record.episode_id,
-                condition=condition.name,
-                k=condition.k,
-                goals=record.goals,
-                seed=record.seed,
-                difficulty=record.difficulty,
-                simulator=record.simulator,
-                exact=record.exact
-                and not (lossy and any((one.dataset, one.source) in lossy for one in entries)),
-                lesson_frames=lesson_frames(lessons, 0, frames),
-                history_frames=frames,
-                lesson_share=lesson_share(lessons, 0, frames),
-                query=place,
-                sessions=entries,
+            exact = record.exact and not (
+                lossy and any((one.dataset, one.source) in lossy for one in entries)
             )
+            manifest = query.manifest(condition, entries, exact=exact)
+            _check_length(manifest, plan.position_limit)
+            yield manifest
 
 
-def _check_length(
-    plan: ManifestPlan, record: EpisodeRecord, condition: Condition, frames: int
-) -> None:
+def _check_length(manifest: BufferManifest, limit: int | None) -> None:
     """Check that a buffer and its rollout fit the systems' position embeddings (rule 8)."""
-    needed, limit = frames + MAX_STEPS, plan.position_limit
+    needed = manifest.history_frames + MAX_STEPS
     if limit is not None and needed > limit:
         raise HistoryTooLongError(
-            f"{record.episode_id} under {condition} needs {needed} positions ({frames} history "
-            f"frames + {MAX_STEPS} steps); the released servers hold {limit}",
+            f"{manifest} needs {needed} positions ({manifest.history_frames} history frames + "
+            f"{MAX_STEPS} steps); the released servers hold {limit}",
             "Leave out that condition, or --position-limit none for systems without such a limit.",
         )
 

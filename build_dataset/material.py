@@ -3,7 +3,7 @@
 Rules 1 to 5 of the protocol; the draw itself is `draw.py`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,9 +23,8 @@ from robomme_interference_data.constants import (
     UNITS,
 )
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.digest import combine
 from robomme_interference_data.draw import UnitPool
-from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.errors import FormatError, InvalidOptionError, SourceError
 from robomme_interference_data.files import Files, LocalFiles
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EpisodeRecord, SessionEntry
@@ -77,7 +76,7 @@ class ManifestPlan:
         """The sessions of datasets; contradictions by the query that they contradict."""
         return {
             name: {
-                one.episode_id.scene: _entry(ROLE_OF[name], dataset, one)
+                one.episode_id.scene: dataset.session(ROLE_OF[name], one)
                 for one in dataset.records()
             }
             for name, dataset in self.datasets.items()
@@ -121,12 +120,7 @@ def plan_manifests(
             conditions need a dataset that is not there.
     """
     ordered = in_order(conditions)
-    for condition in ordered:
-        if lacking := [name for name in condition.kind.needs if name not in places]:
-            raise SourceError(
-                f"{condition} needs the dataset {lacking[0]}, which the split lacks",
-                f"Build it first: robomme-interference build {lacking[0]} --out S/{lacking[0]}",
-            )
+    check_needs(ordered, places)
     opened = {}
     for name, files in places.items():
         opened[name] = dataset = Dataset(files)
@@ -149,6 +143,26 @@ def plan_manifests(
     return ManifestPlan(opened, ordered, seed, position_limit)
 
 
+def check_needs(conditions: Iterable[Condition], there: Collection[str]) -> None:
+    """Check that a split has the datasets that conditions need.
+
+    Args:
+        conditions: The conditions.
+        there: Names of the datasets that it has.
+
+    Raises:
+        SourceError: One is not there.
+    """
+    for condition in conditions:
+        for name in condition.kind.needs:
+            if name not in there:
+                raise SourceError(
+                    f"{condition} needs the dataset {name}, which the split lacks",
+                    f"Build it first: robomme-interference build {name} --source KIND:PATH "
+                    f"--out SPLIT/{name}. Or leave {condition} out.",
+                )
+
+
 def _check_features(datasets: Mapping[str, Dataset]) -> None:
     """Check that sessions of all datasets can follow one another in a buffer."""
     shown = {
@@ -158,9 +172,9 @@ def _check_features(datasets: Mapping[str, Dataset]) -> None:
     for name, features in shown.items():
         if features != shown[DEMONSTRATIONS]:
             raise SourceError(
-                "sessions of both datasets cannot follow one another in a buffer: the "
+                "sessions of the datasets cannot follow one another in a buffer: the "
                 f"demonstrations have {shown[DEMONSTRATIONS]}, the {name} {features}",
-                "Build both with the same --cameras, from sources with the same sizes.",
+                "Build all with the same --cameras, from sources with the same sizes.",
             )
 
 
@@ -192,6 +206,9 @@ class QueryMaterial:
         whole = self._plan.session(DEMONSTRATIONS, record.episode_id)
         if part == "lesson":
             return whole
+        if part not in record.spans or record.span_sha256 is None:
+            where = self._plan.demonstrations.files.describe()
+            raise FormatError.damaged(where, f"{record.episode_id}: no digests of its parts")
         start, stop = record.spans[part]
         sha256 = getattr(record.span_sha256, part)
         found = replace(whole, start=start, stop=stop, sha256=sha256)
@@ -214,10 +231,3 @@ class QueryMaterial:
             draw = self._plan.pool.draw_own if own else self._plan.pool.draw
             self._drawn[own] = draw(self._record.episode_id, k)
         return self._drawn[own][:k]
-
-
-def _entry(role: str, dataset: Dataset, record: EpisodeRecord) -> SessionEntry:
-    """Return the session that an episode is."""
-    name, sha256 = record.episode_id, combine(record.feature_sha256)
-    place = dataset.kind, dataset.revision, record.episode_index
-    return SessionEntry(role, name.family, name, *place, *record.session, 1, sha256)

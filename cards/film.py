@@ -5,17 +5,10 @@ from functools import cached_property
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts
-from robomme_interference_data.digest import combine
+from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.query import Query
-from robomme_interference_data.records import (
-    BufferManifest,
-    EpisodeRecord,
-    SessionEntry,
-    place_sessions,
-)
-from robomme_interference_data.sampling import lesson_share
-from robomme_interference_data.strip import strip_png
+from robomme_interference_data.strip import shown_camera, strip_png
 
 FIRST_CHOICE = "k3"
 """The condition that a strip shows if there is such a one."""
@@ -40,13 +33,12 @@ class Film:
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
         self.buffer.fetch([self.camera])
-        return strip_png(self.buffer, self.camera)
+        return strip_png(self.buffer)
 
     @property
     def camera(self) -> str:
         """The camera that is shown."""
-        cameras = self.buffer.cameras
-        return "front" if "front" in cameras else cameras[0]
+        return shown_camera(self.buffer)
 
     @property
     def condition(self) -> str:
@@ -87,30 +79,6 @@ def film_of_lesson(facts: DatasetFacts) -> Film:
     if not facts.records:
         raise FormatError.damaged(dataset.files.describe(), "no episodes")
     record = facts.records[0]
-    query = Query(dataset, record)
-    sessions = (_lesson(facts, record, query.lesson_frames),)
-    manifest = BufferManifest(
-        episode_id=record.episode_id,
-        condition="k0",
-        k=0,
-        goals=record.goals,
-        seed=record.seed,
-        difficulty=record.difficulty,
-        simulator=record.simulator,
-        exact=record.exact,
-        lesson_frames=query.lesson_frames,
-        history_frames=query.lesson_frames,
-        lesson_share=lesson_share(place_sessions(sessions), 0, query.lesson_frames),
-        query=query.place,
-        sessions=sessions,
-    )
+    query, lesson = Query(dataset, record), dataset.session("lesson", record)
+    manifest = query.manifest(parse_condition("k0"), (lesson,), exact=record.exact)
     return Film(Buffer(manifest, query, {dataset.kind: dataset}))
-
-
-def _lesson(facts: DatasetFacts, record: EpisodeRecord, frames: int) -> SessionEntry:
-    dataset, name = facts.dataset, record.episode_id
-    if record.exec_start_idx is None:
-        raise FormatError.damaged(dataset.files.describe(), f"{name}: no lesson")
-    place = dataset.kind, dataset.revision, record.episode_index
-    sha256 = combine(record.feature_sha256)
-    return SessionEntry("lesson", name.family, name, *place, 0, frames, 1, sha256)

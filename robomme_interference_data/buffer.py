@@ -99,7 +99,7 @@ class Buffer:
         from robomme_interference_data.strip import strip_png
 
         with suppress(MissingExtraError):
-            return strip_png(self, "front" if "front" in self.cameras else self.cameras[0])
+            return strip_png(self)
         return None
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""A dataset of history sessions: demonstrations or distractor units, on disk or on the Hub.
+"""One of a split's datasets, on disk or on the Hub: demonstrations, distractor units, ….
 
 A LeRobot dataset in which every episode has files of its own, with our columns in `meta/episodes`,
 a lean copy of that table in `meta/interference.parquet`, and its identity in
@@ -22,7 +22,7 @@ from robomme_interference_data.constants import (
     STATE,
     SUMS_PATH,
 )
-from robomme_interference_data.digest import SpanDigester
+from robomme_interference_data.digest import SpanDigester, combine
 from robomme_interference_data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import (
     FormatError,
@@ -33,7 +33,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import Files, read_sums, sha256_file
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
-from robomme_interference_data.records import DatasetIdentity, EpisodeRecord
+from robomme_interference_data.records import DatasetIdentity, EpisodeRecord, SessionEntry
 from robomme_interference_data.rows import from_dict, read_header
 
 
@@ -49,7 +49,7 @@ def camera_feature(camera: str) -> str:
 
 
 class Dataset:
-    """Demonstrations or distractor units.
+    """One of a split's datasets; which, its `kind` says.
 
     Args:
         files: How to reach the files.
@@ -145,6 +145,17 @@ class Dataset:
             for index, row in enumerate(self.lerobot.table.to_pylist()):
                 self._records[index] = from_dict(EpisodeRecord, row, where)
         return (self._records[index] for index in range(len(self)))
+
+    def session(self, role: str, record: EpisodeRecord) -> SessionEntry:
+        """Return the session that an episode of the dataset is: a whole lesson, or a unit.
+
+        Args:
+            role: What it is to a query, one of `records.ROLES`.
+            record: The episode's record.
+        """
+        name, sha256 = record.episode_id, combine(record.feature_sha256)
+        place = self.kind, self.revision, record.episode_index
+        return SessionEntry(role, name.family, name, *place, *record.session, 1, sha256)
 
     def index_of(self, episode: EpisodeId) -> int:
         """Return the number of an episode in the dataset, by its id.

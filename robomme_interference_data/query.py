@@ -5,11 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.conditions import Condition
 from robomme_interference_data.constants import STATE
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord, QueryFrame
+from robomme_interference_data.records import (
+    BufferManifest,
+    EpisodeRecord,
+    QueryFrame,
+    SessionEntry,
+    place_sessions,
+)
+from robomme_interference_data.sampling import lesson_frames, lesson_share
 
 
 @dataclass(frozen=True)
@@ -67,6 +75,34 @@ class Query:
         """Where the first live observation is stored."""
         dataset, index = self.dataset, self.record.episode_index
         return QueryFrame(dataset.kind, dataset.revision, index, self.lesson_frames)
+
+    def manifest(
+        self, condition: Condition, sessions: tuple[SessionEntry, ...], *, exact: bool
+    ) -> BufferManifest:
+        """Return the manifest of the query's buffer under a condition.
+
+        Args:
+            condition: The condition.
+            sessions: What the buffer holds, in order.
+            exact: Whether all frames are the recorded ones, bit for bit.
+        """
+        record, lessons = self.record, place_sessions(sessions, "lesson")
+        frames = sum(one.num_frames for one in sessions)
+        return BufferManifest(
+            episode_id=record.episode_id,
+            condition=condition.name,
+            k=condition.k,
+            goals=record.goals,
+            seed=record.seed,
+            difficulty=record.difficulty,
+            simulator=record.simulator,
+            exact=exact,
+            lesson_frames=lesson_frames(lessons, 0, frames),
+            history_frames=frames,
+            lesson_share=lesson_share(lessons, 0, frames),
+            query=self.place,
+            sessions=sessions,
+        )
 
     def frame(self, camera: str = "front") -> NDArray[np.uint8]:
         """Decode the first live observation, `(H, W, 3) uint8` RGB.

@@ -155,11 +155,16 @@ def draw_strip(
         page.height = bottom + 0.28
 
 
-def strip_png(buffer: Buffer, camera: str = "front") -> bytes:
-    """Return what `draw_strip` draws, as PNG."""
+def shown_camera(buffer: Buffer) -> str:
+    """Return the camera of a strip for which none is chosen: the front one if there is one."""
+    return "front" if "front" in buffer.cameras else buffer.cameras[0]
+
+
+def strip_png(buffer: Buffer) -> bytes:
+    """Return what `draw_strip` draws of the camera that `shown_camera` names, as PNG."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "strip.png"
-        draw_strip(buffer, out, camera=camera)
+        draw_strip(buffer, out, camera=shown_camera(buffer))
         return out.read_bytes()
 
 

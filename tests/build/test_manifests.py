@@ -16,6 +16,7 @@ from robomme_interference_data.digest import combine
 from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import (
     BuildError,
+    FormatError,
     HistoryTooLongError,
     InvalidOptionError,
     MissingFileError,
@@ -121,6 +122,15 @@ def test_what_buffers_beyond_the_paper_hold(tmp_path: Path) -> None:
     ]
     assert (begin.sha256, end.sha256) == ("1", "2")
     assert found["parts-k2"].lesson_frames == 33
+
+
+def test_a_lesson_whose_parts_have_no_digests_is_refused(tmp_path: Path) -> None:
+    queries = [record("demonstrations", "MoveCube/test/0", span_sha256=None)]
+    root = made_up(tmp_path, queries=queries)
+    assert len(list(planned_buffers(plan_manifests(in_folder(root), ("k1",))))) == 1
+    for name in ("parts-k1", "held-k1"):
+        with pytest.raises(FormatError, match="MoveCube/test/0: no digests of its parts"):
+            list(planned_buffers(plan_manifests(in_folder(root), (name,))))
 
 
 def test_datasets_that_conditions_need(tmp_path: Path) -> None:
