@@ -131,7 +131,7 @@ def run_evaluation(
     if any(item not in there or not is_done(there[item]) for item in items):
         check_simulator(config, policy.cameras, executor)
     versions = simulator_versions(config.simulator, config.robomme_python)
-    identity = _identity(config, name, split, said, versions)
+    identity = _identity(config, name, split, plan, said, versions)
     with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
         # The same split may be in another folder by now: rows keep one label for it.
         run = Run(config, name, log.header.split, split.revision)
@@ -226,12 +226,11 @@ def _identity(
     config: RunConfig,
     system: str,
     split: Split,
+    plan: Plan,
     said: Mapping[str, Any],
     versions: Mapping[str, str],
 ) -> dict[str, Any]:
     """Return what makes the run the one that it is, as plain values."""
-    selector = make_selector(config)
-    buffer = split.load(split.episode_ids[0], split.conditions[0], cameras=())
     return {
         "system": system,
         "simulator": config.simulator,
@@ -240,10 +239,24 @@ def _identity(
         "episode_split": config.episode_split,
         "shift": config.shift,
         "model_seed": config.model_seed,
-        "retrieval_index": None if selector is None else plain(selector.identity(buffer)),
+        "retrieval_index": _retrieval_index(config, split, plan),
         "protocol_version": PROTOCOL_VERSION,
         **policy_identity(config.policy, config.policy_options, said),
     }
+
+
+def _retrieval_index(config: RunConfig, split: Split, plan: Plan) -> Any:
+    """Return what the retrieval step's choices depend on; None without one.
+
+    Looks for the index of every dataset that a planned condition needs.
+    """
+    selector = make_selector(config)
+    if selector is None:
+        return None
+    found = None  # the same for all: the buffers of a condition need the same datasets
+    for name in plan.conditions:
+        found = selector.identity(next(split.buffers(condition=name)))
+    return plain(found)
 
 
 def _start(

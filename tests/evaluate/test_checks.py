@@ -6,9 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.retrieval import QUIET, make_index
 from support.runs import CHEAT, config, run, run_one
+from support.splits import QUERIES, copy_split
 
 from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.manifests import write_manifests
+from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
+from robomme_interference_data.constants import CONTRADICTIONS
 from robomme_interference_data.errors import (
     HistoryTooLongError,
     InterferenceError,
@@ -84,6 +92,21 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
         run(tmp_path / "run", **changes)
     assert words in raised.value.message
     assert not (tmp_path / "run").exists()
+
+
+def test_every_condition_must_have_its_indexes(tmp_path: Path) -> None:
+    split, source = copy_split(tmp_path / "split"), SampleSource(size=32)
+    listed = list_episodes((source,), split="test", families=[one.split("/")[0] for one in QUERIES])
+    tasks = tuple((number, source.contradict(one)) for number, one in listed)
+    plan = BuildPlan(CONTRADICTIONS, (source,), tasks)
+    build_dataset(plan, split / CONTRADICTIONS, Serial(), QUIET)
+    sum(write_manifests(plan_manifests(in_folder(split), ("k0", "stale-k0")), split))
+    make_index(split)
+    asked = {"split": split, "retrieval": "thumbnail", "families": ("MoveCube",)}
+    with pytest.raises(MissingIndexError, match=f"{CONTRADICTIONS} has no embeddings"):
+        run(tmp_path / "run", **asked, conditions=("k0", "stale-k0"))
+    assert not (tmp_path / "run").exists()
+    assert run(tmp_path / "run", **asked, conditions=("k0",)).counts["error"] == 0
 
 
 def test_only_simulators_that_exist_are_offered(
