@@ -135,10 +135,17 @@ def publish(
     """
     from robomme_interference_data.cards.checks import check_split
     from robomme_interference_data.cards.upload import HubRepository
+    from robomme_interference_data.constants import DEMONSTRATIONS, INDEX_DIR
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
     opened = load_split(split)
+    here = opened.header.datasets[DEMONSTRATIONS].place is None  # else they are published already
+    if here and not opened.place(DEMONSTRATIONS).list(INDEX_DIR):
+        say(
+            "The demonstrations go without embeddings; for some, type before: "
+            f"robomme-interference index {split}"
+        )
     if to is not None:
         check_output(to.resolve().parent)
     elif not dry_run:

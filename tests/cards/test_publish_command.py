@@ -66,6 +66,20 @@ def test_a_dry_run_sends_nothing(hub: HubServer, run: Run) -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
+def test_it_says_if_the_demonstrations_have_no_embeddings(
+    hub: HubServer, run: Run, tmp_path: Path
+) -> None:
+    root = copy_split(tmp_path / "split")
+    command = f"robomme-interference index {root}"
+    for options in ((), ("--to", tmp_path / "out")):
+        given = ("publish", root, "--repo-id", UNITS, "--dry-run", *options)
+        assert command in run(*given)[2]
+    (root / "demonstrations/index/thumbnail").mkdir(parents=True)
+    (root / "demonstrations/index/thumbnail/index.json").write_text("{}")
+    assert command not in run("publish", root, "--repo-id", UNITS, "--dry-run")[2]
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_without_a_terminal_it_has_to_be_said(hub: HubServer, run: Run) -> None:
     code, _, err = run(*ASKED)
     assert (code, written(hub)) == (1, False)
