@@ -63,7 +63,7 @@ class BuildResult:
 def build_dataset(
     plan: BuildPlan, out: Path, executor: Executor, progress: WorkProgress
 ) -> BuildResult:
-    """Build demonstrations or distractor units as a LeRobot v3 dataset, or let one grow.
+    """Build one of a split's datasets as a LeRobot v3 dataset, or let one grow.
 
     Args:
         plan: What to build.

@@ -43,8 +43,8 @@ app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Build datasets of demonstrations and distractor units, and manifests of buffers.",
-    epilog="""Flow: record or download episodes, build both datasets and the manifests, verify.
+    help="Build a split's datasets, demonstrations and distractor units first, and manifests.",
+    epilog="""Flow: record or download episodes, build the datasets and the manifests, verify.
 
 ```
 robomme-interference build all --source robomme-h5:recordings/ --out my-split

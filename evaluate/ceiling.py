@@ -16,15 +16,13 @@ from robomme_interference_data.evaluate.config import CeilingConfig
 from robomme_interference_data.evidence import counted_from, known_parts
 from robomme_interference_data.query import Query
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
+from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, choose, measure
 from robomme_interference_data.sampling import MEMORIES, evidence_kept
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
-
-ALL = "all"
-"""Stands for all families together."""
 
 
 @dataclass(frozen=True)

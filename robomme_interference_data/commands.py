@@ -19,6 +19,7 @@ from robomme_interference_data.console import (
     say,
     stoppable,
 )
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.fetch import FetchConfig
 from robomme_interference_data.settings import with_settings
 from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
@@ -112,7 +113,13 @@ def show(
     from robomme_interference_data.views import shifted_frame
 
     check_output(out)
-    under, opened = parse_shift(shift), load_split(split)
+    under = parse_shift(shift)
+    if under is not None and out is None:
+        raise InvalidOptionError(
+            f"--shift {shift} says nothing where nothing is drawn",
+            "Add --out strip.png, or leave it out.",
+        )
+    opened = load_split(split)
     buffer = opened.load(episode, condition)
     buffer.query.dataset.shape(camera)  # refuses an unknown one
     if out is not None:

@@ -76,7 +76,7 @@ class IndexHeader:
         frames: Frames in all.
         size: Values of a frame.
         typical_cosine: Of distractor units: median cosine of two frames of different ones, centred
-            if the encoder is. None for demonstrations.
+            if the encoder is. None of other datasets.
         sums: SHA-256 of `SHA256SUMS`, which lists the other files.
         sha256: SHA-256 of the canonical JSON of all other fields.
     """

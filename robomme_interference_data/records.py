@@ -16,9 +16,9 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.shifts import parse_shift
 
 ROLES = ("lesson", "distractor", "filler", "contradiction")
-"""What a session is to its query: its own demonstration (or a part of it), a session of another
-family, material without content, or one that contradicts the lesson. The paper's conditions use
-the first two."""
+"""What a session is to its query: its own demonstration (or a part of it), a distractor unit,
+material without content, or a lesson that contradicts its own. The paper's conditions use the first
+two."""
 
 
 _MOST_FRAMES = 1 << 22

@@ -184,14 +184,7 @@ class Split:
     ) -> BufferManifest:
         """Return the manifest of one buffer; see `load_buffer` for arguments and errors."""
         episode = EpisodeId.parse(episode_id)
-        wanted = _condition(condition, k)
-        if wanted.name not in self.conditions:
-            raise UnknownNameError(
-                f"condition {wanted.name!r} is not in {self.location}",
-                f"Planned there: {' '.join(self.conditions)}. For another one, type: "
-                f"robomme-interference build manifests {self.location} --conditions "
-                f"{' '.join(self.conditions)} {wanted.name}",
-            )
+        wanted = self._planned(condition, k)
         row = self._places.get((str(episode), wanted.name))
         if row is None:
             self._check_episode(episode)
@@ -213,7 +206,7 @@ class Split:
         Raises:
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
-        name = None if condition is None and k is None else _condition(condition, k).name
+        name = None if condition is None and k is None else self._planned(condition, k).name
         keep = np.ones(len(self), bool)
         for column, value in (("family", family), ("condition", name), ("difficulty", difficulty)):
             if value is not None:
@@ -255,6 +248,17 @@ class Split:
             cache=self._cache,
             threads=self._threads,
         )
+
+    def _planned(self, condition: Condition | str | None, k: int | None) -> Condition:
+        wanted = _condition(condition, k)
+        if wanted.name not in self.conditions:
+            raise UnknownNameError(
+                f"condition {wanted.name!r} is not in {self.location}",
+                f"Planned there: {' '.join(self.conditions)}. For another one, type: "
+                f"robomme-interference build manifests {self.location} --conditions "
+                f"{' '.join(self.conditions)} {wanted.name}",
+            )
+        return wanted
 
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode.family not in self.families:

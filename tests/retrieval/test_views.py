@@ -64,6 +64,8 @@ def test_the_film_strip_shows_what_the_robot_sees(run: Run, seen: Path, tmp_path
         assert run(*words)[0] == 0
         pictures.append(out.read_bytes())
     assert pictures[0] == pictures[1] != pictures[2]
+    code, out, err = run("show", QUERIES[0], "k1", "--split", seen, "--shift", "light:1")
+    assert (code, out) == (1, "") and "--out strip.png" in err
 
 
 def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split: Path) -> None:

@@ -136,7 +136,7 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
     [
         (["list", "{}/nowhere"], ("neither a folder nor", "namespace/name")),
         (["list", "{}", "--family", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
-        (["list", "{}", "--condition", "k9"], ("'k9'", "k0", "k7")),
+        (["list", "{}", "--condition", "k9"], ("'k9'", "--conditions no-history k0 k1 k3 k7 k9")),
         (["list", "{}", "--condition", "seven"], ("'seven'", "k0")),
         (["show", "MoveCube/test/9", "k3", "--split", "{}"], ("MoveCube/test/9", EPISODE)),
         (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
