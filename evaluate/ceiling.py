@@ -12,7 +12,7 @@ from functools import lru_cache
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.evaluate.config import CeilingConfig
+from robomme_interference_data.evaluate.config import CeilingConfig, unusual_retrieval
 from robomme_interference_data.evidence import counted_from, known_parts
 from robomme_interference_data.query import Query
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
@@ -66,11 +66,13 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
 
     Raises:
         UnknownNameError: There is no such memory, condition, encoder or method.
-        InvalidOptionError: No lesson of the split has evidence.
+        InvalidOptionError: No lesson of the split has evidence, or a setting of a retrieval step is
+            given without one.
         MissingIndexError, StaleIndexError: See `measure`.
     """
     if config.memory not in MEMORIES:
         raise UnknownNameError.none("memory", config.memory, MEMORIES)
+    unusual_retrieval(config)
     names = [one.name for one in in_order(config.conditions or split.conditions)]
     found = [
         what_is_left(buffer, config.memory, *span)

@@ -15,7 +15,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.clips import check_drawing
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.config import RunConfig, unusual_retrieval
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
@@ -60,7 +60,7 @@ def default_system(config: RunConfig) -> str:
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", spec.target).strip("-")
     if config.retrieval is None:
         return name
-    return "-".join(("retrieval", name, *_unusual(config).values())).replace("/", "-")
+    return "-".join(("retrieval", name, *unusual_retrieval(config).values())).replace("/", "-")
 
 
 def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
@@ -88,23 +88,13 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
             "Run it on --simulator tabletop, or take another policy.",
         )
     Rule.parse(config.retrieval_rule)
-    for name in _unusual(config) if config.retrieval is None else ():
-        raise InvalidOptionError(
-            f"--{name.replace('_', '-')} says nothing without a retrieval step",
-            "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
-        )
+    unusual_retrieval(config)
     _check_name(config, name_system(system))
     if config.videos:
         check_drawing()
     for camera in policy.history_cameras:
         if camera not in split.cameras:
             raise UnknownNameError.among("camera", camera, split.location, split.cameras)
-
-
-def _unusual(config: RunConfig) -> dict[str, str]:
-    """Return in what the retrieval step is not the paper's: setting to value."""
-    step = {name: getattr(config, name) for name in ("retrieval_rule", "retrieval_camera")}
-    return {name: value for name, value in step.items() if value != getattr(RunConfig, name)}
 
 
 def _check_name(config: RunConfig, system: System) -> None:

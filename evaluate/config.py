@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.records import Rollout
 from robomme_interference_data.settings import setting
@@ -80,6 +81,22 @@ class CeilingConfig:
     retrieval_camera: str = setting(
         "front", help="Camera whose frames the retrieval step compares."
     )
+
+
+def unusual_retrieval(config: RunConfig | CeilingConfig) -> dict[str, str]:
+    """Return in what the retrieval step is not the paper's: setting to value.
+
+    Raises:
+        InvalidOptionError: Something is, and there is no retrieval step.
+    """
+    step = {name: getattr(config, name) for name in ("retrieval_rule", "retrieval_camera")}
+    found = {name: value for name, value in step.items() if value != getattr(RunConfig, name)}
+    for name in found if config.retrieval is None else ():
+        raise InvalidOptionError(
+            f"--{name.replace('_', '-')} says nothing without a retrieval step",
+            "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
+        )
+    return found
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DISTRACTORS, SHIFTED
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, SHIFTED
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.ids import EpisodeId
@@ -46,8 +46,11 @@ def shifted_embedding(
 
 def _views(split: Split) -> Dataset:
     if SHIFTED not in split.datasets:
+        what = f"{split.location} has no first live views under shifts"
+        if "tabletop" not in split.datasets[DEMONSTRATIONS].identity.simulators:
+            raise MissingFileError(what, "Only a split that was built from tabletop can have them.")
         raise MissingFileError(
-            f"{split.location} has no first live views under shifts",
+            what,
             f"Type: robomme-interference build {SHIFTED} --source tabletop --split test --out "
             f"{split.location}/{SHIFTED}, then build manifests and index again.",
         )

@@ -60,6 +60,8 @@ def test_what_cannot_be_told(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) 
         ceiling(split, CeilingConfig("framesmap"))
     with pytest.raises(UnknownNameError, match="k9"):
         ceiling(split, CeilingConfig(conditions=("k9",)))
+    with pytest.raises(InvalidOptionError, match="--retrieval-rule says nothing"):
+        ceiling(split, CeilingConfig(retrieval_rule="last"))
     monkeypatch.setattr(Buffer, "evidence", None)
     with pytest.raises(InvalidOptionError, match="unknown which frames"):
         ceiling(split, CeilingConfig())

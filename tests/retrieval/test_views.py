@@ -13,8 +13,9 @@ from support.splits import GOLDEN, QUERIES, dataset
 
 from robomme_interference_data import EpisodeId, load_split
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.constants import SHIFTED
+from robomme_interference_data.constants import IDENTITY_PATH, SHIFTED
 from robomme_interference_data.errors import SourceError
+from robomme_interference_data.files import write_json
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -69,6 +70,10 @@ def test_the_film_strip_shows_what_the_robot_sees(run: Run, seen: Path, tmp_path
 
 
 def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split: Path) -> None:
+    code, _, err = run("retrieval-score", own_split, "--shift", "light:2")
+    assert code == 1 and "Only a split that was built from tabletop" in err
+    identity = own_split / "demonstrations" / IDENTITY_PATH
+    write_json(identity, json.loads(identity.read_text()) | {"simulators": ["tabletop"]})
     code, _, err = run("retrieval-score", own_split, "--shift", "light:2")
     assert code == 1 and f"--source tabletop --split test --out {own_split}/shifted" in err
     assert "such as light:2" in run("retrieval-score", seen, "--shift", "dark")[2]
