@@ -252,10 +252,14 @@ class Split:
     def _planned(self, condition: Condition | str | None, k: int | None) -> Condition:
         wanted = _condition(condition, k)
         if wanted.name not in self.conditions:
+            command = f"build manifests {self.location}"
+            if isinstance(self.files, HubFiles):  # what is published stays as it is
+                place = self.header.datasets[DEMONSTRATIONS].place
+                command = f"new-split --demonstrations {place} --source KIND:PATH --out SPLIT"
             raise UnknownNameError(
                 f"condition {wanted.name!r} is not in {self.location}",
                 f"Planned there: {' '.join(self.conditions)}. For another one, type: "
-                f"robomme-interference build manifests {self.location} --conditions "
+                f"robomme-interference {command} --conditions "
                 f"{' '.join(self.conditions)} {wanted.name}",
             )
         return wanted

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, SHIFTED
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import MissingFileError
+from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.shifts import SHIFTS, Shift
 from robomme_interference_data.split import Split
@@ -49,6 +50,8 @@ def _views(split: Split) -> Dataset:
         what = f"{split.location} has no first live views under shifts"
         if "tabletop" not in split.datasets[DEMONSTRATIONS].identity.simulators:
             raise MissingFileError(what, "Only a split that was built from tabletop can have them.")
+        if not isinstance(split.files, LocalFiles):
+            raise MissingFileError(what, "Ask its publisher to add them.")
         raise MissingFileError(
             what,
             f"Type: robomme-interference build {SHIFTED} --source tabletop --split test --out "

@@ -19,7 +19,12 @@ from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.build_dataset.audit import audit_split
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.cli import app
-from robomme_interference_data.errors import FormatError, HubError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    HubError,
+    MissingFileError,
+    UnknownNameError,
+)
 from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.run import run_evaluation
 from robomme_interference_data.execution import Serial
@@ -59,6 +64,14 @@ def test_no_more_is_downloaded_than_the_buffer_needs(hub: HubServer) -> None:
     buffer.frames("front")
     _ = buffer.states
     assert len(hub.requests) == before
+
+
+def test_what_is_published_is_not_planned_again(hub: HubServer) -> None:
+    with pytest.raises(UnknownNameError, match="condition 'k2' is not in") as caught:
+        load_buffer(QUERY, "k2", split=SPLIT)
+    hint = str(caught.value.hint)
+    assert f"new-split --demonstrations {BASE}@" in hint and hint.endswith("k7 k2")
+    assert "build manifests" not in hint
 
 
 def test_a_second_load_makes_no_request(hub: HubServer) -> None:
