@@ -76,6 +76,7 @@ ELSEWHERE = (
     "simulate ",  # a renderer
     "--source ",  # recordings, or a renderer
     "--shift ",  # a renderer
+    " k31 ",  # more units than the golden split has
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
 )
