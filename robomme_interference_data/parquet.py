@@ -206,7 +206,11 @@ class RowSpan:
             self._type(name)
         groups, first = self._row_groups()
         table = read_table(self._file, self.path, columns, groups)
-        return table.slice(self.start - first, len(self))
+        rows = table.slice(self.start - first, len(self))
+        if len(rows) < len(self):  # a damaged column may hold fewer than the file says
+            what = f"{len(rows)} rows of {', '.join(rows.column_names)}, not {len(self)}"
+            raise FormatError.damaged(self.path, what)
+        return rows
 
     def scalars(self, name: str) -> NDArray[np.int64]:
         """Return a column of booleans or integers, or of lists of one such value, `(T,) int64`."""

@@ -82,3 +82,12 @@ def test_no_parquet_file(tmp_path: Path) -> None:
         (tmp_path / "t").write_bytes(data)
         with pytest.raises(FormatError, match=r"t: cannot be read: .*\nThe file is damaged"):
             RowSpan(tmp_path / "t")
+
+
+def test_fewer_rows_than_the_file_says(tmp_path: Path) -> None:
+    """As of a damaged column: what is read has all of the rows, or is refused."""
+    path = tmp_path / "rows.parquet"
+    pq.write_table(pa.table({"n": range(5)}), path)
+    assert RowSpan(path).part(3, 5).scalars("n").tolist() == [3, 4]
+    with pytest.raises(FormatError, match="2 rows of n, not 4"):
+        RowSpan(path).part(3, 7).scalars("n")
