@@ -13,7 +13,7 @@ from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.config import CeilingConfig, unusual_retrieval
-from robomme_interference_data.evidence import counted_from, known_parts
+from robomme_interference_data.evidence import known_parts
 from robomme_interference_data.query import Query
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.grade import ALL
@@ -75,10 +75,10 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
     unusual_retrieval(config)
     names = [one.name for one in in_order(config.conditions or split.conditions)]
     found = [
-        what_is_left(buffer, config.memory, *span)
+        what_is_left(buffer, config.memory, frames)
         for name in names
         for buffer in split.buffers(condition=name)
-        if (span := _span(buffer, config)) is not None
+        if (frames := _given(buffer, config)) is not None
     ]
     if all(one.evidence_kept is None for one in found):
         raise InvalidOptionError(
@@ -88,15 +88,14 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
     return [*_cells(found, split.families), *_cells(found, (ALL,))]
 
 
-def what_is_left(buffer: Buffer, memory: str, start: int, stop: int) -> Left:
-    """Return what a memory keeps of the answer at the first step, given a span of a buffer."""
+def what_is_left(buffer: Buffer, memory: str, frames: Sequence[int]) -> Left:
+    """Return what a memory keeps of the answer at the first step, given frames of a buffer."""
     told = buffer.episode_id.family, buffer.condition
     if buffer.evidence is None:
         return Left(*told, None, None)
-    evidence = counted_from(buffer.evidence, start)
-    kept = MEMORIES[memory](stop - start)
-    success = chance(buffer.query, known_parts(evidence, kept))
-    return Left(*told, evidence_kept(evidence, kept), success)
+    kept = [frames[place] for place in MEMORIES[memory](len(frames))]
+    success = chance(buffer.query, known_parts(buffer.evidence, kept))
+    return Left(*told, evidence_kept(buffer.evidence, kept), success)
 
 
 def chance(query: Query, known: dict[int, str]) -> float | None:
@@ -123,15 +122,15 @@ def _scene(family: str, seed: int, difficulty: str) -> Family:
     return draw_episode(family, seed, difficulty)
 
 
-def _span(buffer: Buffer, config: CeilingConfig) -> tuple[int, int] | None:
-    """Return which frames the memory is given; None where there is nothing to retrieve from."""
+def _given(buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
+    """Return the frames that the memory is given; None where there is nothing to retrieve from."""
     if config.retrieval is None:
-        return 0, len(buffer)
+        return range(len(buffer))
     if not len(buffer):
         return None
     name = encoder_name(config.retrieval)
     rule = Rule.parse(config.retrieval_rule, published_threshold(name))
-    return choose(measure(buffer, name, config.retrieval_camera), rule).span
+    return choose(measure(buffer, name, config.retrieval_camera), rule).frames.tolist()
 
 
 def _cells(found: Sequence[Left], families: Iterable[str]) -> Iterator[Ceiling]:

@@ -100,12 +100,12 @@ class Clip:
 
     @_harmless
     def begin(
-        self, buffer: Buffer, start: int, stop: int, first: Observation, info: EpisodeInfo
+        self, buffer: Buffer, given: Sequence[int], first: Observation, info: EpisodeInfo
     ) -> None:
-        """Take what is known before the first step; of the buffer the policy got `start:stop`."""
+        """Take what is known before the first step, and which frames of the buffer were given."""
         self._goal = info.goal
-        self._given = f"history given: {stop - start} frames" if stop > start else "no history"
-        self._history = history_picture(buffer, start, stop)
+        self._given = f"history given: {len(given)} frames" if given else "no history"
+        self._history = history_picture(buffer, given)
         self._images = first.images
         partial = self._file.enter_context(atomic_path(self._path))
         self._encoder = VideoEncoder(partial, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
@@ -152,15 +152,16 @@ class Clip:
         return _lettered(canvas, (self._given, "front", "wrist"), lines, _COLORS[status])
 
 
-def history_picture(buffer: Buffer, start: int, stop: int) -> NDArray[np.uint8]:
-    """Return 64 frames from `start` to `stop` (excluded), evenly spread, `(256, 256, 3) uint8`.
+def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
+    """Return 64 of some frames of a buffer, evenly spread, `(256, 256, 3) uint8`.
 
     Each has a line under it in the colour of its session, the lesson's as in the film strip.
     Without frames the picture is white.
     """
     picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
     colors, sessions = session_colors(buffer.sessions), buffer.session_index
-    for place, index in enumerate(spread(start, stop, _COLUMNS * _COLUMNS)):
+    for place, chosen in enumerate(spread(0, len(given), _COLUMNS * _COLUMNS)):
+        index = given[chosen]
         y, x = (_THUMB * part for part in divmod(place, _COLUMNS))
         frame = buffer.frame(index, "front")
         step = max(1, frame.shape[0] // _SMALL)

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.systems import check_history, name_system
-from robomme_interference_data.evidence import Evidence, counted_from
+from robomme_interference_data.evidence import among
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.sampling import (
@@ -78,12 +78,12 @@ def run_rollout(
     worker = worker or Worker(0)  # no time limit
     cameras = policy.history_cameras if selector is None else ()  # until it is known which part
     buffer = split.load(item.episode, item.condition, cameras=cameras)
-    start, stop = 0, len(buffer)
+    given: Sequence[int] = range(len(buffer))
     with ExitStack() as stack:
         history = None
         # One that computes in this process holds Python's lock: decoding beside it slows both down.
         if selector is None and getattr(simulator, "remote", False):
-            history = stack.enter_context(_decode(buffer, start, stop, policy, run))
+            history = stack.enter_context(_decode(buffer, given, policy, run))
         with clock.part("reset_s"), worker.limit(config.simulator_timeout, "the simulator's reset"):
             demonstration, first, info = simulator.reset(
                 str(item.episode), demonstration=config.check_lesson
@@ -94,18 +94,19 @@ def run_rollout(
             check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
         with clock.part("history_s"):
             if selector is not None and len(buffer):
-                start, stop = selector.select(buffer, first.images[selector.camera])
-                check_history(name_system(run.system), {item.condition: stop - start})
+                given = selector.select(buffer, first.images[selector.camera]).tolist()
+                check_history(name_system(run.system), {item.condition: len(given)})
         if clip is not None:
-            clip.begin(buffer, start, stop, first, info)
+            clip.begin(buffer, given, first, info)
         with clock.part("history_s"):
             if history is None:
-                history = stack.enter_context(_decode(buffer, start, stop, policy, run))
-            evidence = buffer.evidence and counted_from(buffer.evidence, start)
-            own = (simulator, evidence) if policy.privileged else ()
-            policy.reset(RolloutInfo(info.goal, stop - start, config.model_seed, *own))
+                history = stack.enter_context(_decode(buffer, given, policy, run))
+            own: tuple[Any, ...] = ()
+            if policy.privileged:
+                own = simulator, buffer.evidence and among(buffer.evidence, given)
+            policy.reset(RolloutInfo(info.goal, len(given), config.model_seed, *own))
             for chunk in history:
-                policy.add_history(chunk.frames, chunk.states, stop - start)
+                policy.add_history(chunk.frames, chunk.states, len(given))
     status, steps = _act(run, policy, simulator, first, info.goal, clock, clip, worker)
     if status is Status.ERROR:
         raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
@@ -118,11 +119,11 @@ def run_rollout(
         status=str(status),
         success=status is Status.SUCCESS,
         steps=steps,
-        history_frames=stop - start,
-        lesson_frames=lesson_frames(buffer.sessions, start, stop),
-        lesson_share=lesson_share(buffer.sessions, start, stop) if stop > start else None,
-        evidence_kept=_evidence_kept(run.system, evidence, stop - start),
-        **_retrieval_columns(selector, buffer, start, stop),
+        history_frames=len(given),
+        lesson_frames=lesson_frames(buffer.sessions, given),
+        lesson_share=lesson_share(buffer.sessions, given) if given else None,
+        evidence_kept=_evidence_kept(run.system, buffer, given),
+        **_retrieval_columns(selector, buffer, given),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
@@ -172,35 +173,33 @@ def _checked(actions: Any) -> NDArray[np.float32]:
 
 
 def _retrieval_columns(
-    selector: "Selector | None", buffer: Buffer, start: int, stop: int
+    selector: "Selector | None", buffer: Buffer, given: Sequence[int]
 ) -> dict[str, Any]:
     columns: dict[str, Any] = {"retrieval_model": selector.name} if selector else {}
     if selector is not None and len(buffer):
-        columns |= {"retrieval_start": start, "retrieval_stop": stop}
-        frames, share = len(even_sample(stop - start)), lesson_share(buffer.sessions, start, stop)
+        columns |= {"retrieval_start": given[0], "retrieval_stop": given[-1] + 1}
+        frames, share = len(even_sample(len(given))), lesson_share(buffer.sessions, given)
         filler = (frames - 1 - round(share * frames)) / frames
         for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
             columns[f"retrieval_selected_{part}_fraction"] = fraction
     return columns
 
 
-def _evidence_kept(
-    system: str, evidence: tuple[Evidence, ...] | None, history_frames: int
-) -> float | None:
+def _evidence_kept(system: str, buffer: Buffer, given: Sequence[int]) -> float | None:
     """Return the share of the evidence that the memory of a system holds at the first step."""
     memory = name_system(system).sampling
-    if memory is None or evidence is None:
+    if memory is None or buffer.evidence is None:
         return None
-    return evidence_kept(evidence, MEMORIES[memory](history_frames))
+    kept = [given[place] for place in MEMORIES[memory](len(given))]
+    return evidence_kept(buffer.evidence, kept)
 
 
 def _decode(
-    buffer: Buffer, start: int, stop: int, policy: Policy, run: Run
+    buffer: Buffer, given: Sequence[int], policy: Policy, run: Run
 ) -> AbstractContextManager[Iterator[Chunk]]:
     """Begin to decode what a policy is given of a buffer; give it in chunks, in order."""
-    frames = run.config.history_chunk
-    chunks = buffer.stream(frames, tuple(policy.history_cameras), start, stop)
-    return read_ahead(chunks, max(1, _FRAMES_AHEAD // frames))
+    size, cameras = run.config.history_chunk, tuple(policy.history_cameras)
+    return read_ahead(buffer.stream(size, cameras, given), max(1, _FRAMES_AHEAD // size))
 
 
 @contextmanager

@@ -117,6 +117,7 @@ def retrieve(
     encoder: EncoderName = "thumbnail",
     rule: Annotated[str, typer.Option(help="RULE, as for retrieval-score.")] = "max",
     camera: Camera = "front",
+    shift: Annotated[str, typer.Option(help=SHIFT_HELP)] = NO_SHIFT,
     out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
@@ -128,21 +129,30 @@ def retrieve(
     ```
     robomme-interference retrieve MoveCube/test/0 k7 --split my-split --out why.png
     robomme-interference retrieve MoveCube/test/0 k7 --split my-split --rule mean/0.9
+    robomme-interference retrieve MoveCube/test/0 k7 --split my-split --rule joined --shift light:2
     ```
     """
-    from robomme_interference_data.loading import load_buffer
+    from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval import drawing, encoders, reasons, select
     from robomme_interference_data.rows import to_dict
+    from robomme_interference_data.views import shifted_embedding, shifted_frame
 
     check_output(out)
     name = encoders.encoder_name(encoder)
     parsed = select.Rule.parse(rule, encoders.published_threshold(name))
-    buffer = load_buffer(episode, condition, split=split)
-    measured = select.measure(buffer, name, camera)
+    under, opened = parse_shift(shift), load_split(split)
+    buffer = opened.load(episode, condition)
+    query = (
+        None if under is None else shifted_embedding(opened, buffer.episode_id, under, name, camera)
+    )
+    measured = select.measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
     found = reasons.reasons(buffer, measured, choice, parsed, name, camera)
     if out is not None:
-        drawing.draw_retrieval(buffer, measured, choice, found, out)
+        live = buffer.query.frame(camera)
+        if under is not None:
+            live = shifted_frame(opened, buffer.episode_id, under, camera)
+        drawing.draw_retrieval(buffer, measured, choice, found, live, out)
         say(f"{out} written")
     if as_json:
         print_json(to_dict(found))
@@ -157,8 +167,8 @@ def retrieval_score(
         list[str],
         typer.Option(
             help="How to choose: METHOD or METHOD/CUT, several for comparison, or all. METHOD is "
-            "max (released rule), mean, last, random, top32 or oracle; CUT a cosine or adaptive, "
-            "left out for the encoder's own.",
+            "max (released rule), latest, joined, mean, last, random, top32 or oracle; CUT a "
+            "cosine or adaptive, left out for the encoder's own.",
             metavar="RULE…",
         ),
     ] = ["max"],  # noqa: B006 - typer copies it

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.drawing import GREY, INK, Page, ink_on, open_page, tidy, tint
-from robomme_interference_data.retrieval.reasons import Reasons
+from robomme_interference_data.retrieval.reasons import Reasons, frames_text
 from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import MIN_FRAMES, Choice, Measured
 from robomme_interference_data.strip import LESSON_COLOR, mark_evidence, session_colors
@@ -28,7 +29,12 @@ _SEGMENT = "#d9d9d9"
 
 
 def draw_retrieval(
-    buffer: Buffer, measured: Measured, choice: Choice, found: Reasons, out: Path
+    buffer: Buffer,
+    measured: Measured,
+    choice: Choice,
+    found: Reasons,
+    live: NDArray[np.uint8],
+    out: Path,
 ) -> None:
     """Draw a choice: film strip, true sessions, cuts, segments, and cosines with the query.
 
@@ -37,8 +43,9 @@ def draw_retrieval(
     Args:
         buffer: The buffer.
         measured: Its cosines.
-        choice: What was chosen of it; a span.
+        choice: What was chosen of it.
         found: Why.
+        live: What the robot sees first, `(H, W, 3) uint8` RGB.
         out: File to write, `.png` or `.svg`.
 
     Raises:
@@ -57,7 +64,7 @@ def draw_retrieval(
         picture.alike(picture.axes(top + 0.14))
         top += 0.14 + _CURVE + 0.36
         page.text((_LEFT + _RIGHT) / 2, top - 0.19, "frame in the buffer", 6.5, color=GREY)
-        picture.compared(top)
+        picture.compared(live, top)
 
 
 @dataclass
@@ -82,7 +89,7 @@ class _Picture:
         page.text(_RIGHT, 0.1, how, 6.5, align="right", color=GREY, width=0.4 * _WIDTH)
         goal = f"Goal: {self.buffer.goal}"
         page.text(0.1, 0.27, goal, 7.5, align="left", width=_WIDTH - 0.2)
-        frames = f"frames {grade.start} to {grade.stop - 1} of {grade.history_frames}"
+        frames = f"frames {frames_text(self.choice.spans)} of {grade.history_frames}"
         result = f"chosen: {frames};  {self.found.graded()}"
         page.text(0.1, 0.43, result, 7.5, align="left", bold=True, color=_CHOSEN)
 
@@ -90,14 +97,14 @@ class _Picture:
         """Draw pictures in the places of their frames on the axis; those chosen are marked."""
         page, pitch = self.page, _SPAN / _SHOWN
         size = pitch - 0.05
-        start, stop = self.choice.span
+        chosen = {*self.choice.frames.tolist()}
         for place in range(_SHOWN):
             frame = (2 * place + 1) * len(self.buffer) // (2 * _SHOWN)
             x = _LEFT + place * pitch + 0.025
             color = self.colors[self.session[frame]]
             tall = page.picture(self.buffer.frame(frame, self.found.camera), x, top, size)
             page.box(x, top + tall + 0.012, size, 0.035, fill=color, edge=color, line=0)
-            if start <= frame < stop:
+            if frame in chosen:
                 page.box(x, top, size, tall, fill="none", edge=_CHOSEN, line=2)
             page.text(x + size / 2, top + tall + 0.055, str(frame), 5.5, color=GREY)
         return top + tall + 0.2
@@ -123,15 +130,16 @@ class _Picture:
         return top + _BAR
 
     def segments(self, top: float) -> float:
-        """Draw the segments; the chosen one stands out, those too short are hollow."""
+        """Draw the segments; what was chosen stands out, those too short are hollow."""
         self._label(top, "found", "segments")
         for start, stop in self.choice.segments:
             short = stop - start < MIN_FRAMES
             fill, edge = ("white", GREY) if short else (_SEGMENT, "white")
             self._bar((start, stop), top, fill, edge)
-        x, width = self._bar(self.choice.span, top, _CHOSEN, "white")  # the oracle's is no segment
-        if self.page.text_width("chosen", 6, bold=True) < width:
-            self.page.text(x + width / 2, top + 0.05, "chosen", 6, bold=True, color="white")
+        for span in self.choice.spans:  # of the oracle it is no segment
+            x, width = self._bar(span, top, _CHOSEN, "white")
+            if self.page.text_width("chosen", 6, bold=True) < width:
+                self.page.text(x + width / 2, top + 0.05, "chosen", 6, bold=True, color="white")
         return top + _BAR
 
     def axes(self, top: float) -> Any:
@@ -164,10 +172,10 @@ class _Picture:
         """Draw the cosine of each frame with what the robot sees, and each segment's score."""
         values, found = self.measured.alike, self.found
         axes.plot(np.arange(len(values)) + 0.5, values, color=_CURVE_INK, linewidth=0.9)
-        span = self.choice.span
-        axes.axvspan(*span, facecolor="none", edgecolor=_CHOSEN, linewidth=1.2, zorder=3)
+        for span in self.choice.spans:
+            axes.axvspan(*span, facecolor="none", edgecolor=_CHOSEN, linewidth=1.2, zorder=3)
         for segment, score in self.choice.scores.items():
-            color = _CHOSEN if segment == span else GREY
+            color = _CHOSEN if segment[0] in self.choice.frames else GREY
             axes.plot(segment, (score, score), color=color, linewidth=1.2)
         for name, frame, cosine, color, marker, size in (
             ("closest frame", found.closest, found.cosine, _CHOSEN, "*", 9),
@@ -180,10 +188,9 @@ class _Picture:
             axes, "cosine of each frame with what the robot sees now; bars: score of each segment"
         )
 
-    def compared(self, top: float) -> None:
+    def compared(self, live: NDArray[np.uint8], top: float) -> None:
         """Draw what the robot sees beside the closest frames, inside the choice and outside."""
         page, found = self.page, self.found
-        live = self.buffer.query.frame(found.camera)
         shown = [("what the robot sees now", live, "black", "the first live observation", "")]
         for title, frame, cosine in (
             ("closest frame that was chosen", found.closest, found.cosine),

@@ -1,5 +1,6 @@
 """Why a part of a history was chosen: as data, and in a few lines."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,8 @@ class Reasons:
         encoder: Name of the encoder.
         camera: Camera whose frames were compared.
         grade: The choice, compared with the true lesson.
-        score: What the chosen segment was scored by, or None if the rule scores none.
+        chosen: First frame of each run of chosen frames, and the one after its last.
+        score: The highest score of a chosen segment, or None if the rule scores none.
         sessions: Role and source of each session that the chosen part touches, in order.
         closest, cosine: Chosen frame closest to what the robot sees, and its cosine.
         other, other_cosine, other_source: Frame closest to it outside the chosen part, its cosine
@@ -30,6 +32,7 @@ class Reasons:
     encoder: str
     camera: str
     grade: Grade
+    chosen: tuple[Span, ...]
     score: float | None
     sessions: tuple[str, ...]
     closest: int
@@ -48,12 +51,12 @@ class Reasons:
         if self.other is not None:
             source = f"frame {self.other} of {self.other_source}"
             outside = f"the closest one outside is {source}, {self.other_cosine:.3f}"
-        lesson = " and ".join(f"{start} to {stop - 1}" for start, stop in self.lesson)
+        lesson = frames_text(self.lesson)
         lines = (
             f"{one.episode_id} under {one.condition}, {self.camera} camera, rule {one.rule}: "
             f"{one.history_frames} history frames, cut into {parts} where the cosine of "
             f"adjacent frames is below {one.threshold:.3f}",
-            f"Chosen: frames {one.start} to {one.stop - 1}, of {', '.join(self.sessions)}",
+            f"Chosen: frames {frames_text(self.chosen)}, of {', '.join(self.sessions)}",
             f"Why: {method} takes {METHODS[method]}{score}",
             f"What the robot sees now is closest to frame {self.closest} of these, with cosine "
             f"{self.cosine:.3f}; {outside}",
@@ -70,21 +73,28 @@ class Reasons:
         return f"purity {percent(one.purity)}, coverage {percent(one.coverage)}, {false}"
 
 
+def frames_text(spans: Sequence[Span]) -> str:
+    """Name spans by their first and last frames, three of them at most."""
+    parts = [f"{start} to {stop - 1}" for start, stop in spans[:3]]
+    return " and ".join(parts) + f" and {len(spans) - 3} more parts" * (len(spans) > 3)
+
+
 def reasons(
     buffer: Buffer, measured: Measured, choice: Choice, rule: Rule, encoder: str, camera: str
 ) -> Reasons:
-    """Collect why a span was chosen."""
-    start, stop = choice.span
-    alike = measured.alike
-    closest = start + int(np.argmax(alike[start:stop]))
-    outside = np.concatenate([np.arange(start), np.arange(stop, len(alike))])
+    """Collect why frames were chosen."""
+    alike, frames = measured.alike, choice.frames
+    closest = int(frames[np.argmax(alike[frames])])
+    outside = np.setdiff1d(np.arange(len(alike)), frames)
     other = int(outside[np.argmax(alike[outside])]) if len(outside) else None
-    touched = [one for one in buffer.sessions if one.start < stop and one.stop > start]
+    touched = [buffer.sessions[n] for n in np.unique(buffer.session_index[frames])]
+    scores = [score for span, score in choice.scores.items() if span[0] in frames]
     return Reasons(
         encoder,
         camera,
         grade(measured, rule),
-        choice.scores.get(choice.span),
+        choice.spans,
+        max(scores, default=None),
         tuple(f"{one.role} {one.source}" for one in touched),
         closest,
         float(alike[closest]),

@@ -38,6 +38,17 @@ def adjacent_cosines(embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.round(np.einsum("td,td->t", rows[:-1], rows[1:]), _DIGITS)
 
 
+def closest_cosines(embeddings: NDArray[np.floating], span: Span) -> NDArray[np.float32]:
+    """Return the cosine of each embedding with the closest one of a span, `(T,) float32`.
+
+    Args:
+        embeddings: `(T, D)`, each of length 1.
+        span: At least one of them.
+    """
+    rows = embeddings.astype(np.float32, copy=False)
+    return np.round(rows @ rows[slice(*span)].T, _DIGITS).max(axis=1)
+
+
 def segments(adjacent: NDArray[np.float32], threshold: float) -> tuple[Span, ...]:
     """Cut between frames t and t + 1 where `adjacent[t]` is below the threshold.
 

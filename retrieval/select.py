@@ -18,26 +18,43 @@ from robomme_interference_data.errors import InvalidOptionError, UnknownNameErro
 from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Session
-from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines, segments
+from robomme_interference_data.retrieval.segment import (
+    Span,
+    adjacent_cosines,
+    closest_cosines,
+    cosines,
+    segments,
+)
+from robomme_interference_data.sampling import runs
 
 ADAPTIVE: Final = "adaptive"
 
 MIN_FRAMES = 4
 """Frames of the shortest segment that may be chosen (released reference)."""
 
+_FOLLOWING = 0.1
+"""Quantile of a segment's adjacent cosines from which on frames are like those that follow each
+other (ours)."""
+
 METHODS = {
     "max": "the segment with the frame closest to what the robot sees now (released rule)",
+    "latest": "as max, but of segments with equally close frames the last",
+    "joined": "as max, with all segments that hold a frame like one of its own (ours)",
     "mean": "the segment with the highest mean cosine with what the robot sees now",
     "last": "the last segment",
     "random": "a segment by lot",
     "top32": "the 32 frames closest to what the robot sees now, without segments",
     "oracle": "the true lesson, or its first part",
 }
-"""What each method takes. Ties go to the earliest; segments of fewer than `MIN_FRAMES` frames are
-left aside."""
+"""What each method takes. Ties go to the earliest but for `latest`; segments of fewer than
+`MIN_FRAMES` frames are left aside.
+
+`joined` finds a session that is in several parts: two frames are alike if their cosine is that of
+nine in ten adjacent frames of the segment that `max` takes, or more.
+"""
 
 _SCORES: dict[str, Callable[[NDArray[np.float32]], float]] = {
-    "max": lambda values: float(values.max()),
+    **dict.fromkeys(("max", "latest", "joined"), lambda values: float(values.max())),
     "mean": lambda values: float(np.round(values.mean(dtype=np.float64), 6)),
 }
 
@@ -117,6 +134,8 @@ class Measured:
         adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
         alike: Cosine of each frame with the query frame, `(T,) float32`.
         typical: Median cosine of two frames of different distractor units.
+        closest: From a span to the cosine of each frame with the closest one of that span,
+            `(T,) float32`; looked up when asked for, as embeddings of many buffers take much room.
         evidence: Which frames show the hidden answer; None where that is unknown.
     """
 
@@ -126,6 +145,7 @@ class Measured:
     adjacent: NDArray[np.float32]
     alike: NDArray[np.float32]
     typical: float
+    closest: Callable[[Span], NDArray[np.float32]]
     evidence: tuple[Evidence, ...] | None = None
 
     @property
@@ -160,6 +180,7 @@ def measure(
         adjacent_cosines(embeddings),
         cosines(embeddings, buffer.query_embedding(encoder, camera) if query is None else query),
         buffer.index(encoder, camera).typical_cosine,
+        lambda span: closest_cosines(buffer.embeddings(encoder, camera), span),
         buffer.evidence,
     )
 
@@ -182,17 +203,9 @@ class Choice:
     scores: Mapping[Span, float]
 
     @property
-    def span(self) -> Span:
-        """First chosen frame, and the one after the last.
-
-        Raises:
-            InvalidOptionError: The chosen frames are not consecutive.
-        """
-        start, stop = int(self.frames[0]), int(self.frames[-1]) + 1
-        if stop - start != len(self.frames):
-            what = f"the rule chose {len(self.frames)} single frames, not a span"
-            raise InvalidOptionError(what, "Choose one that takes whole segments, such as max.")
-        return start, stop
+    def spans(self) -> tuple[Span, ...]:
+        """The runs of chosen frames, in order."""
+        return runs(self.frames.tolist())
 
 
 def choose(measured: Measured, rule: Rule) -> Choice:
@@ -221,7 +234,11 @@ def choose(measured: Measured, rule: Rule) -> Choice:
         return Choice(threshold, np.sort(closest), spans, scores)
     if score := _SCORES.get(rule.method):
         scores = {span: score(measured.alike[slice(*span)]) for span in candidates}
-        chosen = max(scores, key=lambda span: scores[span])  # the first of equal ones
+        # The first of equal ones, or the last.
+        order = candidates[::-1] if rule.method == "latest" else candidates
+        chosen = max(order, key=lambda span: scores[span])
+        if rule.method == "joined":
+            return Choice(threshold, _joined(measured, chosen, candidates), spans, scores)
     elif rule.method == "last":
         chosen = candidates[-1]
     elif rule.method == "random":
@@ -233,3 +250,13 @@ def choose(measured: Measured, rule: Rule) -> Choice:
     else:
         raise InvalidOptionError(f"{about}: there is no lesson that oracle could choose")
     return Choice(threshold, np.arange(*chosen), spans, scores)
+
+
+def _joined(measured: Measured, first: Span, candidates: Sequence[Span]) -> NDArray[np.int64]:
+    """Return the frames of a segment, and of those that hold a frame like one of its own."""
+    following = measured.adjacent[first[0] : first[1] - 1]
+    if not len(following):  # a single frame tells nothing of what frames that follow are like
+        return np.arange(*first)
+    alike = measured.closest(first) >= np.quantile(following, _FOLLOWING, method="lower")
+    chosen = (span for span in candidates if span == first or alike[slice(*span)].any())
+    return np.concatenate([np.arange(*span) for span in chosen])

@@ -15,26 +15,25 @@ from robomme_interference_data.retrieval.encoders import (
     make_encoder,
     published_threshold,
 )
-from robomme_interference_data.retrieval.segment import Span
 from robomme_interference_data.retrieval.select import Rule, choose, measure
 from robomme_interference_data.split_index import SplitIndex
 
 
 class Selector:
-    """Chooses the span of a history that goes with what the robot sees.
+    """Chooses the frames of a history that go with what the robot sees.
 
     The history's embeddings are looked up in the index beside the data; only the live image is
     embedded. True sessions are read after the choice, to grade it, and by `oracle`.
 
     Args:
         encoder: Name of the encoder, see `make_encoder`.
-        rule: How to choose, as `Rule.parse` reads it; a method that chooses a segment.
+        rule: How to choose, as `Rule.parse` reads it.
         camera: Camera whose frames it compares.
         device: Where to compute; None for a GPU if there is one.
 
     Raises:
         UnknownNameError: There is no such encoder or method.
-        InvalidOptionError: The method chooses single frames, or the cut is no cosine.
+        InvalidOptionError: The cut is no cosine.
         MissingExtraError, HubError, FormatError: See `make_encoder`.
     """
 
@@ -47,9 +46,6 @@ class Selector:
         device: str | None = None,
     ):
         self.rule = Rule.parse(rule, published_threshold(encoder))
-        if self.rule.method == "top32":
-            expected = "one that chooses a span: a policy is not handed single frames"
-            raise InvalidOptionError.expected("rule", rule, expected)
         self.camera = camera.removeprefix(CAMERA_PREFIX)
         self._encoder = make_encoder(encoder, device=device)
 
@@ -83,15 +79,15 @@ class Selector:
             "threshold": self.rule.threshold(index.typical_cosine),
         }
 
-    def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> Span:
-        """Choose the span of a buffer that goes with an image.
+    def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Choose the frames of a buffer that go with an image.
 
         Args:
             buffer: The history.
             image: The first live observation, `(H, W, 3) uint8` RGB.
 
         Returns:
-            First frame in the buffer, and the one after the last.
+            Their indices in the buffer, ascending, `(n,) int64`, n at least 1.
 
         Raises:
             MissingIndexError: The data has no embeddings of this encoder.
@@ -105,7 +101,7 @@ class Selector:
             raise InvalidOptionError.expected("image", given, "(H, W, 3) uint8")
         features = self._encoder.features(self._encoder.prepare(image[None]))
         query = index.embed(features)[0]
-        return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).span
+        return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).frames
 
     def _index(self, buffer: Buffer) -> SplitIndex:
         """Return the index of the split, made with this very encoder."""

@@ -33,6 +33,7 @@ from robomme_interference_data.records import (
     SessionEntry,
     place_sessions,
 )
+from robomme_interference_data.sampling import runs
 from robomme_interference_data.split_index import SplitIndex
 
 _PIECE = 8 * KEY_FRAMES
@@ -44,16 +45,16 @@ _MOST_BYTES = 16 << 30
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive frames of a buffer, as `Buffer.stream` gives them; the arrays are the caller's.
+    """Frames of a buffer, as `Buffer.stream` gives them; the arrays are the caller's.
 
     Attributes:
-        start: Index of the first frame in the buffer.
+        indices: Of the frames in the buffer, ascending, `(n,) int64`.
         frames: Camera to `(n, H, W, 3) uint8`.
         states: `(n, D) float32`.
         session_index: `(n,) int64`.
     """
 
-    start: int
+    indices: NDArray[np.int64]
     frames: dict[str, NDArray[np.uint8]]
     states: NDArray[np.float32]
     session_index: NDArray[np.int64]
@@ -211,7 +212,7 @@ class Buffer:
             MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
         """
         index = whole_number("index", index, "a whole number from 0, such as 3")
-        self._check_inside(f"frame {index} is", index, index + 1)
+        self._check_inside(index, index)
         session = self.sessions[bisect_right(self.sessions, index, key=lambda s: s.start) - 1]
         entry = session.entry
         stored = entry.start + (index - session.start) // entry.repeat
@@ -223,47 +224,43 @@ class Buffer:
         self,
         chunk: int = 64,
         cameras: Sequence[str] | None = None,
-        start: int = 0,
-        stop: int | None = None,
+        indices: Sequence[int] | None = None,
     ) -> Generator[Chunk]:
-        """Decode the buffer, or a span of it, in chunks, in order, holding one chunk at a time.
+        """Decode the buffer, or some of its frames, in chunks, holding one chunk at a time.
 
         With a cache, frames that it lacks are decoded a whole session at a time.
 
         Args:
             chunk: Frames in a chunk; the last one may be shorter.
             cameras: Names of the cameras; None for all.
-            start: First frame of the span.
-            stop: Frame after its last one; None for the buffer's end.
+            indices: Of the frames, ascending, each once; None for all.
 
         Raises:
-            InvalidOptionError: `chunk` is not positive, or an argument of another type.
-            UnknownNameError: The span is not inside the buffer, or there is no such camera.
+            InvalidOptionError: `chunk` is not positive, the indices do not ascend, or an argument
+                is of another type.
+            UnknownNameError: The buffer has no such frame or camera.
             MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
         """
         expected = "a whole number from 1"
         chunk = whole_number("chunk", chunk, expected)
         if chunk < 1:
             raise InvalidOptionError.expected("chunk", chunk, expected)
-        start = whole_number("start", start, "a whole number from 0")
-        end = whole_number("stop", len(self) if stop is None else stop, "a whole number, or None")
-        self._check_inside(f"start {start} and stop {end} are", start, end)
+        chosen = self._chosen(indices)
         if isinstance(cameras, str) or not isinstance(cameras, Iterable | None):
             raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
         wanted = self.cameras if cameras is None else tuple(cameras)
         shapes = {name: self.query.dataset.shape(name) for name in wanted}
-        decoders = {name: self._iter_frames(name, start, end) for name in wanted}
+        decoders = {name: self._iter_chosen(name, chosen) for name in wanted}
         session_index = self.session_index
         try:
-            for first in range(start, end, chunk):
-                last = min(first + chunk, end)
+            for first in range(0, len(chosen), chunk):
+                these = chosen[first : first + chunk].copy()
                 frames = {}
                 for name, shape in shapes.items():
-                    frames[name] = np.empty((last - first, *shape), np.uint8)
+                    frames[name] = np.empty((len(these), *shape), np.uint8)
                     for image in frames[name]:
                         image[...] = next(decoders[name])
-                states = self.states[first:last].copy()
-                yield Chunk(first, frames, states, session_index[first:last].copy())
+                yield Chunk(these, frames, self.states[these], session_index[these])
         finally:
             for decoder in decoders.values():
                 decoder.close()
@@ -332,12 +329,26 @@ class Buffer:
                 "then run robomme-interference verify SPLIT",
             )
 
-    def _check_inside(self, given: str, start: int, stop: int) -> None:
-        if not 0 <= start <= stop <= len(self):
-            raise UnknownNameError(
-                f"{given} not in the buffer of {self.manifest}, which has {len(self)} history "
-                "frames, numbered from 0"
-            )
+    def _chosen(self, indices: Sequence[int] | None) -> NDArray[np.int64]:
+        """Return what `stream` is asked for, `(n,) int64`."""
+        if indices is None:
+            return np.arange(len(self))
+        chosen = np.asarray(indices)
+        if not chosen.size:
+            return np.empty(0, np.int64)
+        if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or (np.diff(chosen) < 1).any():
+            expected = "whole numbers, ascending, each once, such as range(64)"
+            raise InvalidOptionError.expected("indices", indices, expected)
+        self._check_inside(int(chosen[0]), int(chosen[-1]))
+        return chosen.astype(np.int64)
+
+    def _check_inside(self, *indices: int) -> None:
+        for index in indices:
+            if not 0 <= index < len(self):
+                raise UnknownNameError(
+                    f"frame {index} is not in the buffer of {self.manifest}, which has "
+                    f"{len(self)} history frames, numbered from 0"
+                )
 
     def _recorded(self, entry: SessionEntry) -> dict[str, str] | None:
         """Return the recorded digests of a session by feature; None if none are recorded."""
@@ -389,6 +400,11 @@ class Buffer:
                 self._keep(name, shown[:, 0])
 
         return finish
+
+    def _iter_chosen(self, camera: str, chosen: NDArray[np.int64]) -> Generator[NDArray[np.uint8]]:
+        """Yield frames, `(H, W, 3) uint8`, by their ascending indices."""
+        for start, stop in runs(chosen.tolist()):
+            yield from self._iter_frames(camera, start, stop)
 
     def _iter_frames(self, camera: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
         """Yield frames `start` to `stop` (excluded), `(H, W, 3) uint8`, in order."""

@@ -4,6 +4,7 @@ A span is recorded with its episode; where no source says what a frame shows, ev
 (None), never guessed.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -97,9 +98,16 @@ def place_evidence(
     return tuple(placed)
 
 
-def counted_from(evidence: Iterable[Evidence], start: int) -> tuple[Evidence, ...]:
-    """Return evidence as counted from a frame of the buffer on; what is before is negative."""
-    return tuple(replace(one, start=one.start - start, stop=one.stop - start) for one in evidence)
+def among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple[Evidence, ...]:
+    """Return the evidence that some frames of a buffer show, in its places among these frames.
+
+    Args:
+        evidence: The buffer's evidence, in order.
+        frames: Indices in the buffer, ascending.
+    """
+    places = ((bisect_left(frames, one.start), bisect_left(frames, one.stop)) for one in evidence)
+    shown = zip(evidence, places, strict=True)
+    return tuple(replace(one, start=a, stop=b) for one, (a, b) in shown if a < b)
 
 
 def known_parts(evidence: Sequence[Evidence], kept: Collection[int]) -> dict[int, str]:

@@ -97,9 +97,9 @@ class Query:
             difficulty=record.difficulty,
             simulator=record.simulator,
             exact=exact,
-            lesson_frames=lesson_frames(lessons, 0, frames),
+            lesson_frames=lesson_frames(lessons, range(frames)),
             history_frames=frames,
-            lesson_share=lesson_share(lessons, 0, frames),
+            lesson_share=lesson_share(lessons, range(frames)),
             query=self.place,
             sessions=sessions,
         )

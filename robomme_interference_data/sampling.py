@@ -2,7 +2,7 @@
 
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Sequence
-from functools import partial
+from itertools import groupby
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.evidence import Evidence
@@ -50,33 +50,41 @@ def spread(start: int, stop: int, count: int) -> list[int]:
     return [start + j * last // max(count - 1, 1) for j in range(count)]
 
 
-def lesson_frames(sessions: Iterable[Session], start: int, stop: int) -> int:
-    """Count the frames of a span of a buffer that are of the lesson.
+def runs(frames: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    """Return each run of consecutive indices: the first, and the one after the last.
+
+    Args:
+        frames: Indices, ascending.
+    """
+    found = []
+    for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0]):
+        indices = [index for _, index in run]
+        found.append((indices[0], indices[-1] + 1))
+    return tuple(found)
+
+
+def lesson_frames(sessions: Iterable[Session], frames: Sequence[int]) -> int:
+    """Count those of some frames of a buffer that are of the lesson.
 
     Args:
         sessions: The buffer's sessions.
-        start: First frame of the span.
-        stop: Frame after its last one.
+        frames: Indices in the buffer, ascending.
     """
     lessons = (session for session in sessions if session.role == "lesson")
-    return sum(max(0, min(one.stop, stop) - max(one.start, start)) for one in lessons)
+    return sum(bisect_left(frames, one.stop) - bisect_left(frames, one.start) for one in lessons)
 
 
-def lesson_share(sessions: Sequence[Session], start: int, stop: int) -> float:
-    """Return the share of lesson frames, 0 to 1, in an even sample of a span of a buffer.
+def lesson_share(sessions: Iterable[Session], frames: Sequence[int]) -> float:
+    """Return the share of lesson frames, 0 to 1, in an even sample of what is given of a buffer.
 
-    The live observation after the span is the sample's last frame, and is no lesson.
+    The live observation that follows is the sample's last frame, and is no lesson.
 
     Args:
         sessions: The buffer's sessions.
-        start: First frame of the span.
-        stop: Frame after its last one.
+        frames: What is given: indices in the buffer, ascending.
     """
-    sample = even_sample(stop - start)
-    before = partial(bisect_left, sample, hi=len(sample) - 1)
-    lessons = (one for one in sessions if one.role == "lesson")
-    inside = sum(before(one.stop - start) - before(one.start - start) for one in lessons)
-    return inside / len(sample)
+    *sample, _ = even_sample(len(frames))
+    return lesson_frames(sessions, [frames[place] for place in sample]) / (len(sample) + 1)
 
 
 def evidence_kept(evidence: Iterable[Evidence], kept: Collection[int]) -> float | None:

@@ -1,7 +1,7 @@
 """Buffers: the very frames of their sessions in order, however they are asked for."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -88,24 +88,27 @@ def test_lesson_first_then_the_units(condition: str, episode: str) -> None:
     st.data(),
 )
 @settings(max_examples=20)
-def test_chunks_of_any_span_and_size(
+def test_chunks_of_any_frames_and_size(
     condition: str, size: int, cameras: tuple[str, ...], data: st.DataObject
 ) -> None:
     made = unusual() if condition == "unusual" else buffer(condition)
-    start = data.draw(st.integers(0, len(made)))
-    stop = data.draw(st.integers(start, len(made)))
-    chunks = list(made.stream(size, cameras, start, stop))
-    assert [chunk.start for chunk in chunks] == list(range(start, stop, size))
+    places = st.integers(0, len(made))
+    span, single = data.draw(st.tuples(places, places)), data.draw(st.sets(places, max_size=20))
+    chosen = sorted({*range(*span), *single} - {len(made)})
+    chunks = list(made.stream(size, cameras, chosen))
+    assert [chunk.indices.tolist() for chunk in chunks] == [
+        chosen[first : first + size] for first in range(0, len(chosen), size)
+    ]
     entries = made.manifest.sessions
     for camera in cameras:
         whole = expected_frames(entries, camera)
         joined = np.concatenate([whole[:0], *(chunk.frames[camera] for chunk in chunks)])
-        np.testing.assert_array_equal(joined, whole[start:stop])
+        np.testing.assert_array_equal(joined, whole[chosen])
     assert all(chunk.frames.keys() == set(cameras) for chunk in chunks)
     states = np.concatenate([made.states[:0], *(chunk.states for chunk in chunks)])
-    np.testing.assert_array_equal(states, expected_states(entries)[start:stop])
+    np.testing.assert_array_equal(states, expected_states(entries)[chosen])
     index = np.concatenate([made.session_index[:0], *(chunk.session_index for chunk in chunks)])
-    np.testing.assert_array_equal(index, made.session_index[start:stop])
+    np.testing.assert_array_equal(index, made.session_index[chosen])
 
 
 def test_sessions_of_any_kind() -> None:
@@ -145,10 +148,10 @@ def test_arrays_are_the_callers() -> None:
     made.verify()
 
 
-@pytest.mark.parametrize("span", [(-1, 3), (4, 3), (0, 100_000), (145, 145)])
-def test_spans_and_single_frames_are_inside(span: tuple[int, int]) -> None:
+@pytest.mark.parametrize("indices", [[-1, 3], range(100_000), [144]])
+def test_frames_are_inside(indices: Sequence[int]) -> None:
     with pytest.raises(UnknownNameError, match="has 144 history frames"):
-        next(buffer().stream(8, None, *span))
+        next(buffer().stream(8, None, indices))
     for index in (-1, 144):
         told = f"frame {index} is not in the buffer of MoveCube/test/0 under k3"
         with pytest.raises(UnknownNameError, match=told):
@@ -160,14 +163,19 @@ def test_spans_and_single_frames_are_inside(span: tuple[int, int]) -> None:
     [
         (lambda made, wrong: made.frame(wrong), "index {}; expected a whole number"),
         (lambda made, wrong: next(made.stream(wrong)), "chunk {}; expected a whole number"),
-        (lambda made, wrong: next(made.stream(8, None, wrong)), "start {}; expected a whole"),
-        (lambda made, wrong: next(made.stream(8, None, 0, wrong)), "stop {}; expected a whole"),
+        (lambda made, wrong: next(made.stream(8, None, [wrong])), "indices [{}]; expected whole"),
     ],
 )
 @pytest.mark.parametrize("wrong", [1.5, True, "1", [1]])
 def test_numbers_are_whole(use: Callable[[Buffer, Any], object], told: str, wrong: object) -> None:
     with pytest.raises(InvalidOptionError, match=re.escape(told.format(repr(wrong)))):
         use(buffer(), wrong)
+
+
+@pytest.mark.parametrize("indices", [[3, 3], [4, 3], 3, "front"])
+def test_indices_ascend(indices: Any) -> None:
+    with pytest.raises(InvalidOptionError, match="ascending, each once"):
+        next(buffer().stream(8, None, indices))
 
 
 @pytest.mark.parametrize(
@@ -262,7 +270,7 @@ def test_cached_frames_are_those_that_are_decoded(tmp_path: Path) -> None:
         made = buffer("k3", cache=cache)
         expected = expected_frames(made.manifest.sessions, "front")
         np.testing.assert_array_equal(made.frames("front"), expected)
-        chunks = [chunk.frames["front"] for chunk in made.stream(7, ("front",), 40, 100)]
+        chunks = [chunk.frames["front"] for chunk in made.stream(7, ("front",), range(40, 100))]
         np.testing.assert_array_equal(np.concatenate(chunks), expected[40:100])
     assert len(list(cache.folder.iterdir())) == 4  # lesson and three units of the front camera
 

@@ -15,7 +15,7 @@ from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evidence import (
     Evidence,
-    counted_from,
+    among,
     known_parts,
     place_evidence,
     spans_of_parts,
@@ -146,10 +146,12 @@ def test_evidence_kept_by_hand() -> None:
     assert evidence_kept(placed(wrong), range(20)) is None
 
 
-def test_a_part_of_a_buffer_counts_from_its_own_beginning() -> None:
-    part = counted_from(placed(ENTRY), 5)
-    assert places(part) == [(0, -3, 5), (1, 3, 15)]
-    assert evidence_kept(part, range(3)) == 0.5
+def test_evidence_among_some_frames_has_its_places_among_them() -> None:
+    evidence = placed(ENTRY)
+    assert places(among(evidence, range(5, 20))) == [(0, 0, 5), (1, 3, 15)]
+    assert places(among(evidence, range(20))) == places(evidence)
+    assert places(among(evidence, [0, 1, 8, 12, 30])) == [(0, 2, 3), (1, 2, 4)]
+    assert among(evidence, [0, 1]) == ()
 
 
 # --- known ---------------------------------------------------------------------------------------

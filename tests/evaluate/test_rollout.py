@@ -120,36 +120,36 @@ def test_only_a_privileged_policy_is_told_what_frames_show() -> None:
 
 
 class Chooses:
-    """A retrieval step that takes a span, whatever it is shown."""
+    """A retrieval step that takes these frames, whatever it is shown."""
 
     name, camera = "chooses", "front"
 
-    def __init__(self, start: int, stop: int):
-        self.chosen = start, stop
+    def __init__(self, *frames: int):
+        self.chosen = np.array(frames)
 
     def select(self, buffer: Buffer, image: np.ndarray) -> Any:
         return self.chosen
 
 
-def test_retrieval_hands_over_the_span_that_it_chose_and_clips_show_it() -> None:
+def test_retrieval_hands_over_the_frames_that_it_chose_and_clips_show_them() -> None:
     policy, shown = Cheat(), []
-    clip = SimpleNamespace(begin=lambda *given: shown.append(given[1:3]), step=lambda *_: None)
-    row = roll("k3", policy, selector=Chooses(40, 60), clip=clip)
-    assert policy.chunks == [(20, 20)] and shown == [(40, 60)]
+    clip = SimpleNamespace(begin=lambda *given: shown.append(given[1]), step=lambda *_: None)
+    row = roll("k3", policy, selector=Chooses(*range(40, 60)), clip=clip)
+    assert policy.chunks == [(20, 20)] and shown == [[*range(40, 60)]]
     assert (row.retrieval_model, row.retrieval_start, row.retrieval_stop) == ("chooses", 40, 60)
     # 20 frames and the live one are all in the sample; 8 of them are of the 48 frames' lesson.
     assert (row.history_frames, row.lesson_frames, row.lesson_share) == (20, 8, 8 / 21)
     assert row.retrieval_selected_lesson_fraction == 8 / 21
     assert row.retrieval_selected_filler_fraction == 12 / 21
     assert row.retrieval_selected_query_fraction == 1 / 21
-    empty = roll("no-history", Cheat(), selector=Chooses(0, 0))
+    empty = roll("no-history", Cheat(), selector=Chooses())
     assert (empty.retrieval_model, empty.retrieval_start) == ("chooses", None)
 
 
 def test_what_retrieval_chose_keeps_the_position_limit() -> None:
     system = "retrieval-framesamp-modul"  # 4096 positions less 1300 steps
     with pytest.raises(HistoryTooLongError, match="2797 frames under k7"):
-        roll("k7", Cheat(), selector=Chooses(0, 2797), system=system)
+        roll("k7", Cheat(), selector=Chooses(*range(2797)), system=system)
 
 
 # --- the row -----------------------------------------------------------------------------------

@@ -145,7 +145,6 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         (f"retrieve {EPISODE} k2 --split {{split}}", "condition 'k2'"),
         (f"retrieve {EPISODE} no-history --split {{split}}", "the history is empty"),
         ("retrieve VideoRepick/test/9 k1 --split {split}", "VideoRepick/test/9"),
-        (f"retrieve {EPISODE} k1 --split {{split}} --rule top32", "single frames"),
         (f"retrieve {EPISODE} k1 --split {{split}} --out why.gif", "ends in"),
         ("calibrate {split} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
         ("calibrate {split} --out cuts.pdf", "ends in"),
@@ -214,8 +213,19 @@ def test_why_wherever_the_lesson_lies(
     choice = select.choose(measured, rule)
     found = reasons.reasons(buffer, measured, choice, rule, "thumbnail", "front")
     assert found.text().endswith(said)
-    drawing.draw_retrieval(buffer, measured, choice, found, tmp_path / "why.svg")
+    live = buffer.query.frame()
+    drawing.draw_retrieval(buffer, measured, choice, found, live, tmp_path / "why.svg")
     assert said.rpartition(": ")[2] in (tmp_path / "why.svg").read_text()
+
+
+def test_what_was_chosen_may_be_in_several_parts(run: Run, indexed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "why.svg"
+    options = ("--split", indexed, "--rule", "top32", "--out", out)
+    code, told, _ = run("retrieve", EPISODE, "k3", *options)
+    chosen = json.loads(run("retrieve", EPISODE, "k3", *options[:4], "--json")[1])["chosen"]
+    assert code == 0 and out.exists() and len(chosen) > 1
+    assert sum(stop - start for start, stop in chosen) == 32
+    assert f"Chosen: frames {chosen[0][0]} to {chosen[0][1] - 1} and " in told
 
 
 # --- calibrate ---------------------------------------------------------------------------------

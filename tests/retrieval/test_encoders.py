@@ -19,7 +19,8 @@ def test_thumbnail_by_hand() -> None:
     encoder = Thumbnail()
     (row,) = encoder.features(encoder.prepare(image[None]))
     colours, right, below = row[:192], row[192:360], row[360:]
-    assert colours.reshape(8, 8, 3)[:, 0].tolist() == [[0, 0, 0]] * 4 + [[1, 0, 0]] * 4
+    # The image's mean colour is (0.5, 0, 0).
+    assert colours.reshape(8, 8, 3)[:, 0].tolist() == [[-0.5, 0, 0]] * 4 + [[0.5, 0, 0]] * 4
     assert not right.any()
     steps = below.reshape(7, 8, 3)
     assert steps[3].tolist() == [[1, 0, 0]] * 8 and steps.sum() == 8
@@ -31,8 +32,15 @@ def test_cells_of_uneven_size_are_means() -> None:
     image = np.random.default_rng(0).integers(0, 256, (21, 11, 3), np.uint8)
     (row,) = Thumbnail().prepare(image[None])
     # Cell (2, 7): rows 5 to 6 (42 // 8, 63 // 8 = 7 excluded), columns 9 and 10.
-    expected = image[5:7, 9:11].mean(axis=(0, 1)) / 255
+    expected = (image[5:7, 9:11].mean(axis=(0, 1)) - image.mean(axis=(0, 1))) / 255
     assert row[:192].reshape(8, 8, 3)[2, 7] == pytest.approx(expected, abs=1e-6)
+
+
+def test_thumbnail_hardly_knows_a_lamp_that_is_brighter() -> None:
+    image = np.random.default_rng(0).integers(0, 100, (1, 16, 16, 3), np.uint8)
+    image[:, :8] += 50
+    dark, bright = Thumbnail().prepare(np.concatenate([image, image + 60]))
+    assert bright == pytest.approx(dark, abs=1e-6)
 
 
 @pytest.mark.parametrize(

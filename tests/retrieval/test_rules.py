@@ -123,7 +123,7 @@ def test_rules_that_are_none(text: str, error: type[Exception], said: str) -> No
 )
 def test_choosing(method: str, query: np.ndarray, span: tuple[int, int]) -> None:
     choice = choose(embedded(HISTORY, query, lesson=(0, 4)), Rule(method, 0.5))
-    assert choice.span == span
+    assert choice.spans == (span,)
     assert choice.segments == SPANS
     assert choice.frames.tolist() == list(range(*span))
     assert SPANS[2] not in choice.scores and (method != "max" or SPANS[1] in choice.scores)
@@ -136,23 +136,45 @@ def test_max_and_mean_differ() -> None:
     measured = embedded(np.stack([X, MIXED, MIXED, MIXED, *[other] * 4]), X)
     by_max, by_mean = (choose(measured, Rule(method, 0.5)) for method in ("max", "mean"))
     assert by_max.segments == ((0, 4), (4, 8))
-    assert (by_max.span, by_mean.span) == ((0, 4), (4, 8))
+    assert (by_max.spans, by_mean.spans) == (((0, 4),), ((4, 8),))
     assert by_max.scores == pytest.approx({(0, 4): 1, (4, 8): 0.8}, abs=1e-3)
     assert by_mean.scores == pytest.approx({(0, 4): 0.7, (4, 8): 0.8}, abs=1e-3)
 
 
+def test_of_equally_close_segments_latest_takes_the_last() -> None:
+    twice = np.concatenate([HISTORY, HISTORY])
+    assert choose(embedded(twice, Y), Rule("max", 0.5)).spans == ((4, 9),)
+    assert choose(embedded(twice, Y), Rule("latest", 0.5)).spans == ((19, 24),)
+
+
+def test_joined_takes_every_part_of_the_session() -> None:
+    # Adjacent cosines of the first segment: 1, 1, 0.8; the lowest decile of three is the lowest.
+    first = np.stack([X, X, X, MIXED * [4 / 3, 3 / 4, 1]])  # the last is (0.8, 0.6, 0)
+    other = np.stack([MIXED * [1, -1, 1]] * 4)  # (0.6, −0.8, 0): cosines 0.6 and 0 with the first
+    second = np.stack([Y, MIXED, MIXED, MIXED])  # (0.6, 0.8, 0) and (0.8, 0.6, 0) have 0.96
+    history = np.concatenate([first, other, second, np.stack([Z] * 4)]).astype(np.float16)
+    choice = choose(embedded(history, X), Rule("joined", 0.5))
+    assert choice.segments == ((0, 4), (4, 8), (8, 12), (12, 16))
+    assert choice.spans == ((0, 4), (8, 12))
+    assert choice.scores[0, 4] == 1
+    # Frames that follow are equal here, and (0.8, 0.6, 0) is no part of what is seen.
+    alone = choose(embedded(history, Z), Rule("joined", 0.5))
+    assert alone.spans == ((12, 16),)
+    single = choose(embedded(np.stack([X, Y, Z]), Y), Rule("joined", 0.5))
+    assert single.spans == ((1, 2),)
+
+
 def test_short_segments_count_if_there_are_no_others() -> None:
-    assert choose(embedded(np.stack([X, Y, Z]), Y), Rule("max", 0.5)).span == (1, 2)
+    assert choose(embedded(np.stack([X, Y, Z]), Y), Rule("max", 0.5)).spans == ((1, 2),)
 
 
-def test_single_frames_are_no_span() -> None:
+def test_single_frames() -> None:
     choice = choose(embedded(np.tile(HISTORY, (4, 1)), Y), Rule("top32", 0.5))
     # 20 frames of Y, then the first 12 of the 16 MIXED.
     expected = [i for i in range(60) if i % 15 in range(4, 9)]
     expected += [i for i in range(60) if i % 15 >= 11][:12]
     assert choice.frames.tolist() == sorted(expected)
-    with pytest.raises(InvalidOptionError, match="single frames"):
-        _ = choice.span
+    assert choice.spans[:2] == ((4, 9), (11, 15))
 
 
 @pytest.mark.parametrize(
@@ -164,7 +186,7 @@ def test_the_oracle_takes_the_first_part_wherever_it_lies(
     lessons: tuple[int, ...], span: tuple[int, int]
 ) -> None:
     measured = made(cuts={4: 0.1}, high={1: 1}, lessons=lessons)
-    assert choose(measured, Rule("oracle")).span == span
+    assert choose(measured, Rule("oracle")).spans == (span,)
 
 
 def test_lots_are_those_of_the_rule() -> None:
@@ -173,7 +195,7 @@ def test_lots_are_those_of_the_rule() -> None:
         choose(made(f"MoveCube/test/{n}", cuts={6: 0, 11: 0}, high={}), Rule("random", 0.5))
         for n in range(6)
     ]
-    assert [one.segments.index(one.span) for one in found] == [0, 2, 2, 0, 0, 2]
+    assert [one.segments.index(*one.spans) for one in found] == [0, 2, 2, 0, 0, 2]
 
 
 def test_refusals() -> None:
@@ -182,4 +204,4 @@ def test_refusals() -> None:
     absent = made(cuts={}, high={1: 1}, lessons=())
     with pytest.raises(InvalidOptionError, match="no lesson"):
         choose(absent, Rule("oracle"))
-    assert choose(absent, Rule("max")).span == (0, 15)
+    assert choose(absent, Rule("max")).spans == ((0, 15),)

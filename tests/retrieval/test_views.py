@@ -98,3 +98,16 @@ def test_damage_is_found(seen: Path, tmp_path: Path) -> None:
     (split / SHIFTED / "meta" / "tasks.parquet").write_bytes(b"damaged")
     where = [one.where for one in verify_split(load_split(split), decode=False)]
     assert "shifted/meta/tasks.parquet" in where
+
+
+def test_retrieve_shows_what_the_robot_sees_under_a_shift(
+    run: Run, seen: Path, tmp_path: Path
+) -> None:
+    pictures = []
+    for shift in ("none", "clutter:3"):
+        words = ("retrieve", QUERIES[0], "k1", "--split", seen, "--shift", shift)
+        out = tmp_path / f"{shift[:5]}.png"
+        assert run(*words, "--out", out)[0] == 0
+        pictures.append((out.read_bytes(), json.loads(run(*words, "--json")[1])["cosine"]))
+    (plain, same), (shifted, other) = pictures
+    assert plain != shifted and same != other

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +17,12 @@ from robomme_interference_data.files import write_json
 from robomme_interference_data.records import place_sessions
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
-from robomme_interference_data.retrieval.segment import Span, adjacent_cosines, cosines
+from robomme_interference_data.retrieval.segment import (
+    Span,
+    adjacent_cosines,
+    closest_cosines,
+    cosines,
+)
 from robomme_interference_data.retrieval.select import Measured
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.work_progress import WorkProgress
@@ -136,7 +142,8 @@ def made(
     others = iter(units or own)
     names = [episode if n in lessons else next(others) for n in range(len(spans))]
     sessions: tuple[Session, ...] = sessions_of(names, spans, lessons)
-    return Measured(EpisodeId.parse(episode), condition, sessions, adjacent, alike, 0.0)
+    query = EpisodeId.parse(episode)
+    return Measured(query, condition, sessions, adjacent, alike, 0.0, lambda span: alike)
 
 
 def embedded(history: np.ndarray, query: np.ndarray, lesson: Span = (0, 0)) -> Measured:
@@ -145,4 +152,5 @@ def embedded(history: np.ndarray, query: np.ndarray, lesson: Span = (0, 0)) -> M
     lessons = [spans.index(lesson)] if lesson in spans else []
     sessions = sessions_of(["MoveCube/test/0"] * len(spans), spans, lessons)
     episode, alike = EpisodeId.parse("MoveCube/test/0"), cosines(history, query)
-    return Measured(episode, "k2", sessions, adjacent_cosines(history), alike, 0.0)
+    near = partial(closest_cosines, history)
+    return Measured(episode, "k2", sessions, adjacent_cosines(history), alike, 0.0, near)
