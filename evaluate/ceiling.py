@@ -19,10 +19,12 @@ from robomme_interference_data.retrieval.encoders import encoder_name, published
 from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, choose, measure
 from robomme_interference_data.sampling import MEMORIES, evidence_kept
+from robomme_interference_data.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
+from robomme_interference_data.views import live_embedding
 
 
 @dataclass(frozen=True)
@@ -68,17 +70,23 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
         UnknownNameError: There is no such memory, condition, encoder or method.
         InvalidOptionError: No lesson of the split has evidence, or a setting of a retrieval step is
             given without one.
+        MissingFileError: The split has no views under the shift.
         MissingIndexError, StaleIndexError: See `measure`.
     """
     if config.memory not in MEMORIES:
         raise UnknownNameError.none("memory", config.memory, MEMORIES)
     unusual_retrieval(config)
+    if config.shift != NO_SHIFT and config.retrieval is None:
+        raise InvalidOptionError(
+            f"--shift {config.shift} says nothing without a retrieval step: memories do not look",
+            "Add --retrieval ENCODER, such as --retrieval thumbnail, or leave it out.",
+        )
     names = [one.name for one in in_order(config.conditions or split.conditions)]
     found = [
         what_is_left(buffer, config.memory, frames)
         for name in names
         for buffer in split.buffers(condition=name)
-        if (frames := _given(buffer, config)) is not None
+        if (frames := _given(split, buffer, config)) is not None
     ]
     if all(one.evidence_kept is None for one in found):
         raise InvalidOptionError(
@@ -122,7 +130,7 @@ def _scene(family: str, seed: int, difficulty: str) -> Family:
     return draw_episode(family, seed, difficulty)
 
 
-def _given(buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
+def _given(split: Split, buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
     """Return the frames that the memory is given; None where there is nothing to retrieve from."""
     if config.retrieval is None:
         return range(len(buffer))
@@ -130,7 +138,9 @@ def _given(buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
         return None
     name = encoder_name(config.retrieval)
     rule = Rule.parse(config.retrieval_rule, published_threshold(name))
-    return choose(measure(buffer, name, config.retrieval_camera), rule).frames.tolist()
+    under, camera = parse_shift(config.shift), config.retrieval_camera
+    seen = live_embedding(split, buffer.episode_id, under, name, camera)
+    return choose(measure(buffer, name, camera, seen), rule).frames.tolist()
 
 
 def _cells(found: Sequence[Left], families: Iterable[str]) -> Iterator[Ceiling]:

@@ -16,6 +16,7 @@ from robomme_interference_data.console import (
 )
 from robomme_interference_data.evaluate.config import CeilingConfig, RunConfig
 from robomme_interference_data.settings import with_settings
+from robomme_interference_data.shifts import NO_SHIFT
 
 
 @with_settings
@@ -29,6 +30,7 @@ def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) 
     ```
     robomme-interference ceiling my-split --memory window
     robomme-interference ceiling my-split --retrieval thumbnail --conditions k0 k7
+    robomme-interference ceiling my-split --retrieval thumbnail --shift light:2
     ```
     """
     from robomme_interference_data.evaluate import ceiling as module
@@ -43,6 +45,7 @@ def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) 
     title = f"Ceiling on {opened.name}, memory {config.memory}"
     if config.retrieval is not None:
         title += f", behind retrieval {config.retrieval}, rule {config.retrieval_rule}"
+        title += "" if config.shift == NO_SHIFT else f", shift {config.shift}"
     typer.echo(module.ceiling_table(cells, title).text())
 
 

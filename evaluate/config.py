@@ -81,6 +81,7 @@ class CeilingConfig:
     retrieval_camera: str = setting(
         "front", help="Camera whose frames the retrieval step compares."
     )
+    shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
 
 
 def unusual_retrieval(config: RunConfig | CeilingConfig) -> dict[str, str]:

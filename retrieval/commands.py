@@ -1,7 +1,6 @@
 """The commands of retrieval: `index`, `retrieve`, `retrieval-score` and `calibrate`."""
 
 import os
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -135,23 +134,19 @@ def retrieve(
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval import drawing, encoders, reasons, select
     from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.views import shifted_embedding, shifted_frame
+    from robomme_interference_data.views import live_embedding, live_frame
 
     check_output(out)
     name = encoders.encoder_name(encoder)
     parsed = select.Rule.parse(rule, encoders.published_threshold(name))
     under, opened = parse_shift(shift), load_split(split)
     buffer = opened.load(episode, condition)
-    query = (
-        None if under is None else shifted_embedding(opened, buffer.episode_id, under, name, camera)
-    )
+    query = live_embedding(opened, buffer.episode_id, under, name, camera)
     measured = select.measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
     found = reasons.reasons(buffer, measured, choice, parsed, name, camera)
     if out is not None:
-        live = buffer.query.frame(camera)
-        if under is not None:
-            live = shifted_frame(opened, buffer.episode_id, under, camera)
+        live = live_frame(opened, buffer.episode_id, under, camera)
         drawing.draw_retrieval(buffer, measured, choice, found, live, out)
         say(f"{out} written")
     if as_json:
@@ -264,19 +259,16 @@ def _measured(
     """Measure all buffers of a split that hold frames of the lesson; tell what they are of."""
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval.select import measure
-    from robomme_interference_data.views import shifted_embedding
+    from robomme_interference_data.views import live_embedding
     from robomme_interference_data.work_progress import WorkProgress
 
     under, opened = parse_shift(shift), load_split(split)
-    look = None
-    if under is not None:
-        look = partial(shifted_embedding, opened, shift=under, encoder=encoder, camera=camera)
     measured = []
     with WorkProgress(unit="buffers", quiet=quiet) as progress:
         progress.start(encoder, len(opened))
         for buffer in opened.buffers():
             if buffer.manifest.lesson_frames:
-                query = None if look is None else look(buffer.episode_id)
+                query = live_embedding(opened, buffer.episode_id, under, encoder, camera)
                 measured.append(measure(buffer, encoder, camera, query))
             progress.advance(1)
     left_out = len(opened) - len(measured)

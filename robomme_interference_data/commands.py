@@ -110,7 +110,7 @@ def show(
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.rows import to_dict
     from robomme_interference_data.tables import Table
-    from robomme_interference_data.views import shifted_frame
+    from robomme_interference_data.views import live_frame
 
     check_output(out)
     under = parse_shift(shift)
@@ -125,9 +125,7 @@ def show(
     if out is not None:
         from robomme_interference_data.strip import draw_strip
 
-        live = None
-        if under is not None:
-            live = shifted_frame(opened, buffer.episode_id, under, camera)
+        live = live_frame(opened, buffer.episode_id, under, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         say(f"{out} written")
     manifest, evidence = buffer.manifest, buffer.evidence

@@ -1,4 +1,4 @@
-"""The stored first live views of queries under shifts: a dataset that a split may have."""
+"""The stored first live views of queries, those under shifts too, which a split may have."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,36 +13,56 @@ from robomme_interference_data.split import Split
 from robomme_interference_data.split_index import SplitIndex
 
 
-def shifted_frame(
-    split: Split, episode_id: EpisodeId, shift: Shift, camera: str = "front"
+def live_frame(
+    split: Split, episode_id: EpisodeId, shift: Shift | None, camera: str = "front"
 ) -> NDArray[np.uint8]:
-    """Decode a query's first live view under a shift, `(H, W, 3) uint8` RGB.
+    """Decode a query's stored first live view, `(H, W, 3) uint8` RGB.
+
+    Args:
+        split: The split.
+        episode_id: The query.
+        shift: How the scene differs from the lesson's; None if it does not.
+        camera: Name of the camera.
 
     Raises:
-        UnknownNameError: There is no such camera.
-        MissingFileError: The split has no such views, or a file is missing.
+        UnknownNameError: There is no such camera or query.
+        MissingFileError: The split has no views under shifts, or a file is missing.
         FormatError, TruncatedVideoError: Its video cannot be read.
     """
-    dataset, place = _views(split), SHIFTS.index(shift)
-    [frame] = dataset.iter_frames(dataset.index_of(episode_id), camera, place, place + 1)
+    dataset, episode, place = _stored(split, episode_id, shift)
+    [frame] = split.datasets[dataset].iter_frames(episode, camera, place, place + 1)
     return frame
 
 
-def shifted_embedding(
-    split: Split, episode_id: EpisodeId, shift: Shift, encoder: str, camera: str = "front"
+def live_embedding(
+    split: Split, episode_id: EpisodeId, shift: Shift | None, encoder: str, camera: str = "front"
 ) -> NDArray[np.float32]:
-    """Look up the embedding of a query's first live view under a shift, `(D,) float32`.
+    """Look up the embedding of a query's stored first live view, `(D,) float32`.
 
     For grading without a simulator: in a rollout, what the robot sees is embedded then.
 
+    Args:
+        split: The split.
+        episode_id: The query.
+        shift: As for `live_frame`.
+        encoder: Name of the encoder.
+        camera: Name of the camera.
+
     Raises:
-        MissingFileError: The split has no such views.
+        UnknownNameError, MissingFileError: As for `live_frame`.
         MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
     """
-    views, place = _views(split), SHIFTS.index(shift)
-    needed = {name: split.datasets[name] for name in (DISTRACTORS, SHIFTED)}
-    index = SplitIndex(needed, encoder, camera)
-    return index.span(SHIFTED, views.index_of(episode_id), place, place + 1)[0]
+    dataset, episode, place = _stored(split, episode_id, shift)
+    needed = {name: split.datasets[name] for name in (DISTRACTORS, dataset)}
+    return SplitIndex(needed, encoder, camera).span(dataset, episode, place, place + 1)[0]
+
+
+def _stored(split: Split, episode_id: EpisodeId, shift: Shift | None) -> tuple[str, int, int]:
+    """Return where a view is stored: dataset, episode index and frame."""
+    if shift is None:
+        place = split.query(episode_id).place
+        return place.dataset, place.episode_index, place.frame
+    return SHIFTED, _views(split).index_of(episode_id), SHIFTS.index(shift)
 
 
 def _views(split: Split) -> Dataset:

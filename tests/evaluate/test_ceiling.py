@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from support.made_up import record
 from support.retrieval import make_index
+from support.shifted import add_shifted
 from support.splits import copy_split
 
 from robomme_interference_data import load_split
@@ -52,6 +53,17 @@ def test_a_retrieval_step_in_front(tmp_path: Path) -> None:
     assert set(found.values()) == {0.5}  # of the lesson alone, whatever follows it
     last = kept(split, memory="full", retrieval="thumbnail", retrieval_rule="last")
     assert last["MoveCube", "k7"] == 0
+
+
+def test_retrieval_by_what_is_seen_under_a_shift(tmp_path: Path) -> None:
+    split = copy_split(tmp_path / "split")
+    add_shifted(split)
+    make_index(split, names=("demonstrations", "distractors", "shifted"))
+    options: dict[str, Any] = {"memory": "full", "retrieval": "thumbnail", "conditions": ("k7",)}
+    plain, same, black = (kept(split, shift=s, **options) for s in ("none", "light:1", "clutter:3"))
+    assert plain == same != black  # light:1 looks as always, clutter:3 is black
+    with pytest.raises(InvalidOptionError, match="--shift light:1 says nothing"):
+        ceiling(load_split(split), CeilingConfig(shift="light:1"))
 
 
 def test_what_cannot_be_told(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
