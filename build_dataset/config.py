@@ -75,6 +75,9 @@ class AllConfig(BuildConfig):
     unit_episodes: str | None = setting(
         None, help="Numbers of the train episodes that give units, such as 0-3; default: all."
     )
+    shifted: bool = setting(
+        False, help="Also what query episodes look like under each shift (tabletop)."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,10 +136,8 @@ def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
         BuildError: Something else lies where one of the outputs is to be.
     """
     every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
-    plans = {
-        name: plan_build(name, every if name in UNITS else config)
-        for name in datasets_of(in_order(plan.conditions))
-    }
+    names = [*datasets_of(in_order(plan.conditions)), *[SHIFTED] * config.shifted]
+    plans = {name: plan_build(name, every if name in UNITS else config) for name in names}
     queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
     _check_plans(queries, plans, config.out, plan)
     return plans

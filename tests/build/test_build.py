@@ -257,6 +257,15 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
     assert len(few["distractors"].tasks) == 18
 
 
+def test_views_under_shifts_are_of_the_queries(tmp_path: Path) -> None:
+    asked = config(tmp_path, "tabletop", split="test", episodes="0-1", shifted=True)
+    plans = plan_all(asked, PlanConfig(("k1",)))
+    assert [*plans] == ["demonstrations", "distractors", "shifted"]
+    assert [one.id for _, one in plans["shifted"].tasks] == [
+        one.id for _, one in plans["demonstrations"].tasks
+    ]
+
+
 @pytest.mark.parametrize(
     ("changes", "plan", "error"),
     [
@@ -271,6 +280,7 @@ def test_units_are_of_train_episodes(tmp_path: Path) -> None:
         ({}, {"position_limit": "many"}, InvalidOptionError),
         ({}, {"conditions": ("k63",)}, PoolTooSmallError),
         ({"source": ("robomme",)}, {}, InvalidOptionError),
+        ({"shifted": True}, {}, InvalidOptionError),  # the sample has no lamps
         ({"source": ("sample:MoveCube",)}, {}, PoolTooSmallError),
     ],
 )
