@@ -38,8 +38,8 @@ other (ours)."""
 
 METHODS = {
     "max": "the segment with the frame closest to what the robot sees now (released rule)",
-    "latest": "as max, but of segments with equally close frames the last",
-    "joined": "as max, with all segments that hold a frame like one of its own (ours)",
+    "latest": "the segment that max takes, or the last of those with equally close frames",
+    "joined": "the segment that max takes, and all that hold a frame like one of its own (ours)",
     "mean": "the segment with the highest mean cosine with what the robot sees now",
     "last": "the last segment",
     "random": "a segment by lot",
