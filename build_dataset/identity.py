@@ -139,13 +139,19 @@ def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:
 
 
 def _write_table(path: Path, table: pa.Table) -> None:
-    """Write a table that is read whole: of over a hundred columns, what skips rows is a burden."""
+    """Write a table that is read whole: of over a hundred columns, what skips rows is a burden.
+
+    Most of it are SHA-256 sums, no two the same, to which a dictionary would only add numbers. It
+    is written once and fetched with the first buffer, so it is compressed as well as can be.
+    """
     with writing(path) as file:
         pq.write_table(
             table.replace_schema_metadata(None),
             file,
             row_group_size=len(table),
             compression="zstd",
+            compression_level=19,
+            use_dictionary=False,
             write_statistics=False,
             store_schema=False,
         )
