@@ -56,7 +56,7 @@ def split_tree(split: Split, base: str | None) -> Tree:
     if rows.sha256 != split.header.rows:
         raise HashMismatchError(
             f"{BUFFERS_FILE} of {split.location} does not have the SHA-256 of {MANIFEST_PATH}",
-            f"Build the manifests again: robomme-interference build manifests {split.location}",
+            split.mend,
         )
     header = indented_json(to_dict(placed(split.header, base))).encode()
     further = {

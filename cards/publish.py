@@ -41,7 +41,7 @@ def published_base(split: Split, config: PublishConfig) -> str | None:
     if Dataset(HubFiles(*place.split("@"))).revision != recorded.revision:
         raise PublishError(
             f"{place} holds other demonstrations than those that {split.location} is for",
-            f"Plan the buffers again: robomme-interference build manifests {split.location}",
+            split.mend,
         )
     return place
 

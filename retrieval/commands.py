@@ -275,7 +275,7 @@ def _measured(
     if not measured:
         raise InvalidOptionError(
             f"none of the {left_out} buffers of {split} holds a lesson: there is nothing to grade",
-            f"Type: robomme-interference build manifests {split} --conditions k0 k3",
+            f"Type: {opened.planning('k0', 'k3')}",
         )
     if left_out and not quiet:
         say(f"{left_out} of {len(opened)} buffers hold no lesson and are left out")

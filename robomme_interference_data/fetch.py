@@ -131,9 +131,7 @@ def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
     for family in config.families:
         if family not in split.families:
             raise UnknownNameError.among("family", family, split.location, split.families)
-    names = {one.name for one in in_order(config.conditions or split.conditions)}
-    for name in names - {*split.conditions}:
-        raise UnknownNameError.among("condition", name, split.location, split.conditions)
+    names = {split.planned(one).name for one in in_order(config.conditions or split.conditions)}
     numbers = None if config.episodes is None else {*parse_numbers(config.episodes)}
     found: dict[str, set[int]] = {name: set() for name in split.header.datasets}
     for manifest in split.manifests():

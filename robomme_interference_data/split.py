@@ -126,8 +126,7 @@ class Split:
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
-                    "Put the right dataset there, or build the manifests again: "
-                    f"robomme-interference build manifests {self.location}",
+                    self.mend,
                 )
         return opened
 
@@ -163,6 +162,46 @@ class Split:
         """Names of the cameras, such as `front` and `wrist`."""
         return self.datasets[DEMONSTRATIONS].cameras
 
+    def planned(self, condition: Condition | str | None, k: int | None = None) -> Condition:
+        """Return a condition for which buffers are planned; see `load_buffer` for arguments.
+
+        Raises:
+            InvalidIdError: It does not read as one.
+            UnknownNameError: No buffers are planned for it.
+        """
+        wanted = _condition(condition, k)
+        if wanted.name not in self.conditions:
+            raise UnknownNameError(
+                f"condition {wanted.name!r} is not in {self.location}",
+                f"Planned there: {' '.join(self.conditions)}. For another one, type: "
+                f"{self.planning(*self.conditions, wanted.name)}",
+            )
+        return wanted
+
+    def planning(self, *conditions: str) -> str:
+        """Return the command that plans buffers under these conditions."""
+        command = f"build manifests {self.location}"
+        if isinstance(self.files, HubFiles):  # what is published stays as it is
+            place = self.header.datasets[DEMONSTRATIONS].place
+            command = f"new-split --demonstrations {place} --source KIND:PATH --out SPLIT"
+        return f"robomme-interference {command} --conditions {' '.join(conditions)}"
+
+    @property
+    def mend(self) -> str:
+        """What to do where manifests and data are not of each other."""
+        if isinstance(self.files, HubFiles):
+            places = [one.place or "." for one in self.header.datasets.values()]
+            others = {place.split("@")[0] for place in places} - {"."}
+            cached = " ".join(f"dataset/{name}" for name in sorted({self.files.repo_id, *others}))
+            return (
+                f"Fetch it again: type hf cache rm {cached}, and the same command. If that does "
+                "not help, only its publisher can."
+            )
+        return (
+            "Put the right files there, or build the manifests again: "
+            f"robomme-interference build manifests {self.location}"
+        )
+
     def query(self, episode_id: EpisodeId | str) -> Query:
         """Return a query episode: its goal, scene and first live observation, without a buffer.
 
@@ -184,7 +223,7 @@ class Split:
     ) -> BufferManifest:
         """Return the manifest of one buffer; see `load_buffer` for arguments and errors."""
         episode = EpisodeId.parse(episode_id)
-        wanted = self._planned(condition, k)
+        wanted = self.planned(condition, k)
         row = self._places.get((str(episode), wanted.name))
         if row is None:
             self._check_episode(episode)
@@ -206,7 +245,7 @@ class Split:
         Raises:
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
-        name = None if condition is None and k is None else self._planned(condition, k).name
+        name = None if condition is None and k is None else self.planned(condition, k).name
         keep = np.ones(len(self), bool)
         for column, value in (("family", family), ("condition", name), ("difficulty", difficulty)):
             if value is not None:
@@ -248,21 +287,6 @@ class Split:
             cache=self._cache,
             threads=self._threads,
         )
-
-    def _planned(self, condition: Condition | str | None, k: int | None) -> Condition:
-        wanted = _condition(condition, k)
-        if wanted.name not in self.conditions:
-            command = f"build manifests {self.location}"
-            if isinstance(self.files, HubFiles):  # what is published stays as it is
-                place = self.header.datasets[DEMONSTRATIONS].place
-                command = f"new-split --demonstrations {place} --source KIND:PATH --out SPLIT"
-            raise UnknownNameError(
-                f"condition {wanted.name!r} is not in {self.location}",
-                f"Planned there: {' '.join(self.conditions)}. For another one, type: "
-                f"robomme-interference {command} --conditions "
-                f"{' '.join(self.conditions)} {wanted.name}",
-            )
-        return wanted
 
     def _check_episode(self, episode: EpisodeId) -> None:
         if episode.family not in self.families:

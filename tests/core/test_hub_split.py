@@ -18,9 +18,12 @@ from support.splits import GOLDEN, copy_split
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.build_dataset.audit import audit_split
 from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.cards.contents import split_tree
 from robomme_interference_data.cli import app
+from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import (
     FormatError,
+    HashMismatchError,
     HubError,
     MissingFileError,
     UnknownNameError,
@@ -32,6 +35,7 @@ from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 
 QUERY = "MoveCube/test/0"
 VERSION = "data-1.0.0"
+ROWS_WRONG, UNITS_WRONG = "someone/rows", "someone/wrong-units"
 
 
 @pytest.fixture
@@ -72,6 +76,30 @@ def test_what_is_published_is_not_planned_again(hub: HubServer) -> None:
     hint = str(caught.value.hint)
     assert f"new-split --demonstrations {BASE}@" in hint and hint.endswith("k7 k2")
     assert "build manifests" not in hint
+
+
+def test_no_hint_says_to_build_what_is_published(hub: HubServer, tmp_path: Path, run: Any) -> None:
+    """Where manifests and data are not of each other, only their publisher can mend it."""
+    damaged = copy_split(tmp_path / "damaged")
+    rows, header = damaged / "manifests" / "buffers.parquet", damaged / MANIFEST_PATH
+    told, revision = header.read_text(), load_split(damaged).header.datasets["distractors"].revision
+    header.write_text(told.replace(revision, "0" * 64))
+    push_split(hub, damaged, tmp_path / "units", UNITS_WRONG)
+    header.write_text(told)
+    rows.write_bytes(rows.read_bytes() + b"!")
+    push_split(hub, damaged, tmp_path / "rows", ROWS_WRONG)
+    for name, ask in (
+        (UNITS_WRONG, lambda split: split.load(QUERY, "k3")),
+        (ROWS_WRONG, lambda split: split_tree(split, None)),
+    ):
+        with pytest.raises(HashMismatchError) as caught:
+            ask(load_split(name))
+        hint = str(caught.value.hint)
+        assert f"hf cache rm dataset/{BASE} dataset/{name}," in hint and "publisher" in hint
+        assert "build manifests" not in hint
+    with pytest.raises(HashMismatchError) as caught:
+        split_tree(load_split(damaged), None)
+    assert f"robomme-interference build manifests {damaged}" in str(caught.value.hint)
 
 
 def test_a_second_load_makes_no_request(hub: HubServer) -> None:
@@ -176,7 +204,7 @@ def test_fetch_a_part_twice(hub: HubServer, fetch: Fetched) -> None:
     ("options", "words"),
     [
         (["--families", "MoveCub"], "MoveCub"),
-        (["--conditions", "k9"], "k9"),
+        (["--conditions", "k1", "k9"], "--conditions no-history k0 k1 k3 k7 k9"),
         (["--cameras", "side"], "side"),
         (["--episodes", "40-49"], "no buffer"),
         (["--index", "thumbnail"], "lacks index"),
