@@ -17,6 +17,7 @@ from robomme_interference_data.console import Group, say
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
+from robomme_interference_data.hub_errors import check_endpoint
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.settings import spread_values
 from robomme_interference_data.simulators import commands as simulating
@@ -108,7 +109,7 @@ def _root(
         typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
     ] = False,
 ) -> None:
-    pass
+    check_endpoint()  # before a library that works with the Hub is imported
 
 
 for _commands in _GROUPS.values():

@@ -18,8 +18,8 @@ from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
 )
-from robomme_interference_data.files import LocalFiles, check_relative, sha256_file
-from robomme_interference_data.hub_errors import Asked
+from robomme_interference_data.files import LocalFiles, all_files, check_relative, sha256_file
+from robomme_interference_data.hub_errors import Asked, check_endpoint
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
@@ -73,11 +73,15 @@ class HubFiles:
         repo_id: Repository, `namespace/name`.
         revision: Branch, tag or commit hash; None for the main branch.
         repo_type: `dataset` or `model`.
+
+    Raises:
+        InvalidOptionError: `HF_ENDPOINT` is no address.
     """
 
     folder = ""
 
     def __init__(self, repo_id: str, revision: str | None = None, repo_type: str = "dataset"):
+        check_endpoint()
         self.repo_id = repo_id
         self.revision = revision or "main"
         self.repo_type = repo_type
@@ -129,8 +133,7 @@ class HubFiles:
                 tqdm_class=_silent(),
             )
         )
-        if new:
-            self._check(relative, path)
+        self._check({one: path for one in new})
         return path
 
     def fetch(self, paths: Iterable[str]) -> None:
@@ -192,10 +195,15 @@ class HubFiles:
 
         Raises:
             HubError: See `commit`.
+            HashMismatchError: What came is not what the Hub has.
         """
-        from huggingface_hub import snapshot_download
+        from huggingface_hub import constants, snapshot_download
+        from huggingface_hub.file_download import repo_folder_name
 
-        whole = self._ask(
+        cache = repo_folder_name(repo_id=self.repo_id, repo_type=self.repo_type)
+        root = Path(constants.HF_HUB_CACHE, cache, "snapshots", self.commit, self.folder)
+        there = {*all_files(root)}
+        self._ask(
             None,
             snapshot_download,
             self.repo_id,
@@ -203,13 +211,14 @@ class HubFiles:
             revision=self.commit,
             allow_patterns=[self.folder + pattern for pattern in patterns],
         )
-        return Path(whole, self.folder)
+        self._check({path: root / path for path in all_files(root) if path not in there})
+        return root
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """Return the sorted paths of the files under a folder, which are downloaded.
 
         Raises:
-            HubError: See `commit`.
+            HubError, HashMismatchError: See `snapshot`.
         """
         return LocalFiles(self.snapshot(f"{folder}/*{suffix}")).list(folder, suffix)
 
@@ -218,20 +227,24 @@ class HubFiles:
         whole = f"{self.repo_id}@{self._at}"
         return f"{whole}, {self.folder}" if self.folder else whole
 
-    def _check(self, relative: str, path: Path) -> None:
-        """Check a file that has just come, and remove it if it is not what the Hub has.
+    def _check(self, came: dict[str, Path]) -> None:
+        """Check files that have just come, and remove those that are not what the Hub has.
 
-        The client checks its length only. It keeps files under their digests: Git's of small
+        The client checks their length only. It keeps files under their digests: Git's of small
         ones, SHA-256 of large ones.
         """
-        blob = path.resolve()
-        made = {40: partial(_git_sha1, blob), 64: partial(sha256_file, blob)}.get(len(blob.name))
-        if made is not None and made() != blob.name:
-            path.unlink()
-            blob.unlink(missing_ok=True)
+        damaged = []
+        for relative, path in came.items():
+            blob = path.resolve()
+            digest = {40: _git_sha1, 64: sha256_file}.get(len(blob.name))
+            if digest is not None and digest(blob) != blob.name:
+                path.unlink()
+                blob.unlink(missing_ok=True)
+                damaged.append(relative)
+        if damaged:
             raise HashMismatchError(
-                f"{relative} of {self.describe()} came damaged: its digest is not {blob.name}",
-                "It was thrown away. Type the same command again.",
+                f"{', '.join(damaged)} of {self.describe()} came damaged: the digest is another",
+                "What is damaged was thrown away. Type the same command again.",
             )
 
     def _ask(self, relative: str | None, call: Any, *arguments: Any, **options: Any) -> Any:

@@ -1,15 +1,40 @@
 """What the Hub's client raises, in this package's words, with what to do next."""
 
+import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import urlsplit
 
-from robomme_interference_data.errors import HubError, InterferenceError, MissingFileError
+from robomme_interference_data.errors import (
+    HubError,
+    InterferenceError,
+    InvalidOptionError,
+    MissingFileError,
+)
 from robomme_interference_data.files import naming
 
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _BUSY = (429, 503)
+_PUBLIC = "https://huggingface.co"
+
+
+def check_endpoint() -> None:
+    """Check that `HF_ENDPOINT` is an address: of some that are none, the client cannot be imported.
+
+    Raises:
+        InvalidOptionError: It is none.
+    """
+    given = os.environ.get("HF_ENDPOINT", _PUBLIC)
+    try:
+        told = urlsplit(given)
+        known = told.scheme in ("http", "https") and told.hostname and told.port != 0
+    except ValueError:
+        known = False
+    if not known or any(map(str.isspace, given)):
+        expected, hint = f"an address such as {_PUBLIC}", "For that one, type: unset HF_ENDPOINT"
+        raise InvalidOptionError.expected("HF_ENDPOINT", given, expected, hint)
 
 
 @dataclass(frozen=True)
@@ -62,6 +87,7 @@ class Asked:
             errors.EntryNotFoundError,
             errors.RevisionResolutionError,
             httpx.TransportError,
+            httpx.InvalidURL,
         ) as error:
             cause = _cause(error)
             if isinstance(cause, OSError) and cause.errno is not None:

@@ -1,7 +1,10 @@
 """Files on a Hub, through the real client and a server on the loopback interface."""
 
+import os
 import pickle
 import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +16,7 @@ from support.lerobot_layouts import write_lerobot
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import (
     FormatError,
+    HashMismatchError,
     HubError,
     InvalidOptionError,
     MissingFileError,
@@ -20,6 +24,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import LocalFiles
 from robomme_interference_data.hub import HubFiles, locate
 
+Run = Callable[..., tuple[int, str, str]]
 REPO = "someone/small"
 DATASET = f"datasets/{REPO}"
 FILES = {f"meta/part-{number}.json": b"%d" % number for number in range(4)}
@@ -178,6 +183,61 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
         with pytest.raises(HubError, match="not in the cache, .* HF_HUB_OFFLINE is set"):
             ask()
     assert len(hub.requests) == asked
+
+
+@pytest.mark.parametrize("wrong", ["part-1", "deep/a"])
+def test_a_folder_that_comes_damaged(hub: HubServer, wrong: str) -> None:
+    hub.push(DATASET, FILES)
+    fault = hub.fault("GET", f"/meta/{wrong}.*", wrong=True)
+    with pytest.raises(HashMismatchError, match=f"meta/{wrong}.* came damaged"):
+        HubFiles(REPO).list("meta")
+    fault.times = 0
+    before = len(hub.downloads())
+    files = HubFiles(REPO)
+    assert all(files.path(path).read_bytes() == FILES[path] for path in files.list("meta"))
+    assert len(hub.downloads()) == before + 1  # nothing but what was damaged
+
+
+def test_a_folder_of_a_folder_that_comes_damaged(hub: HubServer) -> None:
+    hub.push(DATASET, FILES)
+    files = HubFiles(REPO).inside("meta")
+    hub.fault("GET", "/meta/deep/.*", wrong=True)
+    with pytest.raises(HashMismatchError, match=r"^deep/a\.parquet of "):
+        files.snapshot("deep/*")
+    assert (files.snapshot("deep/*") / "deep" / "a.parquet").read_bytes() == b"a"
+
+
+# --- no address of a Hub -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given",
+    ["", "not a url", "http://", "http://[", "http://a:b", "http://a b", "ftp://a", "a:9"],
+)
+def test_no_address_of_a_hub(monkeypatch: pytest.MonkeyPatch, run: Run, given: str) -> None:
+    monkeypatch.setenv("HF_ENDPOINT", given)
+    with pytest.raises(InvalidOptionError, match="HF_ENDPOINT .* such as https://huggingface.co"):
+        HubFiles(REPO)
+    code, out, err = run("fetch", REPO)
+    assert (code, out) == (1, "")
+    assert repr(given) in err and "unset HF_ENDPOINT" in err
+
+
+@pytest.mark.parametrize(
+    "given", ["https://huggingface.co/", "http://127.0.0.1:8080", "http://[::1]:80/hub"]
+)
+def test_addresses_of_a_hub(monkeypatch: pytest.MonkeyPatch, given: str) -> None:
+    monkeypatch.setenv("HF_ENDPOINT", given)
+    assert HubFiles(REPO).repo_id == REPO
+
+
+def test_a_client_that_cannot_be_imported(tmp_path: Path) -> None:
+    """The client reads the address when it is imported, and ends there."""
+    told = os.environ | {"HF_ENDPOINT": "http://[", "HF_HUB_OFFLINE": "0"}
+    command = [sys.executable, "-m", "robomme_interference_data.cli", "fetch", REPO]
+    done = subprocess.run(command, env=told, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr and "unset HF_ENDPOINT" in done.stderr
 
 
 # --- a LeRobot dataset on the Hub ----------------------------------------------------------------
