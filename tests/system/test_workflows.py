@@ -44,6 +44,8 @@ def test_no_secret_is_needed_and_no_more_may_be_done_than_has_to_be(name: str) -
     text = (FOLDER / "workflows" / f"{name}.yml").read_text(encoding="utf-8")
     assert not re.search(r"secrets|password|token(?!: write)", text)
     assert workflow(name)["permissions"] == {"contents": "read"}
+    [checkout] = [step for step in steps(name) if "actions/checkout" in step.get("uses", "")]
+    assert checkout["with"] == {"persist-credentials": False}
 
 
 def test_every_change_passes_what_passes_here() -> None:
