@@ -1,6 +1,10 @@
-"""A split on a Hub on the loopback interface, as `publish` lays it out."""
+"""A split on a Hub on the loopback interface, as `publish` lays it out, and others who use it."""
 
+import os
 import shutil
+import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -28,6 +32,33 @@ def running_hub(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubSer
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
         monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
         yield server
+
+
+def elsewhere(hub: HubServer, *arguments: str) -> subprocess.Popen[str]:
+    """Run Python in a process that takes the server for the Hub from its beginning.
+
+    The cache is that of this process.
+    """
+    own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"}
+    own |= {"HF_HUB_CACHE": constants.HF_HUB_CACHE, "PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-c", *arguments]
+    return subprocess.Popen(command, env=os.environ | own, stdout=subprocess.PIPE, text=True)
+
+
+def kill_at(hub: HubServer, method: str, path: str, after: int, *arguments: str) -> None:
+    """Run Python elsewhere, and kill it when it asks for such a path after so many others."""
+    reached, killed = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        reached.set()
+        killed.wait(60)
+
+    hub.fault(method, path, after=after, call=hold)
+    with elsewhere(hub, *arguments) as process:
+        came = reached.wait(120)
+        process.kill()
+    killed.set()
+    assert came
 
 
 def push_split(hub: HubServer, root: Path, work: Path, name: str = SPLIT) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,17 @@ import pytest
 from support import worlds
 from support.hub_server import HubServer
 from support.publishing import UNITS, plain_cards, publish
+from support.retrieval import make_index
 from support.runs import run as evaluate
+from support.shifted import add_shifted
+from support.splits import QUERIES
 
-from robomme_interference_data import load_split
+from robomme_interference_data import EpisodeId, load_split
 from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.constants import SHIFTED
 from robomme_interference_data.query import Query
+from robomme_interference_data.shifts import SHIFTS
+from robomme_interference_data.views import shifted_embedding, shifted_frame
 
 Login = Callable[..., None]
 Run = Callable[..., tuple[int, str, str]]
@@ -153,3 +160,30 @@ def test_further_datasets_go_to_the_hub_and_back(
     assert code == 0, err
     assert load_split(tmp_path / "part").load(QUERY, "k1", verify=True).condition == "k1"
     assert not list((tmp_path / "part").rglob("contradictions/videos"))
+
+
+@pytest.mark.slow
+def test_first_views_go_to_the_hub_and_back(
+    hub: HubServer, login: Login, run: Run, own_split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What queries look like first under shifts: another folder of the split's repository."""
+    plain_cards(monkeypatch)
+    login("someone")
+    add_shifted(own_split)
+    make_index(own_split, names=("demonstrations", "distractors", SHIFTED))
+    publish(own_split)
+    here, there, part = load_split(own_split), load_split(UNITS), own_split.parent / "part"
+    assert there.revision == here.revision
+    wanted = ("--conditions", "k0", "--families", "MoveCube", "--cameras", "front")
+    code, _, err = run("fetch", UNITS, *wanted, "--index", "thumbnail", "--to", part)
+    assert code == 0, err
+    assert len([*(part / SHIFTED).rglob("*.mp4")]) == 1  # of the one query
+    for split, queries in ((there, QUERIES), (load_split(part), (QUERY,))):
+        for query, shift in product(map(EpisodeId.parse, queries), SHIFTS):
+            seen = shifted_frame(split, query, shift)
+            assert (seen == here.query(query).frame() >> SHIFTS.index(shift)).all()
+            found, expected = (
+                shifted_embedding(one, query, shift, "thumbnail") for one in (split, here)
+            )
+            assert (found == expected).all()
+    assert list(verify_split(there)) == []

@@ -1,15 +1,12 @@
 """Publish with all checks and real cards, and after a kill; LeRobot opens what was published."""
 
 import json
-import os
-import subprocess
-import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.hub import elsewhere, kill_at
 from support.hub_server import HubServer
 from support.publishing import LESSONS, UNITS, files, publish, tags
 from support.splits import GOLDEN, contents, stored_frames
@@ -36,14 +33,6 @@ for name in ("buffers", "episodes"):
 """
 
 
-def elsewhere(hub: HubServer, *arguments: str) -> subprocess.Popen[str]:
-    """Run Python in a process that takes the server for the Hub from its beginning."""
-    own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"}
-    own["PYTHONPATH"] = str(GOLDEN.parents[1])
-    command = [sys.executable, "-c", *arguments]
-    return subprocess.Popen(command, env=os.environ | own, stdout=subprocess.PIPE, text=True)
-
-
 @pytest.fixture(autouse=True)
 def _somebody(login: Callable[..., None]) -> None:
     login("someone")
@@ -68,18 +57,8 @@ def test_what_was_published_is_opened_by_lerobot(
 
 @pytest.mark.slow
 def test_publish_after_a_kill(hub: HubServer) -> None:
-    reached, killed = threading.Event(), threading.Event()
-
-    def hold() -> None:
-        reached.set()
-        killed.wait(60)
-
-    hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=hold)
-    with elsewhere(hub, PUBLISH) as process:
-        came = reached.wait(120)
-        process.kill()
-    killed.set()
-    assert came and tags(hub, UNITS) == {}
+    kill_at(hub, "PUT", "/store/datasets/someone/tiny/", 20, PUBLISH)
+    assert tags(hub, UNITS) == {}
     before = len(hub.uploads())
     lessons, _ = publish(GOLDEN)
     assert not lessons.difference

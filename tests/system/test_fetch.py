@@ -1,0 +1,68 @@
+"""Fetch after a kill: what has come is not asked for again, and the split is the one on disk."""
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from huggingface_hub import constants
+from support.hub import SPLIT, kill_at, push_split
+from support.hub_http import Request
+from support.hub_server import HubServer
+from support.splits import GOLDEN, QUERIES
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.verify import verify_split
+
+Run = Callable[..., tuple[int, str, str]]
+FETCH = "from robomme_interference_data.cli import main; main()"
+SPLIT_AT = f"{SPLIT}@data-1.0.0"
+FILE = re.compile(r"/(?:store/)?datasets/([^/]+/[^/]+)/(?:resolve/)?[0-9a-f]{40,64}/(.+)")
+AT_ONCE = 8
+"""Files that are on their way at the same time."""
+
+
+def in_cache() -> set[tuple[str, ...]]:
+    """Return the files that came whole: repository and path."""
+    cache = Path(constants.HF_HUB_CACHE)
+    found = (path.relative_to(cache).parts for path in cache.glob("*/snapshots/*/**/*.*"))
+    return {
+        (repo.removeprefix("datasets--").replace("--", "/"), "/".join(path))
+        for repo, _, _, *path in found
+    }
+
+
+def asked_for(requests: Iterable[Request]) -> list[tuple[str, ...]]:
+    """Return the files that requests are about: repository and path."""
+    matches = (FILE.fullmatch(one.path) for one in requests)
+    return [match.groups() for match in matches if match]
+
+
+@pytest.mark.parametrize("to", [True, False])
+def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path, to: bool) -> None:
+    push_split(hub, GOLDEN, tmp_path / "work")
+    out = tmp_path / "out"
+    words = ["fetch", SPLIT_AT, *(["--to", str(out)] if to else [])]
+    kill_at(hub, "GET", r"/store/.*\.mp4", 24, FETCH, *words)
+    came = in_cache()
+    videos = [path for _, path in came if path.endswith(".mp4")]
+    assert 24 - AT_ONCE < len(videos) < 24 + AT_ONCE and not out.exists()
+    code, told, _ = run(*words, "--dry-run", "--json")
+    missing = sum(one["missing_files"] for one in json.loads(told)["repositories"])
+    assert code == 0 and missing > 0
+    before = len(hub.asked)
+    assert run(*words)[0] == 0
+    asked = hub.asked[before:]
+    downloads = asked_for(one for one in asked if one.method == "GET")
+    assert len(downloads) == len({*downloads}) == missing
+    assert {*asked_for(asked)} == {*downloads} and not came & {*downloads}
+    hub.down = True
+    split, here = load_split(out if to else SPLIT_AT), load_split(GOLDEN)
+    for query in QUERIES:
+        found, expected = (one.load(query, "k7", verify=True) for one in (split, here))
+        for camera in expected.cameras:
+            assert np.array_equal(found.frames(camera), expected.frames(camera))
+        assert np.array_equal(found.states, expected.states)
+    assert not to or list(verify_split(split)) == []
