@@ -20,7 +20,7 @@ from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import SHIFTED
 from robomme_interference_data.query import Query
 from robomme_interference_data.shifts import SHIFTS
-from robomme_interference_data.views import shifted_embedding, shifted_frame
+from robomme_interference_data.views import live_embedding, live_frame
 
 Login = Callable[..., None]
 Run = Callable[..., tuple[int, str, str]]
@@ -180,10 +180,10 @@ def test_first_views_go_to_the_hub_and_back(
     assert len([*(part / SHIFTED).rglob("*.mp4")]) == 1  # of the one query
     for split, queries in ((there, QUERIES), (load_split(part), (QUERY,))):
         for query, shift in product(map(EpisodeId.parse, queries), SHIFTS):
-            seen = shifted_frame(split, query, shift)
+            seen = live_frame(split, query, shift)
             assert (seen == here.query(query).frame() >> SHIFTS.index(shift)).all()
             found, expected = (
-                shifted_embedding(one, query, shift, "thumbnail") for one in (split, here)
+                live_embedding(one, query, shift, "thumbnail") for one in (split, here)
             )
             assert (found == expected).all()
     assert list(verify_split(there)) == []
