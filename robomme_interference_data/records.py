@@ -499,10 +499,10 @@ class Rollout:
             frame at the first step (see `sampling.evidence_kept`); None where the evidence or the
             memory's rule is unknown, and without a lesson.
         retrieval_model: Encoder and rule of the retrieval step, or None.
-        retrieval_start: First frame in the buffer of the retrieved span, or None.
-        retrieval_stop: Frame after its last one, or None.
+        retrieval_start: First frame in the buffer that was retrieved, or None.
+        retrieval_stop: Frame after the last one that was, or None; not all between need be.
         retrieval_selected_lesson_fraction: Share of lesson frames in an even 32-frame sample of
-            the retrieved span and the first live observation, as the released CSV has it.
+            what was retrieved and the first live observation, as the released CSV has it.
         retrieval_selected_filler_fraction: The same for frames of other sessions.
         retrieval_selected_query_fraction: The same for the first live observation.
         error: What broke, in one line; None unless the status is `error`.
