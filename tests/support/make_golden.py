@@ -1,5 +1,6 @@
 """Make the golden split anew: `python tests/support/make_golden.py tests/golden/split`."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -27,4 +28,6 @@ def make(root: Path) -> None:
 
 
 if __name__ == "__main__":
-    make(Path(sys.argv[1]))
+    golden = Path(sys.argv[1])
+    shutil.rmtree(golden, ignore_errors=True)  # a build goes on with what is there
+    make(golden)
