@@ -10,8 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.stats import newcombe_paired
-
 Floats = NDArray[np.float64]
 
 DRAWS = 10_000
@@ -98,29 +96,6 @@ def enough(values: Floats) -> bool:
     """
     _, counts = np.unique(values.round(12), return_counts=True)
     return len(values) - int(counts.max(initial=0)) >= LEAST
-
-
-def paired_interval(values: Floats, once: bool, drawn: Interval) -> tuple[Interval, str]:
-    """Return the difference of two sides with the interval that its data bear, and its kind.
-
-    `bca` where at least ten episodes differ (see `enough`); with fewer, `newcombe` where every
-    episode has one rollout a side, as that interval is made for pairs of single outcomes; else
-    there is none: bounds are NaN and the kind is empty.
-
-    Args:
-        values: Success of the first and the second side, in the episodes that count on both,
-            `(E, 2) float64`.
-        once: Whether every one of these episodes has one rollout that counts on each side.
-        drawn: Mean of second − first with its bootstrap interval.
-    """
-    first, second = values.T
-    if enough(second - first) and drawn.low < drawn.high:
-        return drawn, "bca"
-    if not once or not len(values):
-        return Interval(drawn.value), ""
-    both, one, other = (int(part.sum()) for part in (first * second, second, first))
-    bounds = newcombe_paired(both, one - both, other - both, len(values) - one - other + both)
-    return Interval(drawn.value, *bounds), "newcombe"
 
 
 def bootstrap(

@@ -16,6 +16,10 @@ from robomme_interference_data.rows import arrow_schema, to_dict
 Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
 
 
+class Provisional(float):
+    """A p-value of what is not complete yet: readers see it marked †."""
+
+
 @dataclass(frozen=True)
 class Column:
     """A column.
@@ -138,6 +142,12 @@ def points(value: float) -> str:
     return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
 
 
+def p_text(value: float) -> str:
+    """Return a p-value as `0.031` or `< 0.001`, a provisional one with †."""
+    text = "< 0.001" if value < 0.001 else f"{value:.3f}"
+    return f"{text}†" if isinstance(value, Provisional) else text
+
+
 def _known(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
@@ -162,7 +172,7 @@ def _shown(value: Any, kind: Kind) -> str:
         "rate": percent,
         "points": points,
         "ratio": lambda v: f"{round(v, 2) + 0.0:.2f}".replace("-", "−"),
-        "p": lambda v: "< 0.001" if v < 0.001 else f"{v:.3f}",
+        "p": p_text,
         "count": lambda v: f"{v:,}",
     }
     return shapes.get(kind, lambda v: _plain(v, kind))(value)

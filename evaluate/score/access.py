@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.cube import Cube, counting, success
+from robomme_interference_data.evaluate.score.cube import Cube, counting, success, trials
 from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table
@@ -43,7 +43,8 @@ def access_table(cubes: Iterable[Cube]) -> Table:
                 if n := len(rates):
                     rate = float(rates.mean())
                     cell = (cube.simulator, cube.systems[s], cube.conditions[c], name)
-                    rows.append((*cell, n, rate, *wilson(rate * n, n)))
+                    worth = trials(status)
+                    rows.append((*cell, n, rate, *wilson(rate * worth, worth)))
     return Table.make(
         "access",
         "Success by the evidence that was kept",

@@ -2,16 +2,16 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.evaluate.score.cube import STATUSES, Cube, Flags, success
+from robomme_interference_data.evaluate.score.cube import STATUSES, Cube, Flags, success, trials
+from robomme_interference_data.evaluate.score.ranks import cannot_be_told, to_best
 from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.records import Status
@@ -23,6 +23,10 @@ _NOTE = (
     "Rates with 95% Wilson intervals. n is the number of episodes that count: an error is neither "
     "success nor failure. A cell marked † lacks episodes, or has others than the grid, and is not "
     "ranked; one without any rollout is missing."
+)
+_BEST = (
+    " Best, and bold, is each of several that cannot be told from the highest rate: its p against "
+    "that one, corrected by Holm's method over the others, is 0.05 or more."
 )
 
 
@@ -36,6 +40,7 @@ class Cell:
         n: Episodes that count: at least one rollout that is no error.
         rate: Mean over them of the success of their repeats; NaN if n is 0.
         interval: Its 95% Wilson interval; `(0, 1)` if n is 0.
+        trials: How many independent ones the rate is worth: n, and with repeats more.
         counts: Rollouts by status, as `STATUSES`.
         expected: How many episodes are expected.
         missing: Those that do not count with every model seed of the condition.
@@ -43,6 +48,9 @@ class Cell:
         other: Episodes that count without being expected.
         rank: Place among the complete cells of this simulator, condition and part, 1 for the
             highest rate; None for an incomplete cell, and for a system that is a bound.
+        best: Whether it is among several ranked cells and cannot be told from the best of them:
+            it is the first of the highest rate, or Holm's p against that one, corrected over the
+            others, is 0.05 or more.
     """
 
     simulator: str
@@ -52,12 +60,14 @@ class Cell:
     n: int
     rate: float
     interval: tuple[float, float]
+    trials: float
     counts: tuple[int, ...] = (0,) * len(STATUSES)
     expected: int = 0
     missing: Sequence[EpisodeId] = ()
     broken: Sequence[EpisodeId] = ()
     other: Sequence[EpisodeId] = ()
     rank: int | None = None
+    best: bool = False
 
     @property
     def complete(self) -> bool:
@@ -76,50 +86,53 @@ def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
     Each comes over all episodes, then by family and by difficulty. An expected episode of unknown
     difficulty is missing in all three.
     """
+    return [cell for cube in cubes for cell in _cells(cube)]
+
+
+def _cells(cube: Cube) -> list[Cell]:
+    rates = success(cube.status)
+    every: Flags = np.ones(len(cube.episodes), bool)
+    parts = {"": (every, every)}  # name to its episodes, and to those that are expected in it
+    parts |= {name: (here, here) for name in FAMILIES if (here := cube.of_family(name)).any()}
+    for place, name in enumerate(DIFFICULTIES):
+        here = cube.difficulty == place
+        parts[name] = (here, here | (cube.difficulty < 0))
     cells = []
-    for cube in cubes:
-        rates = success(cube.status)
-        every: Flags = np.ones(len(cube.episodes), bool)
-        parts = [("", every, every)]  # name, its episodes, and those that are expected in it
-        parts += [(name, here, here) for name in FAMILIES if (here := cube.of_family(name)).any()]
-        for place, name in enumerate(DIFFICULTIES):
-            here = cube.difficulty == place
-            parts.append((name, here, here | (cube.difficulty < 0)))
-        for s, c in np.argwhere(cube.due).tolist():
-            for name, here, wanted in parts:
-                if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
-                    continue
-                known = rates[s, c][here & cube.counted[s, c]]
-                n, counts = len(known), cube.counts[s, c]
-                rate = float(known.sum() / n) if n else math.nan
-                cells.append(
-                    Cell(
-                        *(cube.simulator, cube.systems[s], cube.conditions[c], name, n, rate),
-                        interval=wilson(rate * n if n else 0, n),
-                        counts=tuple(counts[here].sum(axis=0).tolist()),
-                        expected=int((wanted & cube.expected).sum()),
-                        missing=cube.chosen(wanted & cube.missing[s, c]),
-                        broken=cube.chosen(here & (counts[:, _ERROR] > 0)),
-                        other=cube.chosen(here & cube.other[s, c]),
-                    )
+    for s, c in np.argwhere(cube.due).tolist():
+        for name, (here, wanted) in parts.items():
+            if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
+                continue
+            known = rates[s, c][here & cube.counted[s, c]]
+            n, counts = len(known), cube.counts[s, c]
+            rate, worth = float(known.sum() / n) if n else math.nan, trials(cube.status[s, c, here])
+            cells.append(
+                Cell(
+                    *(cube.simulator, cube.systems[s], cube.conditions[c], name, n, rate),
+                    interval=wilson(rate * worth if n else 0, worth),
+                    trials=worth,
+                    counts=tuple(counts[here].sum(axis=0).tolist()),
+                    expected=int((wanted & cube.expected).sum()),
+                    missing=cube.chosen(wanted & cube.missing[s, c]),
+                    broken=cube.chosen(here & (counts[:, _ERROR] > 0)),
+                    other=cube.chosen(here & cube.other[s, c]),
                 )
-    return _ranked(cells)
+            )
+    return _ranked(cube, cells, {name: here for name, (here, _) in parts.items()})
 
 
-def _ranked(cells: Sequence[Cell]) -> list[Cell]:
-    groups = [
-        (cell.simulator, cell.condition, cell.part)
-        if cell.complete and not is_bound(cell.system)
-        else None
-        for cell in cells
-    ]
-    rates = defaultdict[Any, list[float]](list)
-    for cell, group in zip(cells, groups, strict=True):
-        rates[group].append(cell.rate)
-    return [
-        replace(cell, rank=1 + sum(rate > cell.rate for rate in rates[group])) if group else cell
-        for cell, group in zip(cells, groups, strict=True)
-    ]
+def _ranked(cube: Cube, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
+    groups = defaultdict[tuple[str, str], list[int]](list)
+    for place, cell in enumerate(cells):
+        if cell.complete and not is_bound(cell.system):
+            groups[cell.condition, cell.part].append(place)
+    for (condition, part), places in groups.items():
+        own = [cells[place] for place in places]
+        against = to_best(cube, condition, [cell.system for cell in own], parts[part])
+        best = cannot_be_told(against)
+        for place, cell in zip(places, own, strict=True):
+            rank = 1 + sum(other.rate > cell.rate for other in own)
+            cells[place] = replace(cell, rank=rank, best=cell.system in best)
+    return cells
 
 
 def rate_table(cells: Sequence[Cell], name: str) -> Table:
@@ -135,24 +148,23 @@ def rate_table(cells: Sequence[Cell], name: str) -> Table:
         if cell.part in (parts or ("",)) and not (parts and own not in ran):
             own += (cell.part,) if parts else ()
             bounds = cell.interval if cell.n else (math.nan, math.nan)
-            more = (cell.complete, len(cell.missing), cell.rank)
+            more = (cell.complete, len(cell.missing), cell.rank, cell.best)
             rows.append((*own, cell.n, cell.rate, *bounds, *cell.counts, *more))
     return Table.make(
         name,
         f"Success by {name if parts else 'system and condition'}",
         f"simulator system condition {name if parts else ''} n:count rate:rate low:rate high:rate "
         "successes:count fails:count timeouts:count errors:count complete:flag missing:count "
-        "rank:count",
+        "rank:count best:flag",
         rows,
-        _NOTE,
+        _NOTE + _BEST,
     )
 
 
 def main_grids(cells: Sequence[Cell]) -> list[Table]:
     """Return the paper's main table of each simulator: a row per system, a column per condition.
 
-    Bold (between `**`) is the highest rate of each condition among several complete cells, as in
-    the paper.
+    Bold (between `**`) is what cannot be told from the best of its condition (see `Cell.best`).
     """
     grids = []
     whole = [cell for cell in cells if not cell.part]
@@ -160,14 +172,14 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         found = list(group)
         conditions = [one.name for one in in_order({cell.condition for cell in found})]
         at = {(cell.system, cell.condition): cell for cell in found}
-        several = {c: sum(a.condition == c and a.complete for a in found) > 1 for c in conditions}
         rows = (
-            (display_name(system), *(_shown(at.get((system, c)), several[c]) for c in conditions))
+            (display_name(system), *(_shown(at.get((system, c))) for c in conditions))
             for system in dict.fromkeys(cell.system for cell in found)
         )
         errors = sum(cell.errors for cell in found)
         bounds = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
         note = _NOTE
+        note += _BEST * any(cell.best for cell in found)
         note += f" Not ranked either, as they only show bounds: {', '.join(bounds)}." * bool(bounds)
         note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
         title = f"Success by system and condition, {simulator}"
@@ -175,14 +187,14 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
     return grids
 
 
-def _shown(cell: Cell | None, bold: bool) -> str:
+def _shown(cell: Cell | None) -> str:
     if cell is None:
         return "–"
     errors = f", errors: {cell.errors}" if cell.errors else ""
     if not cell.n:
         return f"no result†{errors}" if any(cell.counts) else "missing†"
     low, high = cell.interval
-    rate = f"**{percent(cell.rate)}**" if bold and cell.rank == 1 else percent(cell.rate)
+    rate = f"**{percent(cell.rate)}**" if cell.best else percent(cell.rate)
     mark = "" if cell.complete else "†"
     return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}] n={cell.n}{errors}"
 

@@ -4,13 +4,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from robomme_interference_data.bootstrap import bootstrap, difference
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score import Grid
-from robomme_interference_data.evaluate.score.cube import Cube, cubes_of, success
+from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.ids import EpisodeId
@@ -77,6 +74,7 @@ def compare(
         )
     notes += _left_out("a", sides[0].values(), dict(met))
     notes += _left_out("b", sides[1].values(), {b: a for a, b in met})
+    tests = [(pairs, "all" in names, True) for names, pairs in zip(own, found, strict=True)]
     table = Table.make(
         "compare",
         "Two runs compared",
@@ -84,10 +82,11 @@ def compare(
         f"difference:points {COLUMNS}",
         (
             (*names, pairs.n, pairs.first, pairs.second, *test)
-            for names, pairs, test in zip(own, found, tested(found), strict=True)
+            for names, pairs, test in zip(own, found, tested(tests), strict=True)
         ),
         f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
-        f"b − a, gained and lost are from a to b. {how_to_read(found)}",
+        f"b − a, gained and lost are from a to b. "
+        + how_to_read(tests, "the rows of all families, and those of single ones"),
     )
     return Comparison(table, tuple(notes), (one, other))
 
@@ -168,14 +167,11 @@ def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
         side.cube.status[side.cube.cell(side.system, condition)][[at[one] for one in shared]]
         for side, at in zip((a, b), places, strict=True)
     )
-    values = np.stack([success(first), success(second)], axis=1)
-    values = values[~np.isnan(values).any(axis=1)]
-    (drawn,) = bootstrap(values, [difference(0, 1)], a.cube.simulator)
     # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
     seeds = a.cube.model_seeds, b.cube.model_seeds
     matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]
     matched = matched or [(place, place) for place in range(min(map(len, seeds)))]
-    return pair(first, second, drawn, matched)
+    return pair(first, second, matched)
 
 
 def _differing(one: Rows, other: Rows) -> Iterator[str]:

@@ -1,20 +1,17 @@
 """What is compared with what, episode by episode, and the tables of it."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
 
 from robomme_interference_data.bootstrap import LEAST, Interval
 from robomme_interference_data.conditions import KINDS, NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, tested
-from robomme_interference_data.stats import cohens_h
+from robomme_interference_data.stats import SURE, cohens_h
 from robomme_interference_data.tables import Table
 
 START = "k0"
 """The condition that retention and contrasts begin at."""
-
-SURE = 0.05
-"""Below this p of McNemar's exact test, a lift is one that retention can be a share of."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +68,12 @@ class Contrast:
     retention: Interval
 
     @property
+    def tested(self) -> tuple[Pairs, Hashable, bool]:
+        """The comparison, what it is corrected together with, and whether it is complete."""
+        within = self.condition if self.table in ("systems", "matrix") else ""
+        return self.pairs, (self.simulator, within), self.complete
+
+    @property
     def asks(self) -> str:
         """What is asked by a comparison of two kinds of conditions; empty for any other."""
         kind = parse_condition(self.condition).kind.name
@@ -97,19 +100,22 @@ def asked(
                 yield one.name, there
 
 
+_TOGETHER = "the tests of this table in one simulator"
+
+
 # --- tables ------------------------------------------------------------------------------------
 
 
 def lift_table(contrasts: Iterable[Contrast]) -> Table:
     """Return each condition's lift over the system's own rate without history."""
     found = [one for one in contrasts if one.table == "lift"]
-    pairs = [one.pairs for one in found]
+    tests = [one.tested for one in found]
     rows = [
         (
             *(c.simulator, c.system, c.condition, c.against[0]),
             *(c.pairs.n, c.pairs.second, c.pairs.first, *test, *c.retention, c.complete),
         )
-        for c, test in zip(found, tested(pairs), strict=True)
+        for c, test in zip(found, tested(tests), strict=True)
     ]
     return Table.make(
         "lift",
@@ -119,7 +125,7 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
         "complete:flag",
         rows,
         "Over the n episodes that count on both sides. "
-        f"{how_to_read(pairs)} retention: lift divided by the lift at k0, "
+        f"{how_to_read(tests, _TOGETHER)} retention: lift divided by the lift at k0, "
         f"where that one is above zero with p < {SURE}; its BCa interval, where any two of "
         f"no-history, k0 and the condition differ in at least {LEAST} episodes. A system with "
         "retrieval is, without history, the system without it.",
@@ -144,7 +150,7 @@ def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
     """Return effect sizes as the table `effects`, `interference` or `ceiling`."""
     title, note = _CONTRASTS[name]
     found = [one for one in contrasts if one.table == name]
-    pairs = [one.pairs for one in found]
+    tests = [one.tested for one in found]
     asks = any(one.asks for one in found)
     rows = [
         (
@@ -153,7 +159,7 @@ def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
             *(c.pairs.n, c.pairs.second, c.pairs.first, *test),
             *(cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
         )
-        for c, test in zip(found, tested(pairs), strict=True)
+        for c, test in zip(found, tested(tests), strict=True)
     ]
     return Table.make(
         name,
@@ -162,5 +168,5 @@ def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
         f"n:count rate:rate against_rate:rate difference:points {COLUMNS} cohens_h:ratio "
         "complete:flag",
         rows,
-        f"{note}Over the n episodes that count on both sides. {how_to_read(pairs)}",
+        f"{note}Over the n episodes that count on both sides. {how_to_read(tests, _TOGETHER)}",
     )

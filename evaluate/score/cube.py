@@ -13,6 +13,7 @@ from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.systems import SYSTEMS, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
+from robomme_interference_data.stats import effective
 
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
 """By their numbers in a cube."""
@@ -40,6 +41,7 @@ class Cube:
         difficulty: Place of each episode's in `DIFFICULTIES`, −1 unknown, `(E,) int64`.
         expected: The episodes of a complete cell, `(E,) bool`.
         due: The cells that are expected or have rows, `(S, C) bool`.
+        unpinned: Whether rows of a system name no revision of a split, `(S,) bool`.
     """
 
     simulator: str
@@ -52,6 +54,7 @@ class Cube:
     difficulty: NDArray[np.int64]
     expected: Flags
     due: Flags
+    unpinned: Flags
 
     def cell(self, system: str, condition: str) -> tuple[int, int]:
         """Return the place of a cell on the first two axes."""
@@ -61,6 +64,12 @@ class Cube:
         """Return the conditions under which a system has rows."""
         there = self.has_rows[self.systems.index(system)]
         return [condition for condition, has in zip(self.conditions, there, strict=True) if has]
+
+    def pairable(self, one: str, other: str) -> bool:
+        """Whether two systems had the same histories, as far as their rows tell."""
+        # Of a split that one names and the other does not, nobody knows whether it is one.
+        same = self.unpinned[[self.systems.index(name) for name in (one, other)]]
+        return bool(same[0] == same[1])
 
     def of_family(self, family: str) -> Flags:
         """Whether each episode is of a family, `(E,) bool`."""
@@ -122,6 +131,20 @@ def success(status: Statuses) -> NDArray[np.float64]:
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
 
 
+def trials(status: Statuses) -> float:
+    """Return how many independent trials a rate is worth: with repeats, more than its episodes.
+
+    Args:
+        status: The rate's rollouts, `(E, M) int8` (see `stats.effective`).
+    """
+    rates = success(status)
+    rates = rates[~np.isnan(rates)]
+    if len(rates) < 2:
+        return len(rates)
+    rollouts = int(counting(status).sum())
+    return effective(float(rates.mean()), float(rates.var(ddof=1)), len(rates), rollouts)
+
+
 def cubes_of(rows: Rows, grid: Grid) -> dict[str, Cube]:
     """Return simulator to the outcomes in it, by name, with the cells that are expected."""
     return {name: _cube(part, name, grid) for name, part in rows.by("simulator").items()}
@@ -162,6 +185,7 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
         difficulty,
         expected=np.array([key in wanted for key in places]),
         due=applies | (status >= 0).any(axis=(2, 3)),
+        unpinned=np.array([(simulator, system) in rows.unpinned for system in systems]),
     )
 
 

@@ -16,16 +16,15 @@ from robomme_interference_data.bootstrap import (
     Interval,
     Statistic,
     bootstrap,
-    difference,
     enough,
     retention,
     slope,
 )
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
-from robomme_interference_data.evaluate.score.contrasts import START, SURE, Contrast, asked
+from robomme_interference_data.evaluate.score.contrasts import START, Contrast, asked
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
 from robomme_interference_data.evaluate.score.pairs import pair
-from robomme_interference_data.stats import wilson
+from robomme_interference_data.stats import SURE, wilson
 from robomme_interference_data.tables import Table
 
 
@@ -71,11 +70,10 @@ def effects_of(
     falling = [at[system, c] for c in ks] if len(ks) > 1 else []
     line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
 
-    statistics: list[Statistic] = [difference(*two) for two in places]
-    statistics += [retention(*three) for three in kept.values()]
+    statistics: list[Statistic] = [retention(*three) for three in kept.values()]
     drawn = iter(bootstrap(values, [*statistics, *line], cube.simulator, draws))
     pairs = {
-        one: pair(sides[first], sides[second], next(drawn))
+        one: pair(sides[first], sides[second])
         for one, (first, second) in zip(compared, places, strict=True)
     }
     retained = {

@@ -14,10 +14,11 @@ from robomme_interference_data.conditions import DEFAULT_CONDITIONS, KINDS, pars
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.drawing import GREY, INK, ink_on, open_figure, save_figure, tidy
 from robomme_interference_data.evaluate.score import curves
-from robomme_interference_data.evaluate.score.contrasts import QUESTIONS, START, SURE, Contrast
+from robomme_interference_data.evaluate.score.contrasts import QUESTIONS, START, Contrast
 from robomme_interference_data.evaluate.score.curves import Data, curve, explained, legend
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.stats import SURE
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
 _ALL_KINDS = ("heatmap", "kinds", "interference")

@@ -1,20 +1,34 @@
 """Two sides of a comparison, paired over the episodes that count on both."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.bootstrap import LEAST, Interval, paired_interval
-from robomme_interference_data.evaluate.score.cube import Statuses, counting, success
-from robomme_interference_data.stats import holm, mcnemar
+from robomme_interference_data.bootstrap import Interval
+from robomme_interference_data.evaluate.score.cube import Statuses, counting, success, trials
+from robomme_interference_data.stats import (
+    LEVEL,
+    combined,
+    holm,
+    newcombe,
+    newcombe_paired,
+    sign_flip,
+    two_proportions,
+    wilson,
+)
+from robomme_interference_data.tables import Provisional
 
 COLUMNS = (
-    "low:points high:points interval pairs:count gained:count lost:count flips:rate p:p p_holm:p"
+    "low:points high:points interval pairs:count gained:count lost:count flips:rate "
+    "p:p p_mid:p p_holm:p"
 )
 """Columns of a table of comparisons, after the difference (see `tested`)."""
+
+WITHIN = 0.90
+"""Level of the interval that lies within a margin where two one-sided tests at 5% say so."""
 
 
 @dataclass(frozen=True)
@@ -22,57 +36,60 @@ class Pairs:
     """Two sides, paired over the episodes that count on both.
 
     Attributes:
-        n: Episodes that count on both sides.
+        n: Episodes that count on both sides; of unpaired sides the fewer.
         first: Mean success over them on the first side.
         second: The same on the second side.
-        change: `second` − `first` with its interval.
-        interval: Kind of that interval (see `bootstrap.paired_interval`).
-        pairs: Pairs of rollouts that are tested, one an episode: of the lowest model seed that
-            counts on both sides.
+        change: `second` − `first` with its 95% interval.
+        within: The same with its 90% interval.
+        interval: Kind of these intervals: `newcombe` of single rollouts, `clusters` with repeats,
+            `unpaired`; empty without an episode.
+        pairs: Pairs of rollouts, one an episode: of the lowest model seed that counts on both
+            sides; none of unpaired sides.
         gained: Pairs that succeed on the second side alone.
         lost: Pairs that succeed on the first side alone.
+        p: Two-sided p-value of the exact sign-flip test on the episodes' means, which of single
+            rollouts is McNemar's; of unpaired sides that of two proportions. NaN without episodes.
+        p_mid: Its mid-p; NaN of unpaired sides.
     """
 
     n: int
     first: float
     second: float
     change: Interval
+    within: Interval
     interval: str
     pairs: int
     gained: int
     lost: int
+    p: float
+    p_mid: float
 
     @property
     def flips(self) -> float:
         """Share of the pairs whose outcome differs, NaN without pairs."""
         return (self.gained + self.lost) / self.pairs if self.pairs else math.nan
 
-    @property
-    def p(self) -> float:
-        """Two-sided p-value of McNemar's exact test, NaN without pairs."""
-        return mcnemar(self.gained, self.lost) if self.pairs else math.nan
-
 
 def pair(
-    first: Statuses,
-    second: Statuses,
-    drawn: Interval,
-    matched: Sequence[tuple[int, int]] | None = None,
+    first: Statuses, second: Statuses, matched: Sequence[tuple[int, int]] | None = None
 ) -> Pairs:
     """Compare two sides over the same episodes.
 
     Args:
         first: Outcomes by episode and model seed, `(E, M) int8`.
         second: The same of the second side, `(E, N) int8`.
-        drawn: Mean of second − first with its bootstrap interval.
         matched: Places of model seeds that are paired, of the first and the second side, in the
             order in which a pair is looked for; None for equal places.
     """
     values = np.stack([success(first), success(second)], axis=1)
     known = ~np.isnan(values).any(axis=1)
-    values = values[known]
-    once = all((counting(side[known]).sum(-1) == 1).all() for side in (first, second))
-    change, interval = paired_interval(values, once, drawn)
+    values, first, second = values[known], first[known], second[known]
+    change = values[:, 1] - values[:, 0]
+    rates = [float(side.mean()) if len(values) else math.nan for side in values.T]
+    intervals = [_interval(first, second, rates, level) for level in (LEVEL, WITHIN)]
+    once = len(values) == counting(first).sum() == counting(second).sum()
+    kind = "" if not len(values) else "newcombe" if once else "clusters"
+    p, p_mid = sign_flip(change.tolist()) if len(values) else (math.nan, math.nan)
     if matched is not None:
         one, other = zip(*matched, strict=True)
         first, second = first[:, one], second[:, other]
@@ -80,33 +97,91 @@ def pair(
     found = np.flatnonzero(both.any(-1))
     seed = both[found].argmax(-1)
     before, after = (side[found, seed] == 0 for side in (first, second))
-    rates = [float(side.mean()) if len(values) else math.nan for side in values.T]
     gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
-    return Pairs(len(values), rates[0], rates[1], change, interval, len(found), gained, lost)
+    return Pairs(len(values), *rates, *intervals, kind, len(found), gained, lost, p, p_mid)
 
 
-def tested(found: Sequence[Pairs]) -> list[tuple[Any, ...]]:
-    """Return for each comparison of a table the difference and the values of `COLUMNS`."""
-    return [
-        (*one.change, one.interval, one.pairs, one.gained, one.lost, one.flips, one.p, p)
-        for one, p in zip(found, holm([one.p for one in found]), strict=True)
-    ]
+def _interval(first: Statuses, second: Statuses, rates: Sequence[float], level: float) -> Interval:
+    """Return second − first with its interval, of episodes that all count on both sides."""
+    n = len(first)
+    if not n:
+        return Interval(math.nan)
+    before, after = values = [success(side) for side in (first, second)]
+    if n == counting(first).sum() == counting(second).sum():
+        both, one, other = (int(part.sum()) for part in (before * after, after, before))
+        bounds = newcombe_paired(both, one - both, other - both, n - one - other + both, level)
+    else:
+        spreads = [side.std() for side in values]
+        shared = float((before * after).mean() - before.mean() * after.mean())
+        phi = shared / float(np.prod(spreads)) if all(spreads) else 0.0
+        worth = [trials(side) for side in (first, second)]
+        old, new = (wilson(r * m, m, level) for r, m in zip(rates, worth, strict=True))
+        bounds = combined(rates[1], new, rates[0], old, phi)
+    return Interval(round(rates[1] - rates[0], 12), *bounds)
 
 
-def how_to_read(found: Iterable[Pairs]) -> str:
-    """Return how a table of comparisons is to be read."""
+def apart(sides: Sequence[tuple[float, float, int]]) -> Pairs:
+    """Compare two sides that cannot be paired: rate, trials that it is worth, and episodes."""
+    (first, worth, n), (second, other_worth, m) = sides
+    counts = (second * other_worth, other_worth, first * worth, worth)
+    change = round(second - first, 12)
+    intervals = [Interval(change, *newcombe(*counts, level)) for level in (LEVEL, WITHIN)]
+    p = two_proportions(*counts)
+    return Pairs(min(n, m), first, second, *intervals, "unpaired", 0, 0, 0, p, math.nan)
+
+
+def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
+    """Return p-values by Holm's method, those of one group corrected among themselves."""
+    adjusted = [math.nan] * len(p_values)
+    for group in dict.fromkeys(groups):
+        places = [place for place, one in enumerate(groups) if one == group]
+        for place, p in zip(places, holm([p_values[at] for at in places]), strict=True):
+            adjusted[place] = p
+    return adjusted
+
+
+def tested(found: Sequence[tuple[Pairs, Hashable, bool]]) -> list[tuple[Any, ...]]:
+    """Return for each comparison of a table the difference and the values of `COLUMNS`.
+
+    Args:
+        found: The comparison, the group that it is corrected in, and whether it is complete: of
+            one that is not, every p is provisional.
+    """
+    holms = corrected([pairs.p for pairs, _, _ in found], [group for _, group, _ in found])
+    rows = []
+    for (one, _, complete), p_holm in zip(found, holms, strict=True):
+        ps = [p if complete else Provisional(p) for p in (one.p, one.p_mid, p_holm)]
+        counts = (one.pairs, one.gained, one.lost) if one.interval != "unpaired" else (None,) * 3
+        rows.append((*one.change, one.interval, *counts, one.flips, *ps))
+    return rows
+
+
+def how_to_read(found: Iterable[tuple[Pairs, Hashable, bool]], groups: str) -> str:
+    """Return how a table of comparisons is to be read.
+
+    Args:
+        found: As in `tested`.
+        groups: In words, which tests are corrected among themselves.
+    """
+    found = list(found)
+    kinds = {pairs.interval for pairs, _, _ in found}
     note = (
-        "95% intervals: bca, BCa bootstrap clustered by episode, where at least "
-        f"{LEAST} episodes differ; newcombe, Newcombe's paired score interval, where fewer do and "
-        "each has one rollout a side; none where fewer do with repeats. pairs: one an episode, of "
-        "the lowest model seed that counts on both sides; gained and lost: pairs whose outcome "
-        "differs, flips: their share; p: McNemar's exact test on them; p_holm: corrected for the "
-        "number of tests in this table."
+        "95% intervals (interval): newcombe, Newcombe's paired score interval. p: McNemar's exact "
+        "test; p_mid: its mid-p, which is less cautious; p_holm: p corrected by Holm's method "
+        f"among {groups}. pairs: one an episode; gained and lost: those whose outcome differs; "
+        "flips: their share."
     )
-    if fewer := sum(one.pairs < one.n for one in found):
+    if "clusters" in kinds:
         note += (
-            f" In {fewer} row{'s' * (fewer > 1)} the test leaves out a part of the n episodes, in "
-            "which no model seed counts on both sides: difference and p are not over the same "
-            "episodes."
+            " With repeats (clusters) interval and p are of the episodes' means: the score "
+            "interval from Wilson's of each side by clusters, and the exact sign-flip test; pairs "
+            "are of the lowest model seed that counts on both sides."
         )
+    if "unpaired" in kinds:
+        note += (
+            " Where histories may differ (unpaired) nothing is paired: Newcombe's hybrid score "
+            "interval, and the test of two proportions."
+        )
+    if not all(complete for _, _, complete in found):
+        note += " p†: provisional, as a cell is not complete: looking early finds too much."
     return note

@@ -1,11 +1,15 @@
 """The rates that the paper reports, and how ours compare."""
 
 import csv
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib import resources
 
 from robomme_interference_data.evaluate.score.cells import Cell
+from robomme_interference_data.evaluate.score.pairs import apart
+from robomme_interference_data.evaluate.score.ranks import cannot_be_told
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats import newcombe, wilson
 from robomme_interference_data.tables import Table
@@ -30,8 +34,28 @@ def published() -> tuple[Cell, ...]:
         n = int(row["episodes"])
         won = round(float(row["percent"]) * n / 100)
         names = (row["simulator"], row["system"], row["condition"])
-        cells.append(Cell(*names, "", n, won / n, wilson(won, n)))
-    return tuple(cells)
+        cells.append(Cell(*names, "", n, won / n, wilson(won, n), n))
+    best = {one for group in _by_condition(cells) for one in _best(group)}
+    return tuple(replace(cell, best=(cell.system, cell.condition) in best) for cell in cells)
+
+
+def _by_condition(cells: Iterable[Cell]) -> list[list[Cell]]:
+    found = defaultdict[str, list[Cell]](list)
+    for cell in cells:
+        found[cell.condition].append(cell)
+    return [*found.values()]
+
+
+def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
+    """Return system and condition of the published cells that cannot be told from the best."""
+    sides = [(cell.rate, cell.trials, cell.n) for cell in cells]
+    best = max(cells, key=lambda cell: cell.rate)
+    first = sides[cells.index(best)]
+    compared = {
+        cell.system: None if cell is best else apart([first, side])
+        for cell, side in zip(cells, sides, strict=True)
+    }
+    return {(system, best.condition) for system in cannot_be_told(compared)}
 
 
 def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
@@ -52,7 +76,9 @@ def paper_table(cells: Sequence[Cell]) -> Table:
     """
     rows = []
     for cell, paper in _comparable(cells):
-        bounds = newcombe(cell.rate * cell.n, cell.n, round(paper.rate * paper.n), paper.n)
+        bounds = newcombe(
+            cell.rate * cell.trials, cell.trials, round(paper.rate * paper.n), paper.n
+        )
         ours = (cell.system, cell.condition, paper.system, cell.n, cell.rate, *cell.interval)
         change = (cell.rate - paper.rate, *bounds, cell.complete)
         rows.append((*ours, paper.n, paper.rate, *paper.interval, *change))

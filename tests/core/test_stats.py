@@ -1,5 +1,6 @@
 """Statistics against worked values and scipy's."""
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -11,22 +12,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.bootstrap import (
-    Interval,
     Statistic,
     bootstrap,
     difference,
     enough,
     mean,
-    paired_interval,
     retention,
     slope,
 )
 from robomme_interference_data.stats import (
     cohens_h,
+    effective,
     holm,
     mcnemar,
     newcombe,
     newcombe_paired,
+    sign_flip,
+    two_proportions,
     wilson,
 )
 
@@ -100,39 +102,68 @@ def test_newcombes_paired_interval_by_hand(
     assert newcombe_paired(*counts) == pytest.approx(interval, abs=1e-6)
 
 
-@given(COUNTS, st.booleans())
-def test_no_paired_interval_has_width_zero(counts: tuple[int, int, int, int], once: bool) -> None:
-    kinds = np.array([[1, 1], [0, 1], [1, 0], [0, 0]], float)
-    values = np.repeat(kinds, counts, axis=0)
-    estimate = (counts[1] - counts[2]) / len(values)
-    drawn = Interval(estimate, estimate - 0.01, estimate + 0.01)
-    found, kind = paired_interval(values, once, drawn)
-    assert found.value == estimate
-    if kind == "bca":
-        assert counts[1] + counts[2] >= 10 and found == drawn
-    elif kind == "newcombe":
-        assert once and (found.low, found.high) == newcombe_paired(*counts)
-    else:
-        assert not once and math.isnan(found.low) and math.isnan(found.high)
-    # A bootstrap whose draws all agree has no interval to give, whatever the episodes.
-    flat, kind = paired_interval(values, once, Interval(estimate, estimate, estimate))
-    assert kind != "bca" and flat.low != flat.high
+@given(COUNTS)
+def test_no_paired_interval_has_width_zero(counts: tuple[int, int, int, int]) -> None:
+    low, high = newcombe_paired(*counts)
+    narrow = newcombe_paired(*counts, level=0.9)
+    change = (counts[1] - counts[2]) / sum(counts)
+    assert -1 <= low <= narrow[0] <= change <= narrow[1] <= high <= 1 and low < high
+    both, first, second, neither = counts
+    assert newcombe_paired(both, second, first, neither) == pytest.approx((-high, -low))
+
+
+def test_what_repeats_are_worth_by_hand() -> None:
+    # 0.5 · 0.5 / 0.05 is 5 trials an episode, but there are only 3 rollouts of each.
+    assert effective(0.5, 0.05, 10, 30) == 30
+    assert effective(0.5, 0.125, 10, 30) == pytest.approx(20)
+    # Single rollouts have p (1 − p) n / (n − 1): their number, and no fewer.
+    assert effective(0.5, 0.25 * 10 / 9, 10, 10) == 10
+    # Where all episodes agree nothing tells repeats from copies.
+    assert effective(1.0, 0.0, 10, 30) == 10
+
+
+def test_two_proportions_by_hand() -> None:
+    # Published GroundSG and the next without history: z = 0.024444 / √(p(1−p) 2/450), p = 175/900
+    assert two_proportions(93, 450, 82, 450) == pytest.approx(0.354208, abs=1e-6)
+    table = scipy.stats.chi2_contingency([[93, 357], [82, 368]], correction=False)
+    assert two_proportions(93, 450, 82, 450) == pytest.approx(table.pvalue)
+    assert two_proportions(5, 5, 7, 7) == 1.0
+    assert math.isnan(two_proportions(0, 0, 1, 2))
+
+
+@given(st.lists(st.sampled_from([-1, -2 / 3, -0.5, -1 / 3, 0, 0.25, 0.5, 1]), max_size=9))
+def test_sign_flips_are_counted(differences: list[float]) -> None:
+    p, mid = sign_flip(differences)
+    sums = [
+        abs(sum(map(math.prod, zip(differences, signs, strict=True))))
+        for signs in itertools.product((1, -1), repeat=len(differences))
+    ]
+    observed = abs(sum(differences))
+    above = sum(one > observed + 1e-9 for one in sums)
+    equal = sum(abs(one - observed) <= 1e-9 for one in sums)
+    assert p == pytest.approx((above + equal) / len(sums))
+    assert mid == pytest.approx((above + equal / 2) / len(sums) if observed > 1e-9 else 1)
+
+
+@given(st.integers(0, 200), st.integers(0, 200), st.integers(0, 50))
+def test_of_single_rollouts_sign_flips_are_mcnemars(gained: int, lost: int, same: int) -> None:
+    assert sign_flip([1.0] * gained + [-1.0] * lost + [0.0] * same) == mcnemar(gained, lost)
 
 
 def test_mcnemar_by_hand() -> None:
-    assert mcnemar(13, 13) == 1.0  # as the released rows flip between k0 and k7
-    assert mcnemar(0, 0) == 1.0
-    # Of 5 discordant pairs none the other way: 2 · 1/32
-    assert mcnemar(5, 0) == mcnemar(0, 5) == 0.0625
-    # 2 of 10: 2 · (1 + 10 + 45)/1024
-    assert mcnemar(8, 2) == 0.109375
+    assert mcnemar(13, 13) == (1.0, 1.0)  # as the released rows flip between k0 and k7
+    assert mcnemar(0, 0) == (1.0, 1.0)
+    # Of 5 discordant pairs none the other way: 2 · 1/32, and its half
+    assert mcnemar(5, 0) == mcnemar(0, 5) == (0.0625, 0.03125)
+    # 2 of 10: 2 · (1 + 10 + 45)/1024, less 45/1024
+    assert mcnemar(8, 2) == (0.109375, 67 / 1024)
 
 
 @given(st.integers(0, 3000), st.integers(0, 3000))
 def test_mcnemar_is_the_binomial_test(gained: int, lost: int) -> None:
     if gained + lost:
         expected = scipy.stats.binomtest(gained, gained + lost).pvalue
-        assert mcnemar(gained, lost) == pytest.approx(expected, rel=1e-8, abs=1e-200)
+        assert mcnemar(gained, lost)[0] == pytest.approx(expected, rel=1e-8, abs=1e-200)
 
 
 def test_holm_by_hand() -> None:

@@ -52,6 +52,19 @@ def test_an_error_is_neither_and_an_incomplete_cell_is_never_ranked(small: Score
     assert "Rollouts that broke: 1." in small.grids[0].note
 
 
+def test_best_is_each_that_cannot_be_told_from_the_highest_rate(tmp_path: Path) -> None:
+    # Of 24 episodes the first has 12; the second loses one, the third six, the last seven.
+    rates = {"one": 12, "two": 11, "three": 6, "four": 5}
+    given = {(name, "k0"): "s" * n + "f" * (24 - n) for name, n in rates.items()}
+    given[("lone", "k1")] = "s" * 24
+    found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
+    best = {c.system: c.best for c in found.cells if not c.part and c.n}
+    # p is 1, 2/64 and 2/128; Holm's 3 · 2/128 < 0.05, and 2 · 2/64 is not.
+    assert best == {"one": True, "two": True, "three": True, "four": False, "lone": False}
+    bold = {row[0] for row in grid_of(found) for cell in row if cell.startswith("**")}
+    assert bold == {"one", "two", "three"}
+
+
 def test_repeats_count_as_the_mean_of_their_episode(tmp_path: Path) -> None:
     given = {(made.OWN, "k0"): "ssf"}, {(made.OWN, "k0"): "sff"}
     path = made.write_csv(tmp_path / "a.csv", [*made.cells(given[0]), *made.cells(given[1], 4)])

@@ -42,7 +42,11 @@ def test_two_systems_are_paired_by_episode(tmp_path: Path) -> None:
     assert k7["difference"] == pytest.approx(5 / 12)
     assert (k7["interval"], k7["pairs"], k7["flips"]) == ("newcombe", 12, 5 / 12)
     assert (k7["low"], k7["high"]) == newcombe_paired(2, 5, 0, 5)
-    assert k7["p_holm"] == pytest.approx(6 * 2 / 32)
+    # Corrected among the two overall rows; those of families are corrected among themselves.
+    assert k7["p_holm"] == 2 * 2 / 32
+    family = next(r for r in records if (r["family"], r["condition"]) == ("MoveCube", "k7"))
+    assert (family["lost"], family["gained"], family["p"]) == (0, 3, 0.25)
+    assert family["p_holm"] == 4 * 0.25
 
 
 def test_two_runs_of_one_system_show_the_noise_floor(tmp_path: Path) -> None:

@@ -75,17 +75,6 @@ def test_decay_by_hand(small: Score) -> None:
     assert {one["system"] for one in records(small, "decay")} == {BASE, RETRIEVAL}
 
 
-def test_the_bootstrap_begins_at_ten_episodes_that_differ(tmp_path: Path) -> None:
-    found = scored(
-        tmp_path,
-        own(k0="f" * 10 + "s" * 30, k1="s" * 9 + "f" + "s" * 30, k3="s" * 10 + "s" * 30),
-    )
-    nine, ten = (record(found, "effects", condition=condition) for condition in ("k1", "k3"))
-    assert (nine["interval"], nine["gained"]) == ("newcombe", 9)
-    assert (ten["interval"], ten["gained"]) == ("bca", 10)
-    assert 0 < ten["low"] < 0.25 < ten["high"]
-
-
 def test_retention_has_an_interval_if_all_three_conditions_differ(tmp_path: Path) -> None:
     # k0 lifts 30 of 60; k1 keeps all but nine of them, k3 all but ten, k7 nine alone.
     found = scored(
@@ -126,11 +115,25 @@ def test_pairs_are_of_the_lowest_seed_that_counts_on_both_sides(tmp_path: Path) 
     effect = record(found, "effects", condition="k7")
     # Episodes 0 and 2 are gained and 1 is lost with seed 1; 4 is lost with seed 0.
     assert (effect["n"], effect["pairs"]) == (5, 4)
-    assert (effect["gained"], effect["lost"], effect["flips"], effect["p"]) == (2, 2, 1.0, 1.0)
-    assert "In 1 row the test leaves out a part of the n episodes" in found.tables["effects"].note
-    assert "leaves out" not in found.tables["lift"].note
-    # Repeats, and fewer than ten episodes: no interval is made for that.
-    assert effect["low"] is effect["high"] is None and effect["interval"] == ""
+    assert (effect["gained"], effect["lost"], effect["flips"]) == (2, 2, 1.0)
+    # The test is of the means: 1/2, 1, 1/2, 1 and 1 at k0, then 1, 0, 1, 1 and 1/2. In halves the
+    # differences are 1, −2, 1, 0 and −1, their sum −1: odd, so all sums are as far from 0.
+    assert (effect["difference"], effect["p"]) == (-0.1, 1.0)
+    assert effect["interval"] == "clusters" and effect["low"] < -0.1 < effect["high"]
+
+
+def test_interval_and_test_of_repeats_agree(tmp_path: Path) -> None:
+    # Of 12 episodes, seed 0 gains 2 and seed 1 gains 8 others: nine differ by a half, one by one.
+    found = scored(
+        tmp_path,
+        cells({(OWN, "k0"): "f" * 12, (OWN, "k7"): "ssffffffffff"}),
+        cells({(OWN, "k0"): "f" * 12, (OWN, "k7"): "fsssssssssff"}, seed=1),
+    )
+    effect = record(found, "effects", condition="k7")
+    assert (effect["gained"], effect["lost"], effect["pairs"]) == (2, 0, 12)
+    assert effect["p"] == 2 / 2**10  # ten differ, all the same way
+    assert effect["p_mid"] == 1 / 2**10
+    assert effect["low"] > 0
 
 
 def test_noise_is_of_the_two_lowest_seeds_that_count(tmp_path: Path) -> None:
