@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from robomme_interference_data.bootstrap import LEAST, Interval
 from robomme_interference_data.conditions import KINDS, NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, tested
-from robomme_interference_data.stats import SURE, cohens_h
+from robomme_interference_data.significance import SURE
+from robomme_interference_data.stats import cohens_h
 from robomme_interference_data.tables import Table
 
 START = "k0"

@@ -24,7 +24,8 @@ from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.contrasts import START, Contrast, asked
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
 from robomme_interference_data.evaluate.score.pairs import pair
-from robomme_interference_data.stats import SURE, wilson
+from robomme_interference_data.significance import SURE
+from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table
 
 

@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.score.contrasts import QUESTIONS, START,
 from robomme_interference_data.evaluate.score.curves import Data, curve, explained, legend
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
-from robomme_interference_data.stats import SURE
+from robomme_interference_data.significance import SURE
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
 _ALL_KINDS = ("heatmap", "kinds", "interference")

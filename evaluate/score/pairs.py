@@ -9,16 +9,8 @@ import numpy as np
 
 from robomme_interference_data.bootstrap import Interval
 from robomme_interference_data.evaluate.score.cube import Statuses, counting, success, trials
-from robomme_interference_data.stats import (
-    LEVEL,
-    combined,
-    holm,
-    newcombe,
-    newcombe_paired,
-    sign_flip,
-    two_proportions,
-    wilson,
-)
+from robomme_interference_data.significance import holm, sign_flip, two_proportions
+from robomme_interference_data.stats import LEVEL, combined, newcombe, newcombe_paired, wilson
 from robomme_interference_data.tables import Provisional
 
 COLUMNS = (

@@ -6,7 +6,7 @@ import numpy as np
 
 from robomme_interference_data.evaluate.score.cube import Cube, Flags, success, trials
 from robomme_interference_data.evaluate.score.pairs import Pairs, apart, pair
-from robomme_interference_data.stats import SURE, holm
+from robomme_interference_data.significance import SURE, holm
 
 
 def against(cube: Cube, condition: str, one: str, other: str, here: Flags) -> Pairs:

@@ -20,17 +20,8 @@ from robomme_interference_data.bootstrap import (
     retention,
     slope,
 )
-from robomme_interference_data.stats import (
-    cohens_h,
-    effective,
-    holm,
-    mcnemar,
-    newcombe,
-    newcombe_paired,
-    sign_flip,
-    two_proportions,
-    wilson,
-)
+from robomme_interference_data.significance import holm, mcnemar, sign_flip, two_proportions
+from robomme_interference_data.stats import cohens_h, effective, newcombe, newcombe_paired, wilson
 
 COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)
 

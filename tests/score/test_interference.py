@@ -20,7 +20,8 @@ from robomme_interference_data.evaluate.score.figures import draw_figure, draw_f
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.report import write_report
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.stats import mcnemar, newcombe_paired, wilson
+from robomme_interference_data.significance import mcnemar
+from robomme_interference_data.stats import newcombe_paired, wilson
 
 GOLDEN = made.ROOT / "tests" / "golden" / "score-kinds"
 BEYOND = ("interference", "access", "ceiling")
