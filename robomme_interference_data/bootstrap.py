@@ -130,11 +130,7 @@ def bootstrap(
     features = [_features(values, statistic.columns) for statistic in statistics]
     # Statistics share most of what they sum: each column is summed once.
     columns, place = np.unique(np.concatenate(features, axis=1), axis=1, return_inverse=True)
-    drawn = _drawn(key, len(values), draws)
-    step = max(1, _CHUNK // len(values))
-    sums = np.concatenate(
-        [drawn[at : at + step].astype(float) @ columns for at in range(0, draws, step)]
-    )
+    sums = _sums(columns, key, draws)
     ends = np.cumsum([feature.shape[1] for feature in features])[:-1]
     return [
         _interval(statistic, feature, statistic.of(sums[:, mine]))
@@ -142,6 +138,25 @@ def bootstrap(
             statistics, features, np.split(place, ends), strict=True
         )
     ]
+
+
+def drawn_means(values: Floats, key: str, draws: int = DRAWS) -> Floats:
+    """Return the means of each column in the draws that `bootstrap` takes, `(draws, C)`.
+
+    Args:
+        values: As of `bootstrap`, without a hole.
+        key: As of `bootstrap`.
+        draws: As of `bootstrap`.
+    """
+    return _sums(values, key, draws) / len(values)
+
+
+def _sums(columns: Floats, key: str, draws: int) -> Floats:
+    drawn = _drawn(key, len(columns), draws)
+    step = max(1, _CHUNK // len(columns))
+    return np.concatenate(
+        [drawn[at : at + step].astype(float) @ columns for at in range(0, draws, step)]
+    )
 
 
 def _features(values: Floats, columns: Sequence[int]) -> Floats:

@@ -66,8 +66,11 @@ def combined(
     other: float,
     other_bounds: tuple[float, float],
     correlation: float = 0.0,
+    limit: float = 1.0,
 ) -> tuple[float, float]:
     """Return the interval of rate − other from the interval of each and their correlation φ.
+
+    Of changes in place of rates it is that of the difference of differences, whose limit is 2.
 
     With rates p, q and intervals (l, u), (l', u'):
     p − q − √((p − l)² − 2φ (p − l)(u' − q) + (u' − q)²) to
@@ -83,8 +86,8 @@ def combined(
     (low, high), (other_low, other_high) = bounds, other_bounds
     change = rate - other
     return (
-        max(-1.0, change - added(rate - low, other_high - other)),
-        min(1.0, change + added(high - rate, other - other_low)),
+        max(-limit, change - added(rate - low, other_high - other)),
+        min(limit, change + added(high - rate, other - other_low)),
     )
 
 

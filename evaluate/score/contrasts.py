@@ -15,6 +15,10 @@ START = "k0"
 """The condition that retention and contrasts begin at."""
 
 
+WITHIN = ("systems", "matrix")
+"""Tables whose tests are corrected within each condition."""
+
+
 @dataclass(frozen=True)
 class Question:
     """What two kinds of conditions, with equally many sessions, are compared for.
@@ -71,7 +75,7 @@ class Contrast:
     @property
     def tested(self) -> tuple[Pairs, Hashable, bool]:
         """The comparison, what it is corrected together with, and whether it is complete."""
-        within = self.condition if self.table in ("systems", "matrix") else ""
+        within = self.condition if self.table in WITHIN else ""
         return self.pairs, (self.simulator, within), self.complete
 
     @property
@@ -144,12 +148,19 @@ _CONTRASTS = {
         "The ceiling is the ideal observer with the same memory: it uses all of the evidence that "
         "the memory kept. ",
     ),
+    "systems": (
+        "Difference to the best system",
+        "Within each condition, complete cells against that of the highest rate, of equal ones the "
+        "first. ",
+    ),
+    "matrix": ("All pairs of systems", "Within each condition, of complete cells. "),
 }
 
 
 def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
-    """Return effect sizes as the table `effects`, `interference` or `ceiling`."""
+    """Return effect sizes as a table of `_CONTRASTS`."""
     title, note = _CONTRASTS[name]
+    together = "the tests of a condition in one simulator" if name in WITHIN else _TOGETHER
     found = [one for one in contrasts if one.table == name]
     tests = [one.tested for one in found]
     asks = any(one.asks for one in found)
@@ -169,5 +180,33 @@ def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
         f"n:count rate:rate against_rate:rate difference:points {COLUMNS} cohens_h:ratio "
         "complete:flag",
         rows,
-        f"{note}Over the n episodes that count on both sides. {how_to_read(tests, _TOGETHER)}",
+        f"{note}Over the n episodes that count on both sides. {how_to_read(tests, together)}",
+    )
+
+
+def interaction_table(contrasts: Iterable[Contrast]) -> Table:
+    """Return how the change from k0 differs between systems (see `interaction`)."""
+    found = [one for one in contrasts if one.table == "interaction"]
+    tests = [one.tested for one in found]
+    rows = [
+        (
+            *(c.simulator, c.system, c.condition, c.against[0], c.pairs.n),
+            *(c.pairs.second, c.pairs.first, *test, c.complete),
+        )
+        for c, test in zip(found, tested(tests), strict=True)
+    ]
+    return Table.make(
+        "interaction",
+        "Which system falls more",
+        "simulator system condition against_system n:count change:points against_change:points "
+        f"difference:points {COLUMNS} complete:flag",
+        rows,
+        f"change: rate under the condition − rate at {START}; difference: of the changes, positive "
+        "where the system falls less than the other one, which is the best at k0, or the one "
+        "without retrieval. The best at k0 is chosen by that rate, which overstates its fall where "
+        "others are about as good. Over the n episodes that count in all four cells; pairs are "
+        "episodes, gained and lost those whose change is higher, or lower, than the other's. 95% "
+        "intervals: from those of both changes and their correlation. p: the exact sign-flip test "
+        "of the episodes' differences, p_mid its mid-p, p_holm corrected by Holm's method among "
+        f"{_TOGETHER}.",
     )

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.bootstrap import Interval
+from robomme_interference_data.bootstrap import Floats, Interval
 from robomme_interference_data.evaluate.score.cube import Statuses, counting, success, trials
-from robomme_interference_data.significance import holm, sign_flip, two_proportions
+from robomme_interference_data.significance import holm, mcnemar, sign_flip, two_proportions
 from robomme_interference_data.stats import LEVEL, combined, newcombe, newcombe_paired, wilson
 from robomme_interference_data.tables import Provisional
 
@@ -62,6 +62,13 @@ class Pairs:
         return (self.gained + self.lost) / self.pairs if self.pairs else math.nan
 
 
+NO_PAIRS = Pairs(
+    *(0, math.nan, math.nan, Interval(math.nan), Interval(math.nan), "", 0, 0, 0),
+    *(math.nan, math.nan),
+)
+"""What comes of no episode."""
+
+
 def pair(
     first: Statuses, second: Statuses, matched: Sequence[tuple[int, int]] | None = None
 ) -> Pairs:
@@ -73,43 +80,51 @@ def pair(
         matched: Places of model seeds that are paired, of the first and the second side, in the
             order in which a pair is looked for; None for equal places.
     """
-    values = np.stack([success(first), success(second)], axis=1)
-    known = ~np.isnan(values).any(axis=1)
-    values, first, second = values[known], first[known], second[known]
-    change = values[:, 1] - values[:, 0]
-    rates = [float(side.mean()) if len(values) else math.nan for side in values.T]
-    intervals = [_interval(first, second, rates, level) for level in (LEVEL, WITHIN)]
-    once = len(values) == counting(first).sum() == counting(second).sum()
-    kind = "" if not len(values) else "newcombe" if once else "clusters"
-    p, p_mid = sign_flip(change.tolist()) if len(values) else (math.nan, math.nan)
+    before, after = success(first), success(second)
+    known = ~np.isnan(before + after)
+    before, after, first, second = before[known], after[known], first[known], second[known]
+    n = len(before)
+    if n == counting(first).sum() == counting(second).sum():
+        return _of_single(before, after)
+    levels = [_clusters(first, second, level) for level in (LEVEL, WITHIN)]
+    tests = sign_flip((after - before).tolist())
+    rates = (float(side.mean()) for side in (before, after))
     if matched is not None:
         one, other = zip(*matched, strict=True)
         first, second = first[:, one], second[:, other]
     both = counting(first) & counting(second)
     found = np.flatnonzero(both.any(-1))
     seed = both[found].argmax(-1)
-    before, after = (side[found, seed] == 0 for side in (first, second))
-    gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
-    return Pairs(len(values), *rates, *intervals, kind, len(found), gained, lost, p, p_mid)
+    old, new = (side[found, seed] == 0 for side in (first, second))
+    gained, lost = int((new & ~old).sum()), int((old & ~new).sum())
+    return Pairs(n, *rates, *levels, "clusters", len(found), gained, lost, *tests)
 
 
-def _interval(first: Statuses, second: Statuses, rates: Sequence[float], level: float) -> Interval:
-    """Return second − first with its interval, of episodes that all count on both sides."""
-    n = len(first)
+def _of_single(before: Floats, after: Floats) -> Pairs:
+    """Compare single rollouts, success 0 or 1 in each episode: four counts say it all."""
+    n = len(before)
     if not n:
-        return Interval(math.nan)
-    before, after = values = [success(side) for side in (first, second)]
-    if n == counting(first).sum() == counting(second).sum():
-        both, one, other = (int(part.sum()) for part in (before * after, after, before))
-        bounds = newcombe_paired(both, one - both, other - both, n - one - other + both, level)
-    else:
-        spreads = [side.std() for side in values]
-        shared = float((before * after).mean() - before.mean() * after.mean())
-        phi = shared / float(np.prod(spreads)) if all(spreads) else 0.0
-        worth = [trials(side) for side in (first, second)]
-        old, new = (wilson(r * m, m, level) for r, m in zip(rates, worth, strict=True))
-        bounds = combined(rates[1], new, rates[0], old, phi)
-    return Interval(round(rates[1] - rates[0], 12), *bounds)
+        return NO_PAIRS
+    one, other, both = (int(part) for part in (before.sum(), after.sum(), before @ after))
+    gained, lost = other - both, one - both
+    change = round((other - one) / n, 12)
+    levels = [
+        Interval(change, *newcombe_paired(both, gained, lost, n - both - gained - lost, level))
+        for level in (LEVEL, WITHIN)
+    ]
+    tests = mcnemar(gained, lost)
+    return Pairs(n, one / n, other / n, *levels, "newcombe", n, gained, lost, *tests)
+
+
+def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
+    """Return second − first with the interval of means of repeats."""
+    values = [success(side) for side in (first, second)]
+    before, after = (float(side.mean()) for side in values)
+    spread = float(values[0].std() * values[1].std())
+    phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
+    worth = [trials(side) for side in (first, second)]
+    old, new = (wilson(r * m, m, level) for r, m in zip((before, after), worth, strict=True))
+    return Interval(round(after - before, 12), *combined(after, new, before, old, phi))
 
 
 def apart(sides: Sequence[tuple[float, float, int]]) -> Pairs:

@@ -15,7 +15,9 @@ from robomme_interference_data.evaluate.score import (
     cells,
     contrasts,
     effects,
+    interaction,
     paper,
+    ranks,
 )
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
@@ -25,8 +27,8 @@ from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import load_jinja2
 
 TABLES = (
-    *("main", "family", "difficulty", "lift", "effects", "interference", "access", "ceiling"),
-    *("decay", "noise", "coverage", "paper"),
+    *("main", "systems", "ranks", "family", "difficulty", "lift", "effects", "interaction"),
+    *("interference", "access", "ceiling", "decay", "noise", "matrix", "coverage", "paper"),
 )
 """Every table that a score may have."""
 
@@ -89,25 +91,34 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             for role, other in beside.items():
                 if other is None or other not in cube.systems:
                     beside[role] = None
-                elif why := _unpaired(rows, cube.simulator, system, other):
+                elif why := _unpaired(rows, cube, system, other):
                     beside[role] = None
                     notes.append(f"{system} and {other} in {cube.simulator} are not paired: {why}.")
             found, decay = effects.effects_of(cube, system, **beside, draws=draws)
             compared += found
             decays += decay
+        compared += ranks.systems_of(cube) + interaction.interactions_of(cube)
     every = cells.cells_of(cubes.values())
+    between = [
+        contrasts.contrast_table(compared, "systems"),
+        ranks.rank_table(cubes.values(), draws),
+    ]
     beyond = [
+        contrasts.interaction_table(compared),
         contrasts.contrast_table(compared, "interference"),
         access.access_table(cubes.values()),
         contrasts.contrast_table(compared, "ceiling"),
     ]
     tables = [
-        *(cells.rate_table(every, name) for name in ("main", "family", "difficulty")),
+        cells.rate_table(every, "main"),
+        *(one for one in between if one.rows),
+        *(cells.rate_table(every, name) for name in ("family", "difficulty")),
         contrasts.lift_table(compared),
         contrasts.contrast_table(compared, "effects"),
         *(one for one in beyond if one.rows),
         effects.decay_table(decays),
         effects.noise_table(cubes.values()),
+        *(one for one in [contrasts.contrast_table(compared, "matrix")] if one.rows),
         cells.coverage_table(every),
     ]
     published = paper.published() if settings.against is Against.PAPER else ()
@@ -130,15 +141,12 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     )
 
 
-def _unpaired(rows: Rows, simulator: str, system: str, other: str) -> str:
-    """Return why two systems' histories may differ; nothing if they are the same."""
-    # Of a split that one names and the other does not, nobody knows whether it is one.
-    unpinned = [one for one in (system, other) if (simulator, one) in rows.unpinned]
-    if len(unpinned) == 1:
-        return (
-            f"the rows of {unpinned[0]} name no revision of a split, so their histories may differ"
-        )
-    steps = [rows.retrieval.get((simulator, one)) for one in (system, other)]
+def _unpaired(rows: Rows, cube: Cube, system: str, other: str) -> str:
+    """Return why two systems differ in more than what is asked; nothing if they do not."""
+    if not cube.pairable(system, other):
+        (lone,) = (one for one in (system, other) if (cube.simulator, one) in rows.unpinned)
+        return f"the rows of {lone} name no revision of a split, so their histories may differ"
+    steps = [rows.retrieval.get((cube.simulator, one)) for one in (system, other)]
     if None not in steps and steps[0] != steps[1]:
         return f"they are behind other retrieval steps, {' and '.join(map(str, steps))}"
     return ""

@@ -104,7 +104,7 @@ def test_interference_by_hand(small: Score) -> None:
 def test_holm_is_within_the_table(tmp_path: Path) -> None:
     k0, stale = "s" * 10, "f" * 10
     found = scored(tmp_path, {(OWN, "k0"): k0, (OWN, "stale-k0"): stale, (OWN, "k7"): stale})
-    p = mcnemar(0, 10)
+    p, _ = mcnemar(0, 10)
     for table in ("interference", "effects"):
         one = record(found, table)
         assert (one["p"], one["p_holm"]) == (p, p)
