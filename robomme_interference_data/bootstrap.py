@@ -61,11 +61,6 @@ def difference(first: int, second: int) -> Statistic:
     return Statistic((first, second), lambda m: m[:, 1] - m[:, 0])
 
 
-def retention(none: int, start: int, end: int) -> Statistic:
-    """Return (end − none) / (start − none): what is left of the lift at the start."""
-    return Statistic((none, start, end), lambda m: (m[:, 2] - m[:, 0]) / (m[:, 1] - m[:, 0]))
-
-
 def slope(columns: Sequence[int], ks: Sequence[int]) -> Statistic:
     """Return the log-linear slope of the columns' means, of conditions with these k.
 

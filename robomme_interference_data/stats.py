@@ -144,6 +144,40 @@ def newcombe_paired(
     return combined(one / pairs, bounds, other / pairs, others, phi)
 
 
+def fieller(
+    share: float,
+    whole: float,
+    variances: tuple[float, float],
+    covariance: float,
+    level: float = LEVEL,
+) -> tuple[float, float]:
+    """Return Fieller's interval of the ratio share / whole of two paired means.
+
+    It holds the ratios r for which share − r · whole is not significantly other than 0:
+    (share − r · whole)² ≤ z² (v − 2 r c + r² w), with the variances v of share and w of whole and
+    their covariance c. Where whole itself is not significantly other than 0, no finite interval
+    does: its bounds are NaN.
+
+    Source: Fieller (1954), Some problems in interval estimation, J. Royal Statistical Society B 16,
+    175–185.
+
+    Args:
+        share: Mean of the numerator.
+        whole: Mean of the denominator.
+        variances: Of the two means.
+        covariance: Of the two means.
+        level: Of the interval.
+    """
+    z = z_of(level) ** 2
+    # a r² − 2 b r + c ≤ 0
+    a, b = whole**2 - z * variances[1], share * whole - z * covariance
+    c = share**2 - z * variances[0]
+    if a <= 0:
+        return math.nan, math.nan
+    root = math.sqrt(max(0.0, b * b - a * c))
+    return (b - root) / a, (b + root) / a
+
+
 def cohens_h(rate: float, other: float) -> float:
     """Return Cohen's effect size for two rates, 2 arcsin √rate − 2 arcsin √other.
 

@@ -72,7 +72,13 @@ def score(
 
 def compare(
     run_a: Annotated[Path, typer.Argument(help="Folder of a run, or file of rows.")],
-    run_b: Annotated[Path, typer.Argument(help="The other one.")],
+    run_b: Annotated[
+        Path | None, typer.Argument(help="The other one; none compares conditions of one run.")
+    ] = None,
+    conditions: Annotated[
+        list[str] | None,
+        typer.Option(help="The condition of A and that of B, such as k0 k7, instead of each."),
+    ] = None,
     system_a: Annotated[
         str | None, typer.Option(help="Name of the system of rows of A that name none.")
     ] = None,
@@ -84,17 +90,21 @@ def compare(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare two runs, paired over the episodes that both have.
+    """Compare two runs, or two conditions of one, paired over the episodes that both have.
+
+    Of runs under different shifts the difference is what the shift costs.
 
     Examples:
     ```
     robomme-interference compare my-run my-run-with-retrieval
+    robomme-interference compare my-run --conditions k0 k7
+    robomme-interference compare my-run my-run-under-light-2
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     ```
     """
     from robomme_interference_data.evaluate.score.compare import compare as compute
 
-    found = compute(run_a, run_b, (system_a, system_b), lenient)
+    found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or ())
     _tell(found.runs, found.notes)
     if as_json:
         bad = [rows.refused for rows in found.runs]

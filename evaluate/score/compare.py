@@ -1,15 +1,17 @@
-"""Two runs, paired over the episodes that both have."""
+"""Two runs, or two conditions of one, paired over the episodes that both have."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
+from robomme_interference_data.evaluate.score.values import unshifted
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
@@ -20,75 +22,98 @@ class Comparison:
     """A paired comparison of two runs.
 
     Attributes:
-        table: A row per condition, then per condition and family.
+        table: A row per condition, or for the two that are compared, then the same by family.
         notes: What a reader must know: that revisions differ, how many episodes flip between two
             runs of one system, what only one of the runs holds.
-        runs: The rows of the two runs.
+        runs: The rows of the runs.
     """
 
     table: Table
     notes: tuple[str, ...]
-    runs: tuple[Rows, Rows]
+    runs: tuple[Rows, ...]
 
 
 def compare(
     first: Path,
-    second: Path,
+    second: Path | None = None,
     systems: tuple[str | None, str | None] = (None, None),
     lenient: bool = False,
+    conditions: Sequence[str] = (),
 ) -> Comparison:
     """Compare two runs of one simulator over the conditions and episodes that both have.
 
     A system that both runs hold is compared with itself, as a repeat is. If they hold none in
-    common and one each, these two are compared, as a system with and without retrieval are.
+    common and one each, these two are compared, as a system with and without retrieval are. Runs
+    under different shifts are compared as well: their scenes are the same.
 
     Args:
         first: Folder or file of rows.
-        second: The other one. Differences are its rate − the first's.
+        second: The other one. Differences are its rate − the first's. None compares two
+            conditions of the first.
         systems: Names of the systems of rows that name none.
         lenient: Leave bad rows out, and count them.
+        conditions: The condition of the first and that of the second; none compares each
+            condition with itself.
 
     Raises:
-        InvalidOptionError: They have no simulator, system, condition or episode in common.
+        InvalidOptionError: They have no simulator, system, condition or episode in common, or
+            there is nothing to compare a single run with.
         BadRowsError: Rows are bad.
     """
-    one, other = (read_rows([p], s, lenient) for p, s in zip((first, second), systems, strict=True))
+    if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
+        raise InvalidOptionError(
+            f"{len(conditions)} conditions to compare; expected two, or none and two runs",
+            f"To set k7 against k0 of one run: compare {first} --conditions k0 k7",
+        )
+    for name in conditions:
+        parse_condition(name)
+    one = read_rows([first], systems[0], lenient)
+    other = one if second is None else read_rows([second], systems[1], lenient)
     _check_scenes(one, other)
     sides = [_sides(rows) for rows in (one, other)]
     met = list(_met((one, other), sides))
-    notes, own, found = list(_differing(one, other)), [], []
+    notes, own = list(_differing(one, other, met)), list[tuple[str, ...]]()
+    found = list[tuple[Pairs, Hashable, bool]]()
     for a, b in met:
-        conditions = [c for c in a.conditions if c in b.conditions]
-        pairs = {(part, c): _pairs(a, b, c, part) for part in ("", *FAMILIES) for c in conditions}
-        for (part, condition), here in pairs.items():
+        common = _asked(a, b, conditions)
+        pairs = {(part, two): _pairs(a, b, two, part) for part in ("", *FAMILIES) for two in common}
+        for (part, two), here in pairs.items():
             if here.n:
-                own.append((a.cube.simulator, a.system, b.system, part or "all", condition))
-                found.append(here)
-        same = one.revisions.get(a.cube.simulator) == other.revisions.get(a.cube.simulator)
-        if a.system == b.system and same:
-            notes += _noise(a, b, {c: pairs["", c] for c in conditions})
+                own.append((a.cube.simulator, a.system, b.system, part or "all", *two))
+                complete = a.complete(two[0]) and b.complete(two[1])
+                found.append((here, (a.cube.simulator, bool(part)), complete))
+        if a.repeats(b, one, other) and not conditions:
+            notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in common})
     if not found:
         raise InvalidOptionError(
-            f"{first} and {second} have no episode under a common condition that counts in both",
+            f"{' and '.join(str(path) for path in (first, second) if path)} have no episode under "
+            f"{' and '.join(conditions) or 'a common condition'} that counts on both sides",
             "Compare runs over the same episodes.",
         )
-    notes += _left_out("a", sides[0].values(), dict(met))
-    notes += _left_out("b", sides[1].values(), {b: a for a, b in met})
-    tests = [(pairs, "all" in names, True) for names, pairs in zip(own, found, strict=True)]
+    notes += _left_out("a", sides[0].values(), dict(met), conditions)
+    notes += _left_out("b", sides[1].values(), {b: a for a, b in met}, conditions[::-1])
     table = Table.make(
         "compare",
-        "Two runs compared",
-        "simulator system_a system_b family condition n:count rate_a:rate rate_b:rate "
-        f"difference:points {COLUMNS}",
+        "Two runs compared" if second else "Two conditions compared",
+        "simulator system_a system_b family condition_a condition_b n:count rate_a:rate "
+        f"rate_b:rate difference:points {COLUMNS} complete:flag",
         (
-            (*names, pairs.n, pairs.first, pairs.second, *test)
-            for names, pairs, test in zip(own, found, tested(tests), strict=True)
+            (*names, pairs.n, pairs.first, pairs.second, *test, complete)
+            for names, (pairs, _, complete), test in zip(own, found, tested(found), strict=True)
         ),
-        f"a: {first}; b: {second}. Over the n episodes that count in both; the difference is "
-        f"b − a, gained and lost are from a to b. "
-        + how_to_read(tests, "the rows of all families, and those of single ones"),
+        f"a: {first}; b: {second or first}. Over the n episodes that count in both; the difference "
+        "is b − a, gained and lost are from a to b. "
+        + how_to_read(found, "the rows of all families, and those of single ones, of a simulator"),
     )
-    return Comparison(table, tuple(notes), (one, other))
+    return Comparison(table, tuple(notes), (one,) if other is one else (one, other))
+
+
+def _asked(a: "_Side", b: "_Side", conditions: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the condition of each side in every comparison of two systems."""
+    if conditions:
+        one, other = conditions
+        return [(one, other)] if one in a.conditions and other in b.conditions else []
+    return [(c, c) for c in a.conditions if c in b.conditions]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +126,15 @@ class _Side:
     @property
     def conditions(self) -> list[str]:
         return self.cube.ran(self.system)
+
+    def complete(self, condition: str) -> bool:
+        return bool(self.cube.complete[self.cube.cell(self.system, condition)])
+
+    def repeats(self, other: "_Side", rows: Rows, others: Rows) -> bool:
+        """Whether another run's side is the same system in the same scenes, with these histories."""
+        name = self.cube.simulator
+        same = (self.system, name) == (other.system, other.cube.simulator)
+        return same and rows.revisions.get(name) == others.revisions.get(name)
 
     def counted(self, condition: str) -> set[EpisodeId]:
         if condition not in self.conditions:
@@ -122,7 +156,11 @@ def _sides(rows: Rows) -> _Sides:
 def _met(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side, _Side]]:
     """Yield what is compared, simulator by simulator, in the order of tables."""
     simulators, systems = ([rows.names(name) for rows in runs] for name in ("simulator", "system"))
-    if set(simulators[0]).isdisjoint(simulators[1]):
+    shared = {name: name for name in simulators[0] if name in simulators[1]}
+    plain = [{unshifted(name): name for name in names} for names in simulators]
+    # The same simulator, under a shift in one run and under another, or none, in the other.
+    shared = shared or {plain[0][name]: plain[1][name] for name in plain[0] if name in plain[1]}
+    if not shared:
         raise InvalidOptionError(
             f"the rows are of different simulators: {' and '.join(map(', '.join, simulators))}",
             "Only rows of one simulator can be compared.",
@@ -135,7 +173,7 @@ def _met(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side,
         )
     partners = common or dict(zip(*systems, strict=True))
     for (simulator, system), a in sides[0].items():
-        if b := sides[1].get((simulator, partners.get(system, ""))):
+        if b := sides[1].get((shared.get(simulator, ""), partners.get(system, ""))):
             yield a, b
 
 
@@ -144,7 +182,7 @@ def _check_scenes(one: Rows, other: Rows) -> None:
     names = ("simulator", "family", "episode_split", "episode", "seed")
     known, found = (
         {
-            row[:-1]: row[-1]
+            (unshifted(row[0]), *row[1:-1]): row[-1]
             for row in zip(*map(rows.list, names), strict=True)
             if row[-1] is not None
         }
@@ -159,13 +197,13 @@ def _check_scenes(one: Rows, other: Rows) -> None:
             )
 
 
-def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
-    """Compare two sides under a condition, over all shared episodes or those of a family."""
+def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pairs:
+    """Compare two sides, each under its condition, over all shared episodes or those of a family."""
     places = [{one: at for at, one in enumerate(side.cube.episodes)} for side in (a, b)]
     shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
     first, second = (
         side.cube.status[side.cube.cell(side.system, condition)][[at[one] for one in shared]]
-        for side, at in zip((a, b), places, strict=True)
+        for side, condition, at in zip((a, b), conditions, places, strict=True)
     )
     # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
     seeds = a.cube.model_seeds, b.cube.model_seeds
@@ -174,19 +212,25 @@ def _pairs(a: _Side, b: _Side, condition: str, family: str) -> Pairs:
     return pair(first, second, matched)
 
 
-def _differing(one: Rows, other: Rows) -> Iterator[str]:
-    for simulator in one.names("simulator"):
-        revisions = [rows.revisions.get(simulator) for rows in (one, other)]
-        if simulator not in other.names("simulator") or revisions[0] == revisions[1]:
+def _differing(one: Rows, other: Rows, met: Iterable[tuple[_Side, _Side]]) -> Iterator[str]:
+    names = dict.fromkeys((a.cube.simulator, b.cube.simulator) for a, b in met)
+    for two in names:
+        if two[0] != two[1]:
+            yield (
+                f"a is of {two[0]} and b of {two[1]}: the scenes are the same, and the difference "
+                "is what the shift costs."
+            )
+        revisions = [rows.revisions.get(name) for rows, name in zip((one, other), two, strict=True)]
+        if revisions[0] == revisions[1]:
             continue
         if None in revisions:
             yield (
-                f"Only one of the runs names the revision of its split of {simulator}: the "
+                f"Only one of the runs names the revision of its split of {two[0]}: the "
                 "histories may differ."
             )
         else:
             yield (
-                f"The rows of {simulator} are of different splits (revisions {revisions[0]} and "
+                f"The rows of {two[0]} are of different splits (revisions {revisions[0]} and "
                 f"{revisions[1]}): the histories differ."
             )
 
@@ -210,12 +254,18 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
     return [note] if shares else []
 
 
-def _left_out(name: str, sides: Iterable[_Side], met: Mapping[_Side, _Side]) -> list[str]:
-    """Say what one run has and the comparison leaves out, nothing if that is nothing."""
+def _left_out(
+    name: str, sides: Iterable[_Side], met: Mapping[_Side, _Side], conditions: Sequence[str]
+) -> list[str]:
+    """Say what one run has and the comparison leaves out, nothing if that is nothing.
+
+    `conditions` are this run's and the other's, or none where each is compared with itself.
+    """
     parts = []
     for side in sides:
         other = met[side].counted if side in met else (lambda condition: set())
-        counts = {c: len(side.counted(c) - other(c)) for c in side.conditions}
+        own = [tuple(conditions)] if conditions else [(c, c) for c in side.conditions]
+        counts = {c: len(side.counted(c) - other(there)) for c, there in own}
         if lone := ", ".join(f"{c} ({count:,})" for c, count in counts.items() if count):
             parts.append(f"{side.system} in {side.cube.simulator}, {lone}")
     return [f"Only in {name}, and left out (episodes): {'; '.join(parts)}."] if parts else []

@@ -4,7 +4,7 @@ import math
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
 
-from robomme_interference_data.bootstrap import LEAST, Interval
+from robomme_interference_data.bootstrap import Interval
 from robomme_interference_data.conditions import KINDS, NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, tested
 from robomme_interference_data.significance import SURE
@@ -50,6 +50,9 @@ QUESTIONS: dict[str, Question] = {one.kind: one for one in _QUESTIONS}
 """Kind to what its conditions are compared for, in the order of tables."""
 
 
+NO_RETENTION = Interval(math.nan)
+
+
 @dataclass(frozen=True)
 class Contrast:
     """One paired comparison: what changes from `against` to the condition.
@@ -61,6 +64,7 @@ class Contrast:
         pairs: The comparison.
         complete: Whether both cells are complete.
         retention: Of a lift: what is left at the condition of the lift at k0.
+        retention_n: Episodes that count under all three conditions, of which retention is.
     """
 
     simulator: str
@@ -70,7 +74,8 @@ class Contrast:
     table: str
     pairs: Pairs
     complete: bool
-    retention: Interval
+    retention: Interval = NO_RETENTION
+    retention_n: int | None = None
 
     @property
     def tested(self) -> tuple[Pairs, Hashable, bool]:
@@ -118,7 +123,15 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
     rows = [
         (
             *(c.simulator, c.system, c.condition, c.against[0]),
-            *(c.pairs.n, c.pairs.second, c.pairs.first, *test, *c.retention, c.complete),
+            *(
+                c.pairs.n,
+                c.pairs.second,
+                c.pairs.first,
+                *test,
+                *c.retention,
+                c.retention_n,
+                c.complete,
+            ),
         )
         for c, test in zip(found, tested(tests), strict=True)
     ]
@@ -127,13 +140,14 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
         "Lift over no history",
         "simulator system condition no_history_of n:count rate:rate no_history_rate:rate "
         f"lift:points {COLUMNS} retention:ratio retention_low:ratio retention_high:ratio "
-        "complete:flag",
+        "retention_n:count complete:flag",
         rows,
         "Over the n episodes that count on both sides. "
         f"{how_to_read(tests, _TOGETHER)} retention: lift divided by the lift at k0, "
-        f"where that one is above zero with p < {SURE}; its BCa interval, where any two of "
-        f"no-history, k0 and the condition differ in at least {LEAST} episodes. A system with "
-        "retrieval is, without history, the system without it.",
+        f"where that one is above zero with p < {SURE}, with Fieller's interval; of the "
+        "retention_n episodes that count under no-history, k0 and the condition, which of cells "
+        "that are not complete can be fewer than n. A system with retrieval is, without history, "
+        "the system without it.",
     )
 
 

@@ -14,10 +14,8 @@ from robomme_interference_data.bootstrap import (
     LEAST,
     Floats,
     Interval,
-    Statistic,
     bootstrap,
     enough,
-    retention,
     slope,
 )
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
@@ -25,7 +23,7 @@ from robomme_interference_data.evaluate.score.contrasts import START, Contrast, 
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success
 from robomme_interference_data.evaluate.score.pairs import pair
 from robomme_interference_data.significance import SURE
-from robomme_interference_data.stats import wilson
+from robomme_interference_data.stats import fieller, wilson
 from robomme_interference_data.tables import Table
 
 
@@ -66,32 +64,26 @@ def effects_of(
     compared |= {(c, (base, c)): "effects" for c in own if base and (base, c) in at}
     compared |= {(c, there): "interference" for c, there in asked(system, own, floor)}
     compared |= {(c, (ceiling, c)): "ceiling" for c in own if ceiling and (ceiling, c) in at}
-    places = [(at[there], at[system, c]) for c, there in compared]
-    kept = {c: (at[floor], at[system, START], at[system, c]) for c in later if floor}
-    falling = [at[system, c] for c in ks] if len(ks) > 1 else []
-    line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
-
-    statistics: list[Statistic] = [retention(*three) for three in kept.values()]
-    drawn = iter(bootstrap(values, [*statistics, *line], cube.simulator, draws))
-    pairs = {
-        one: pair(sides[first], sides[second])
-        for one, (first, second) in zip(compared, places, strict=True)
-    }
-    retained = {
-        (c, floor): _retained(_together(values, three), next(drawn)) for c, three in kept.items()
-    }
+    pairs = {(c, there): pair(sides[at[there]], sides[at[system, c]]) for c, there in compared}
     # A lift that is not above zero beyond doubt is nothing to have a share of.
     lift = pairs.get((START, floor)) if floor else None
-    if lift is None or not (lift.change.value > 0 and lift.p < SURE):
-        retained = {}
+    kept = {}
+    if floor and lift and lift.change.value > 0 and lift.p < SURE:
+        for c in later:
+            three = _together(values, (at[floor], at[system, START], at[system, c]))
+            none, start = pairs[c, floor], pairs[c, (system, START)]
+            kept[c, floor] = (retained(three, none.change, start.change), len(three))
     contrasts = [
         Contrast(
             *(cube.simulator, system, c, there, table, pairs[c, there]),
-            complete=complete[first] and complete[second],
-            retention=retained.get((c, there), Interval(math.nan)),
+            complete[at[there]] and complete[at[system, c]],
+            *kept.get((c, there), ()),
         )
-        for ((c, there), table), (first, second) in zip(compared.items(), places, strict=True)
+        for (c, there), table in compared.items()
     ]
+    falling = [at[system, c] for c in ks] if len(ks) > 1 else []
+    line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
+    drawn = bootstrap(values, line, cube.simulator, draws)
     decays = []
     for one, fall in zip(line, drawn, strict=True):
         changing = _together(values, one.columns)
@@ -107,12 +99,34 @@ def _together(values: Floats, places: Sequence[int]) -> Floats:
     return chosen[~np.isnan(chosen).any(axis=1)]
 
 
-def _retained(values: Floats, drawn: Interval) -> Interval:
-    """Give a retention its interval, if any two of its three conditions differ enough."""
-    # Where two hardly differ, the ratio sticks to 0 or 1 in most draws, or divides by next to 0.
-    pairs = [values[:, i] - values[:, j] for i, j in ((1, 0), (2, 0), (2, 1))]
-    sound = all(map(enough, pairs)) and drawn.low < drawn.high
-    return drawn if sound else Interval(drawn.value)
+def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
+    """Return the share of the lift at k0 that is left, with Fieller's interval.
+
+    Where the condition equals no-history, or k0, in every episode, the ratio is 0, or 1, without
+    any spread: there the interval is that of the lift, or of the fall, divided by the lift at k0.
+
+    Args:
+        values: Success under no-history, k0 and the condition, `(E, 3) float64`.
+        lift: The condition's change from no-history.
+        fall: Its change from k0.
+    """
+    none, start, end = values.T
+    whole, share = (start - none), (end - none)
+    if not len(values) or whole.mean() <= 0:
+        return Interval(math.nan)
+    ratio = float(share.mean() / whole.mean())
+    for sure, other, change in ((0.0, none, lift), (1.0, start, fall)):
+        if (end == other).all():
+            return Interval(sure, *(sure + bound / float(whole.mean()) for bound in change[1:]))
+    if len(values) < 2:
+        return Interval(ratio)
+    spread = np.cov(share, whole) / len(values)
+    bounds = fieller(
+        *(float(share.mean()), float(whole.mean())),
+        (float(spread[0, 0]), float(spread[1, 1])),
+        float(spread[0, 1]),
+    )
+    return Interval(ratio, *bounds)
 
 
 # --- tables ------------------------------------------------------------------------------------

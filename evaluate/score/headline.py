@@ -8,6 +8,7 @@ from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.contrasts import START, Contrast
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
+from robomme_interference_data.significance import holm
 from robomme_interference_data.tables import percent, points
 
 
@@ -46,7 +47,7 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
         )
         return [first, *_alike(others)]
     fall = max(falls, key=lambda one: parse_condition(one.condition).k)
-    sentences = [_from_start(leader, fall), *_alike(others)]
+    sentences = [_from_start(leader, fall, _corrected(score, fall)), *_alike(others)]
     if fall.complete:
         best = _best(complete, fall.condition)
         if all(cell.system != leader.system for cell in best):
@@ -82,21 +83,38 @@ def _nothing_complete(cells: Sequence[Cell]) -> str:
     )
 
 
-def _from_start(leader: Cell, contrast: Contrast) -> str:
+def _corrected(score: Score, fall: Contrast) -> str:
+    """Return the p of the leader's fall, corrected over all systems' falls.
+
+    The leader is the highest of all at k0, and the highest of equal ones is so by luck: its fall
+    is overstated, and it has to stand out from as many falls as it was chosen from.
+    """
+    test = "McNemar" if fall.pairs.interval == "newcombe" else "sign-flip"
+    own = (fall.simulator, fall.condition, "effects")
+    falls = [
+        one
+        for one in score.contrasts
+        if (one.simulator, one.condition, one.table) == own
+        and one.against == (one.system, START)
+        and (one is fall or one.complete)
+        and not (is_bound(one.system) and one is not fall)
+    ]
+    p = holm([one.pairs.p for one in falls])[falls.index(fall)]
+    among = f", corrected for the falls of {len(falls)} systems" * (len(falls) > 1)
+    return f"{test} p = {_p(p)}{among}{'' if fall.complete else ', provisional'}"
+
+
+def _from_start(leader: Cell, contrast: Contrast, tested: str) -> str:
     k = parse_condition(contrast.condition).k
     sessions = "distractor session" + ("s" if k > 1 else "")
-    pairs, p = contrast.pairs, contrast.pairs.p
-    tested = "" if math.isnan(p) else f", McNemar p = {_p(p)}"
-    change = pairs.change
-    # Not every difference has an interval.
-    bounds = "" if math.isnan(change.low) else f"{points(change.low)} to {points(change.high)}; "
+    pairs, change = contrast.pairs, contrast.pairs.change
     over = "" if contrast.complete else f", not complete, over the {pairs.n} episodes it has"
     return (
         f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} episodes "
         f"when the history holds the lesson alone ({START}, 95% interval {_interval(leader)}), and "
         f"in {percent(pairs.second)} with {k} {sessions} behind it ({contrast.condition}{over}): "
-        f"{points(change.value)} points ({bounds}{pairs.gained} episodes gained, "
-        f"{pairs.lost} lost{tested})."
+        f"{points(change.value)} points ({points(change.low)} to {points(change.high)}; "
+        f"{pairs.gained} episodes gained, {pairs.lost} lost, {tested})."
     )
 
 

@@ -1,7 +1,5 @@
 """Does one system fall more than another: the difference of their differences, paired."""
 
-import math
-
 import numpy as np
 
 from robomme_interference_data.bootstrap import Interval
@@ -58,7 +56,6 @@ def _contrasts(cube: Cube, system: str, other: str) -> list[Contrast]:
         Contrast(
             *(cube.simulator, system, last, against, "interaction", pairs),
             complete=complete,
-            retention=Interval(math.nan),
         )
     ]
 

@@ -1,13 +1,12 @@
 """Systems set against each other within a condition: differences to the best, ranks, all pairs."""
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.bootstrap import DRAWS, Floats, Interval, drawn_means
+from robomme_interference_data.bootstrap import DRAWS, Floats, drawn_means
 from robomme_interference_data.evaluate.score.contrasts import Contrast
 from robomme_interference_data.evaluate.score.cube import Cube, Flags, success, trials
 from robomme_interference_data.evaluate.score.pairs import Pairs, apart, pair
@@ -103,7 +102,6 @@ def _contrast(
     return Contrast(
         *(cube.simulator, system, condition, (other, condition), table, pairs),
         complete=True,
-        retention=Interval(math.nan),
     )
 
 

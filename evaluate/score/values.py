@@ -81,6 +81,11 @@ def shifted(simulator: str, shift: str) -> str:
     return simulator if shift == NO_SHIFT else f"{simulator}{_UNDER}{shift}"
 
 
+def unshifted(simulator: str) -> str:
+    """Return what a simulator is called without a shift."""
+    return simulator.partition(_UNDER)[0]
+
+
 def _check_simulator(text: str) -> None:
     name, under, shift = text.partition(_UNDER)
     if under:

@@ -34,7 +34,7 @@ def test_two_systems_are_paired_by_episode(tmp_path: Path) -> None:
     )
     records = found.table.records()
     assert len(records) == 6  # both conditions in all, and in the two families
-    overall = {row["condition"]: row for row in records if row["family"] == "all"}
+    overall = {row["condition_a"]: row for row in records if row["family"] == "all"}
     assert (overall["k0"]["gained"], overall["k0"]["lost"], overall["k0"]["p"]) == (1, 1, 1.0)
     k7 = overall["k7"]
     assert (k7["n"], k7["rate_a"], k7["rate_b"]) == (12, 2 / 12, 7 / 12)
@@ -44,7 +44,7 @@ def test_two_systems_are_paired_by_episode(tmp_path: Path) -> None:
     assert (k7["low"], k7["high"]) == newcombe_paired(2, 5, 0, 5)
     # Corrected among the two overall rows; those of families are corrected among themselves.
     assert k7["p_holm"] == 2 * 2 / 32
-    family = next(r for r in records if (r["family"], r["condition"]) == ("MoveCube", "k7"))
+    family = next(r for r in records if (r["family"], r["condition_b"]) == ("MoveCube", "k7"))
     assert (family["lost"], family["gained"], family["p"]) == (0, 3, 0.25)
     assert family["p_holm"] == 4 * 0.25
 
@@ -94,6 +94,29 @@ def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
     both = made.write_csv(tmp_path / "b.csv", made.changed(own(k0="ss"), simulator="robomme"))
     (note,) = compare(both, released).notes
     assert "Only one of the runs names the revision" in note
+
+
+def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:
+    rows = own(k0="ssssssf-", k7="sfffffse") + cells({(BASE, "k0"): "ss"})
+    found = compare(made.write_csv(tmp_path / "a.csv", rows), conditions=("k0", "k7"))
+    (overall, _) = found.table.records()
+    assert (overall["condition_a"], overall["condition_b"], overall["n"]) == ("k0", "k7", 7)
+    assert (overall["gained"], overall["lost"], overall["p"]) == (1, 5, 14 / 64)
+    # Episode 7 broke: the cell is not complete, and every p provisional.
+    assert not overall["complete"] and "0.219†" in found.table.markdown()
+    assert len(found.runs) == 1 and "noise" not in " ".join(found.notes)
+    with pytest.raises(InvalidOptionError, match="0 conditions to compare"):
+        compare(tmp_path / "a.csv")
+    with pytest.raises(InvalidOptionError, match="no episode under k0 and k3"):
+        compare(tmp_path / "a.csv", conditions=("k0", "k3"))
+
+
+def test_what_a_shift_costs_is_measured(tmp_path: Path) -> None:
+    found = compared(tmp_path, own(k0="ssss"), made.changed(own(k0="sfff"), shift="light:2"))
+    (overall, _) = found.table.records()
+    assert (overall["lost"], overall["gained"]) == (3, 0)
+    (note,) = found.notes  # and no noise floor: the runs are no repeats
+    assert "a is of tabletop and b of tabletop+light:2" in note and "what the shift costs" in note
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.records import Rollout
-from robomme_interference_data.stats import newcombe_paired, wilson
+from robomme_interference_data.stats import fieller, newcombe_paired, wilson
 
 
 def scored(tmp_path: Path, *parts: list[Rollout]) -> Score:
@@ -40,7 +40,7 @@ def test_lift_and_retention_by_hand(small: Score) -> None:
     assert lift["retention"] is None
     kept = record(small, "lift", system=BASE, condition="k3")
     assert kept["retention"] == pytest.approx((3 - 1) / (7 - 1))
-    assert kept["retention_low"] is kept["retention_high"] is None
+    assert kept["retention_low"] < 1 / 3 < kept["retention_high"] < 1
     # Without history, the system with retrieval is the one without.
     kept = record(small, "lift", system=RETRIEVAL, condition="k7")
     assert (kept["no_history_of"], kept["retention"]) == (BASE, 1.0)
@@ -75,24 +75,32 @@ def test_decay_by_hand(small: Score) -> None:
     assert {one["system"] for one in records(small, "decay")} == {BASE, RETRIEVAL}
 
 
-def test_retention_has_an_interval_if_all_three_conditions_differ(tmp_path: Path) -> None:
-    # k0 lifts 30 of 60; k1 keeps all but nine of them, k3 all but ten, k7 nine alone.
-    found = scored(
-        tmp_path,
-        own(
-            none="f" * 60,
-            k0="s" * 30 + "f" * 30,
-            k1="f" * 9 + "s" * 21 + "f" * 30,
-            k3="f" * 10 + "s" * 20 + "f" * 30,
-            k7="s" * 9 + "f" * 51,
-        ),
-    )
-    kept = {
-        condition: record(found, "lift", condition=condition) for condition in ("k1", "k3", "k7")
+def test_retention_has_fiellers_interval(tmp_path: Path) -> None:
+    # k0 lifts 30 of 60; k1 keeps all but nine of them, k3 every one, k7 none.
+    outcomes = {
+        "none": "f" * 60,
+        "k0": "s" * 30 + "f" * 30,
+        "k1": "f" * 9 + "s" * 21 + "f" * 30,
+        "k3": "s" * 30 + "f" * 30,
+        "k7": "f" * 60,
     }
-    assert [kept[c]["retention"] for c in kept] == pytest.approx([21 / 30, 20 / 30, 9 / 30])
-    assert kept["k1"]["retention_low"] is kept["k7"]["retention_high"] is None
-    assert 0 < kept["k3"]["retention_low"] < 20 / 30 < kept["k3"]["retention_high"] < 1
+    found = scored(tmp_path, own(**outcomes))
+    kept = {c: record(found, "lift", condition=c) for c in ("k1", "k3", "k7")}
+    assert [kept[c]["retention"] for c in kept] == pytest.approx([21 / 30, 1, 0])
+    assert {kept[c]["retention_n"] for c in kept} == {60}
+    # Of the lifts 0.35 and 0.5: variances 0.2275/59 and 0.25/59, covariance 0.35 · 0.5/59.
+    bounds = fieller(0.35, 0.5, (0.2275 / 59, 0.25 / 59), 0.175 / 59)
+    assert (kept["k1"]["retention_low"], kept["k1"]["retention_high"]) == pytest.approx(bounds)
+    # As k0, or as no-history, in every episode: the interval of no change, over the lift of a half.
+    low, high = newcombe_paired(30, 0, 0, 30)
+    bounds = (1 + low / 0.5, 1 + high / 0.5)
+    assert (kept["k3"]["retention_low"], kept["k3"]["retention_high"]) == pytest.approx(bounds)
+    low, high = newcombe_paired(0, 0, 0, 60)
+    bounds = (low / 0.5, high / 0.5)
+    assert (kept["k7"]["retention_low"], kept["k7"]["retention_high"]) == pytest.approx(bounds)
+    # Where no-history lacks ten episodes, retention is of the other fifty.
+    found = scored(tmp_path, own(**outcomes | {"none": "-" * 10 + "f" * 50}))
+    assert record(found, "lift", condition="k1")["retention_n"] == 50
 
 
 @pytest.mark.parametrize(("gained", "sure"), [(5, False), (6, True)])

@@ -57,8 +57,8 @@ HEADLINES = {
         (
             "a succeeds in 100.0% of 5 episodes when",
             "in 75.0% with 7 distractor sessions behind it (k7, not complete, over the 4 episodes "
-            "it has): −25.0 points (−69.9 to +28.1; 0 episodes gained, 1 lost, McNemar p = 1). 3 "
-            "of 4 cells are complete.",
+            "it has): −25.0 points (−69.9 to +28.1; 0 episodes gained, 1 lost, McNemar p = 1, "
+            "corrected for the falls of 2 systems, provisional). 3 of 4 cells are complete.",
         ),
     ),
     "equal rates": (
@@ -86,6 +86,16 @@ HEADLINES = {
     ),
     "a bound alone": ({("oracle", "k0"): "s"}, ("Oracle succeeds in 100.0% of 1 episodes", "")),
 }
+
+
+def test_the_leaders_fall_is_corrected_for_how_it_was_chosen(tmp_path: Path) -> None:
+    given = {(name, "k0"): "s" * 12 for name in ("a", "b", "c")}
+    given |= {(name, "k7"): "f" * n + "s" * (12 - n) for name, n in (("a", 8), ("b", 1), ("c", 0))}
+    given |= {("oracle", "k0"): "s" * 12, ("oracle", "k7"): "s" * 12}
+    # 3 · 2/2⁸
+    assert "8 lost, McNemar p = 0.023, corrected for the falls of 3 systems)." in told(
+        tmp_path, given
+    )
 
 
 @pytest.mark.parametrize(("outcomes", "ends"), HEADLINES.values(), ids=HEADLINES.keys())
