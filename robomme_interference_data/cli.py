@@ -86,7 +86,7 @@ _GROUPS = {
         ("evaluate", evaluating.evaluate),
         ("merge", evaluating.merge),
     ),
-    "Scores": (("score", scoring.score), ("compare", scoring.compare)),
+    "Scores": (("score", scoring.score), ("compare", scoring.compare), ("power", scoring.power)),
     "Publish": (
         ("card", publishing.card),
         ("publish", publishing.publish),

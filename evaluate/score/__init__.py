@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.settings import setting
 
 
@@ -42,4 +43,16 @@ class Settings:
         help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to 49 "
         "each), or those that any of the given rows is of.",
     )
+    margin: float | None = setting(
+        None,
+        metavar="POINTS",
+        help="Test whether differences are within this many points: k against k0, and a system "
+        "with retrieval against the one without.",
+    )
     lenient: bool = setting(False, help="Leave bad rows out, and count them.")
+
+    def __post_init__(self) -> None:
+        if self.margin is not None and not 0 < self.margin <= 100:
+            raise InvalidOptionError.expected(
+                "margin", self.margin, "points, more than 0 up to 100"
+            )

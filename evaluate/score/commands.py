@@ -1,6 +1,7 @@
-"""The commands `score` and `compare`."""
+"""The commands `score`, `compare` and `power`."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -111,6 +112,45 @@ def compare(
         print_json({"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()})
     else:
         typer.echo(found.table.text())
+
+
+def power(
+    margin: Annotated[float, typer.Option(help="A difference of interest, in points.")] = 5.0,
+    episodes: Annotated[int, typer.Option(help="Episodes that run on both sides.")] = 450,
+    flips: Annotated[
+        float, typer.Option(help="Share of the episodes that flips between two equal systems.")
+    ] = 0.06,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what a number of episodes can show, before they are run.
+
+    The share that flips by itself is what the table noise of a score has, or compare of two runs
+    of one system.
+
+    Examples:
+    ```
+    robomme-interference power --margin 5 --episodes 450 --flips 0.06
+    robomme-interference power --margin 3 --episodes 450 --flips 0.12 --json
+    ```
+    """
+    from robomme_interference_data.evaluate.score.power import plan
+
+    found = plan(margin / 100, episodes, flips)
+    if as_json:
+        print_json(asdict(found))
+        return
+    least = "none" if found.smallest is None else f"{100 * found.smallest:.1f} points"
+    told = {
+        "noise floor: two equal systems differ by up to": f"±{100 * found.noise:.1f} points (95%)",
+        "smallest difference that is found with 80% power": least,
+        f"power to find {margin:g} points": f"{found.power:.0%}",
+        f"episodes that find {margin:g} points with 80% power": f"about {found.needed:,}",
+        "smallest margin of an equivalence, with 80% power": f"±{100 * found.equal:.1f} points",
+    }
+    typer.echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by themselves\n")
+    wide = max(map(len, told))
+    for name, value in told.items():
+        typer.echo(f"{name:{wide}}  {value}")
 
 
 def _tell(found: "Sequence[Rows]", notes: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score import Grid, power
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, pair, tested
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
@@ -103,7 +103,8 @@ def compare(
         ),
         f"a: {first}; b: {second or first}. Over the n episodes that count in both; the difference "
         "is b − a, gained and lost are from a to b. "
-        + how_to_read(found, "the rows of all families, and those of single ones, of a simulator"),
+        + how_to_read(found, "the rows of all families, and those of single ones, of a simulator")
+        + power.note([pairs for pairs, (_, part), _ in found if not part]),
     )
     return Comparison(table, tuple(notes), (one,) if other is one else (one, other))
 
@@ -131,7 +132,7 @@ class _Side:
         return bool(self.cube.complete[self.cube.cell(self.system, condition)])
 
     def repeats(self, other: "_Side", rows: Rows, others: Rows) -> bool:
-        """Whether another run's side is the same system in the same scenes, with these histories."""
+        """Whether another run's side is the same system, in the same scenes and histories."""
         name = self.cube.simulator
         same = (self.system, name) == (other.system, other.cube.simulator)
         return same and rows.revisions.get(name) == others.revisions.get(name)
@@ -198,7 +199,7 @@ def _check_scenes(one: Rows, other: Rows) -> None:
 
 
 def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pairs:
-    """Compare two sides, each under its condition, over all shared episodes or those of a family."""
+    """Compare two sides, each under its condition, over shared episodes, all or a family's."""
     places = [{one: at for at, one in enumerate(side.cube.episodes)} for side in (a, b)]
     shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
     first, second = (

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from robomme_interference_data.bootstrap import Interval
 from robomme_interference_data.conditions import KINDS, NO_HISTORY, parse_condition
+from robomme_interference_data.evaluate.score import power
 from robomme_interference_data.evaluate.score.pairs import COLUMNS, Pairs, how_to_read, tested
 from robomme_interference_data.significance import SURE
 from robomme_interference_data.stats import cohens_h
@@ -147,7 +148,7 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
         f"where that one is above zero with p < {SURE}, with Fieller's interval; of the "
         "retention_n episodes that count under no-history, k0 and the condition, which of cells "
         "that are not complete can be fewer than n. A system with retrieval is, without history, "
-        "the system without it.",
+        f"the system without it.{power.note(one.pairs for one in found)}",
     )
 
 
@@ -194,7 +195,8 @@ def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
         f"n:count rate:rate against_rate:rate difference:points {COLUMNS} cohens_h:ratio "
         "complete:flag",
         rows,
-        f"{note}Over the n episodes that count on both sides. {how_to_read(tests, together)}",
+        f"{note}Over the n episodes that count on both sides. {how_to_read(tests, together)}"
+        f"{power.note(one.pairs for one in found)}",
     )
 
 

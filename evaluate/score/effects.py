@@ -62,6 +62,7 @@ def effects_of(
     compared = {(c, floor): "lift" for c in ks if floor}
     compared |= {(c, (system, START)): "effects" for c in later}
     compared |= {(c, (base, c)): "effects" for c in own if base and (base, c) in at}
+    compared |= {(c, (base, START)): "equivalence" for c in later if base and (base, START) in at}
     compared |= {(c, there): "interference" for c, there in asked(system, own, floor)}
     compared |= {(c, (ceiling, c)): "ceiling" for c in own if ceiling and (ceiling, c) in at}
     pairs = {(c, there): pair(sides[at[there]], sides[at[system, c]]) for c, there in compared}

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.contrasts import START, Contrast
+from robomme_interference_data.evaluate.score.equivalence import EQUIVALENT, OPEN
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.significance import holm
@@ -55,7 +56,7 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
             sentences.append(f"The highest rate at {fall.condition} is {rate}, of {_listed(best)}.")
         else:
             sentences += _alike([cell for cell in best if cell.system != leader.system])
-    return sentences + _beside_base(score, fall)
+    return sentences + _equal(score, fall) + _beside_base(score, fall)
 
 
 def _alike(others: Sequence[Cell]) -> list[str]:
@@ -116,6 +117,28 @@ def _from_start(leader: Cell, contrast: Contrast, tested: str) -> str:
         f"{points(change.value)} points ({points(change.low)} to {points(change.high)}; "
         f"{pairs.gained} episodes gained, {pairs.lost} lost, {tested})."
     )
+
+
+def _equal(score: Score, fall: Contrast) -> list[str]:
+    """Say whether the leader's rate under a condition is shown to equal that at k0."""
+    if "equivalence" not in score.tables:
+        return []
+    sentences = []
+    own = {"simulator": fall.simulator, "system": fall.system, "condition": fall.condition}
+    for one in score.tables["equivalence"].records():
+        if own.items() <= one.items() and one["against_condition"] == START:
+            margin = f"{100 * one['margin']:g}"
+            bounds = f"90% interval {points(one['low_90'])} to {points(one['high_90'])}"
+            whose = "its own" if one["against_system"] == fall.system else ""
+            whose = whose or f"{display_name(one['against_system'])}'s"
+            whose += " published" * (one["against_rows"] == "published")
+            shown = {
+                EQUIVALENT: f"is equivalent to {whose} {START} within ±{margin} points",
+                OPEN: f"is not shown to be within ±{margin} points of {whose} {START}",
+            }[one["verdict"].rstrip("†")]
+            early = ", provisional" * one["verdict"].endswith("†")
+            sentences.append(f"Its {fall.condition} {shown} ({bounds}{early}).")
+    return sentences
 
 
 def _beside_base(score: Score, contrast: Contrast) -> list[str]:

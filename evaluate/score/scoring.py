@@ -15,6 +15,7 @@ from robomme_interference_data.evaluate.score import (
     cells,
     contrasts,
     effects,
+    equivalence,
     interaction,
     paper,
     ranks,
@@ -28,7 +29,17 @@ from robomme_interference_data.templates import load_jinja2
 
 TABLES = (
     *("main", "systems", "ranks", "family", "difficulty", "lift", "effects", "interaction"),
-    *("interference", "access", "ceiling", "decay", "noise", "matrix", "coverage", "paper"),
+    *(
+        "equivalence",
+        "interference",
+        "access",
+        "ceiling",
+        "decay",
+        "noise",
+        "matrix",
+        "coverage",
+        "paper",
+    ),
 )
 """Every table that a score may have."""
 
@@ -109,6 +120,10 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         access.access_table(cubes.values()),
         contrasts.contrast_table(compared, "ceiling"),
     ]
+    published = paper.published() if settings.against is Against.PAPER else ()
+    if settings.margin is not None:
+        equal = equivalence.equivalence_table(compared, every, published, settings.margin)
+        beyond.insert(1, equal)
     tables = [
         cells.rate_table(every, "main"),
         *(one for one in between if one.rows),
@@ -121,7 +136,6 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         *(one for one in [contrasts.contrast_table(compared, "matrix")] if one.rows),
         cells.coverage_table(every),
     ]
-    published = paper.published() if settings.against is Against.PAPER else ()
     if published:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
         whole = cells.cells_of(cubes_of(rows, Grid.BENCHMARK).values())

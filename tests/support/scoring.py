@@ -157,4 +157,5 @@ def run(*arguments: str | Path) -> Any:
     app = typer.Typer()
     app.command()(commands.score)
     app.command()(commands.compare)
+    app.command()(commands.power)
     return CliRunner().invoke(app, list(map(str, arguments)))

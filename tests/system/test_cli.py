@@ -55,7 +55,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
         *("Look", "conditions", "list", "show", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "ceiling", "evaluate", "merge"),
-        *("Scores", "score", "compare"),
+        *("Scores", "score", "compare", "power"),
         *("Publish", "card", "publish", "publish-results"),
     ]
 

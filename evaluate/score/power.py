@@ -1,0 +1,151 @@
+"""What a number of episodes can show: power of paired comparisons, before they are run. Pure.
+
+The model: a share f of the episodes flips by itself between two equal systems, half of it each way,
+and a true difference δ adds as many flips one way. So the share f / 2 is gained and f / 2 + δ lost,
+or the other way round.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.score.pairs import Pairs
+from robomme_interference_data.significance import SURE
+from robomme_interference_data.stats import z_of
+from robomme_interference_data.tables import percent
+
+POWER = 0.8
+"""The power that is planned for."""
+
+MOST = 5_000
+"""Episodes that plans are made for: the sums over all ways that they come out grow with them."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What paired rollouts can show.
+
+    Attributes:
+        episodes: Episodes that run on both sides.
+        flips: Share of them that flips by itself.
+        margin: A difference of interest, a fraction.
+        noise: How far apart two equal systems come out in 95% of comparisons: z √(f / n).
+        power: Probability that McNemar's exact test finds a difference of `margin` at 5%.
+        smallest: Smallest difference that it finds with 80% power; None if it finds none.
+        needed: About how many episodes a difference of `margin` needs for 80% power.
+        equal: Smallest margin within which two equal systems are shown to be so, by two one-sided
+            tests at 5%, with 80% power: (z(95%) + z(90%)) √(f / n), one-sided quantiles.
+    """
+
+    episodes: int
+    flips: float
+    margin: float
+    noise: float
+    power: float
+    smallest: float | None
+    needed: int
+    equal: float
+
+
+def plan(margin: float, episodes: int, flips: float) -> Plan:
+    """Return what episodes can show.
+
+    Args:
+        margin: A difference of interest, a fraction.
+        episodes: Their number.
+        flips: Share of them that flips by itself.
+
+    Raises:
+        InvalidOptionError: A value is out of range, or more than all episodes would flip.
+    """
+    for name, value, high in (("margin", margin, 1), ("flips", flips, 1)):
+        if not 0 <= value <= high or (name == "margin" and not value):
+            raise InvalidOptionError.expected(name, value, "a share between 0 and 1")
+    if not 1 <= episodes <= MOST:
+        raise InvalidOptionError.expected("episodes", episodes, f"a number from 1 to {MOST:,}")
+    if margin + flips > 1:
+        raise InvalidOptionError(
+            f"margin {margin} and flips {flips} are more than all episodes",
+            "A difference adds its own flips to those: their sum is 1 at most.",
+        )
+    noise = math.sqrt(flips / episodes)
+    both, spread = flips + margin, math.sqrt(flips + margin - margin**2)
+    found = z_of(1 - SURE) * math.sqrt(both) + z_of(2 * POWER - 1) * spread
+    return Plan(
+        *(episodes, flips, margin, z_of(0.95) * noise, power(margin, episodes, flips)),
+        smallest=smallest(episodes, flips),
+        needed=math.ceil((found / margin) ** 2),
+        equal=(z_of(1 - 2 * SURE) + z_of(POWER)) * noise,
+    )
+
+
+def power(margin: float, episodes: int, flips: float) -> float:
+    """Return the probability that McNemar's exact test finds a true difference.
+
+    Flips are d of n with Binomial(n, f + δ), and of these Binomial(d, (f / 2) / (f + δ)) go
+    against the difference; the test finds it where p is at most 0.05. Summed over all d that occur.
+
+    Source of the approximation that `Plan.needed` is: Connor (1987), Sample size for testing
+    differences in proportions for the paired-sample design, Biometrics 43, 207–211.
+    """
+    both = flips + margin
+    reach = 8 * math.sqrt(episodes * both) + 8
+    low = max(0, int(episodes * both - reach))
+    d = np.arange(low, min(episodes, int(episodes * both + reach)) + 1)
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, episodes + 1)))])
+    x = np.arange(d[-1] + 1)
+    rest = d[:, None] - x
+    ways = np.where(rest >= 0, logs[d][:, None] - logs[x] - logs[np.maximum(rest, 0)], -np.inf)
+    fair = np.exp(ways - d[:, None] * math.log(2))
+    # Both tails are alike: x against the difference, and as many for it.
+    rare = 2 * fair.cumsum(axis=1) <= SURE
+    against = _powers(flips / 2 / both, x) + _powers(1 - flips / 2 / both, rest)
+    in_favour = _powers(flips / 2 / both, rest) + _powers(1 - flips / 2 / both, x)
+    found = (np.exp(ways + against) + np.exp(ways + in_favour)) * (rare & (2 * x < d[:, None]))
+    flipping = logs[episodes] - logs[d] - logs[episodes - d]
+    flipping = flipping + _powers(both, d) + _powers(1 - both, episodes - d)
+    return float(np.exp(flipping) @ found.sum(axis=1))
+
+
+def _powers(base: float, exponents: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the logarithm of a power; that of 0 to the 0 is 0."""
+    if base > 0:
+        return exponents * math.log(base)
+    return np.where(exponents == 0, 0.0, -np.inf)
+
+
+@lru_cache(maxsize=64)
+def smallest(episodes: int, flips: float) -> float | None:
+    """Return the smallest difference that is found with 80% power, to 0.01 points, or None."""
+    low, high = 0.0, 1 - flips
+    if high <= 0 or power(high, episodes, flips) < POWER:
+        return None
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (low, middle) if power(middle, episodes, flips) >= POWER else (middle, high)
+    return high
+
+
+def note(found: Iterable[Pairs]) -> str:
+    """Return in a sentence what comparisons like some could show; nothing where none is paired.
+
+    Their episodes are those of the most, and the flips the median of what goes both ways: twice
+    the fewer of gained and lost.
+    """
+    pairs = [one for one in found if one.pairs]
+    if not pairs:
+        return ""
+    n = min(MOST, max(one.pairs for one in pairs))
+    flips = round(median(2 * min(one.gained, one.lost) / one.pairs for one in pairs), 3)
+    least = smallest(n, flips)
+    shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
+    return (
+        f" {n:,} episodes of which {percent(flips)} flip both ways, as here in the median, show "
+        f"{shown} with 80% power."
+    )

@@ -1,0 +1,131 @@
+"""Equivalence within a margin, and what a number of episodes can show."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import scoring as made
+from support.scoring import BASE, RETRIEVAL, cells, record, records, run
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.score import Grid, Settings
+from robomme_interference_data.evaluate.score.headline import headline
+from robomme_interference_data.evaluate.score.power import plan, power, smallest
+from robomme_interference_data.stats import newcombe, newcombe_paired
+
+# --- equivalence -------------------------------------------------------------------------------
+
+
+@made.needs_released
+def test_the_released_rows_are_equivalent_to_their_own_k0_alone() -> None:
+    options = {"system": RETRIEVAL, "grid": Grid.BENCHMARK, "paper": True}
+    found = made.score(made.RELEASED, margin=3, **options)
+    own = record(found, "equivalence", condition="k7", against_system=RETRIEVAL)
+    assert (own["low_90"], own["high_90"]) == newcombe_paired(189, 13, 13, 235, level=0.9)
+    assert round(100 * own["high_90"], 1) == 1.9 and own["verdict"] == "equivalent"
+    wide = made.score(made.RELEASED, margin=5, **options)
+    paper = record(wide, "equivalence", condition="k7", against_system=BASE)
+    assert (paper["against_condition"], paper["against_rows"]) == ("k0", "published")
+    assert (paper["low_90"], paper["high_90"]) == newcombe(202, 450, 204, 450, 0.9)
+    assert paper["verdict"] == "not shown"
+    text = headline(wide, "robomme")
+    assert (
+        "Its k7 is equivalent to its own k0 within ±5 points (90% interval −1.9 to +1.9). Its k7 "
+        "is not shown to be within ±5 points of FrameSamp-Modul's published k0 (90% interval −5.9 "
+        "to +5.0)."
+    ) in text
+
+
+def test_retrieval_is_set_against_the_rows_without_it(tmp_path: Path) -> None:
+    given = {(BASE, "k0"): "s" * 40 + "f" * 40, (BASE, "k7"): "f" * 80}
+    given |= {(RETRIEVAL, "k0"): "s" * 40 + "f" * 40, (RETRIEVAL, "k7"): "s" * 40 + "f" * 39 + "e"}
+    path = made.write_csv(tmp_path / "a.csv", cells(given))
+    assert "equivalence" not in made.score(path).tables
+    found = made.score(path, margin=10)
+    verdicts = {
+        (r["system"], r["condition"], r["against_system"], r["against_condition"]): r["verdict"]
+        for r in records(found, "equivalence")
+    }
+    assert verdicts == {
+        (BASE, "k7", BASE, "k0"): "not shown",
+        (RETRIEVAL, "k7", RETRIEVAL, "k0"): "equivalent†",
+        (RETRIEVAL, "k0", BASE, "k0"): "equivalent",
+        (RETRIEVAL, "k7", BASE, "k7"): "not shown†",
+        (RETRIEVAL, "k7", BASE, "k0"): "equivalent†",
+    }
+
+
+@pytest.mark.parametrize("margin", [0, -1, 101, math.nan])
+def test_a_margin_is_in_points(margin: float) -> None:
+    with pytest.raises(InvalidOptionError, match="points, more than 0 up to 100"):
+        Settings((), margin=margin)
+
+
+# --- planning ----------------------------------------------------------------------------------
+
+
+def test_power_by_hand() -> None:
+    # Of 6 episodes each flips one way or another with 0.5; six flips alike are found: 2/64 ≤ 0.05.
+    # All six against the difference of 0.5 have 0; in its favour 0.5⁶.
+    assert power(0.5, 6, 0.0) == pytest.approx(0.5**6)
+    # With flips of 0.2: six of 0.6 in favour, or six of 0.1 against it.
+    assert power(0.5, 6, 0.2) == pytest.approx(0.6**6 + 0.1**6)
+    # Five alike are not enough: 2/32.
+    assert power(1.0, 5, 0.0) == 0.0 and smallest(5, 0.0) is None
+
+
+def test_a_plan_by_hand() -> None:
+    found = plan(0.05, 450, 0.06)
+    # 1.959964 · √(0.06/450), and (1.644854 + 1.281552) · √(0.06/450)
+    assert found.noise == pytest.approx(0.0226317, abs=1e-7)
+    assert found.equal == pytest.approx(0.0337912, abs=1e-7)
+    # (1.959964 · √0.11 + 0.841621 · √(0.11 − 0.0025))² / 0.05² = 0.8580… / 0.0025
+    assert found.needed == 343
+    assert found.smallest is not None and found.smallest < 0.05 and found.power > 0.8
+    assert power(found.smallest, 450, 0.06) == pytest.approx(0.8, abs=0.002)
+
+
+@given(st.integers(1, 200), st.floats(0, 0.5), st.floats(0.01, 0.5))
+def test_power_is_a_probability_that_grows(episodes: int, flips: float, margin: float) -> None:
+    found = power(margin, episodes, flips)
+    assert -1e-9 <= found <= 1 + 1e-9
+    assert found <= power(min(1 - flips, margin + 0.2), episodes, flips) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((0.0, 450, 0.1), "margin 0.0"),
+        ((0.05, 0, 0.1), "episodes 0"),
+        ((0.05, 10**6, 0.1), "episodes 1000000"),
+        ((0.05, 450, 1.1), "flips 1.1"),
+        ((0.6, 450, 0.5), "more than all episodes"),
+    ],
+)
+def test_what_cannot_be_planned(given: tuple[float, int, float], message: str) -> None:
+    with pytest.raises(InvalidOptionError, match=message):
+        plan(*given)
+
+
+def test_power_on_the_command_line() -> None:
+    words = ("power", "--margin", "5", "--episodes", "450", "--flips", "0.06")
+    done = run(*words)
+    assert done.exit_code == 0
+    assert "±2.3 points (95%)" in done.stdout and "about 343" in done.stdout
+    value = json.loads(run(*words, "--json").stdout)
+    assert value["needed"] == 343 and value["margin"] == 0.05
+
+
+def test_tables_tell_what_they_could_show(tmp_path: Path) -> None:
+    # Two gained and one lost of 40: twice one of them flips both ways.
+    given = {(BASE, "k0"): "ffs" + "s" * 37, (BASE, "k7"): "ssf" + "s" * 37}
+    found = made.score(made.write_csv(tmp_path / "a.csv", cells(given)))
+    least = smallest(40, 0.05)
+    assert least is not None
+    assert found.tables["effects"].note.endswith(
+        f" 40 episodes of which 5.0% flip both ways, as here in the median, show a difference of "
+        f"{100 * least:.1f} points with 80% power."
+    )
