@@ -185,14 +185,19 @@ def _interval(statistic: Statistic, features: Floats, drawn: Floats) -> Interval
     return Interval(value, float(low), float(high))
 
 
+def generator_of(key: str) -> np.random.Generator:
+    """Return random numbers that a text seeds: the same on every machine."""
+    seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:16])
+    return np.random.Generator(np.random.PCG64(seed))
+
+
 @lru_cache(maxsize=2)
 def _drawn(key: str, episodes: int, draws: int) -> NDArray[np.uint8]:
     """Return how often each draw takes each episode, `(draws, episodes)`; no one 256 times.
 
     All systems over the same episodes share the draws.
     """
-    seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:16])
-    generator = np.random.Generator(np.random.PCG64(seed))
+    generator = generator_of(key)
     counts = np.zeros((draws, episodes), np.uint8)
     step = max(1, _CHUNK // episodes)
     for start in range(0, draws, step):

@@ -16,6 +16,7 @@ from robomme_interference_data.evaluate.score import (
     contrasts,
     effects,
     equivalence,
+    families,
     interaction,
     paper,
     ranks,
@@ -29,17 +30,8 @@ from robomme_interference_data.templates import load_jinja2
 
 TABLES = (
     *("main", "systems", "ranks", "family", "difficulty", "lift", "effects", "interaction"),
-    *(
-        "equivalence",
-        "interference",
-        "access",
-        "ceiling",
-        "decay",
-        "noise",
-        "matrix",
-        "coverage",
-        "paper",
-    ),
+    *("equivalence", "interference", "access", "ceiling", "decay", "noise", "families"),
+    *("family_effects", "matrix", "coverage", "paper"),
 )
 """Every table that a score may have."""
 
@@ -124,6 +116,10 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     if settings.margin is not None:
         equal = equivalence.equivalence_table(compared, every, published, settings.margin)
         beyond.insert(1, equal)
+    by_family = [
+        families.families_table(cubes.values(), compared),
+        families.family_effects_table(cubes.values(), compared),
+    ]
     tables = [
         cells.rate_table(every, "main"),
         *(one for one in between if one.rows),
@@ -133,6 +129,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         *(one for one in beyond if one.rows),
         effects.decay_table(decays),
         effects.noise_table(cubes.values()),
+        *(one for one in by_family if one.rows),
         *(one for one in [contrasts.contrast_table(compared, "matrix")] if one.rows),
         cells.coverage_table(every),
     ]
