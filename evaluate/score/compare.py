@@ -104,7 +104,7 @@ def compare(
         f"a: {first}; b: {second or first}. Over the n episodes that count in both; the difference "
         "is b − a, gained and lost are from a to b. "
         + how_to_read(found, "the rows of all families, and those of single ones, of a simulator")
-        + power.note([pairs for pairs, (_, part), _ in found if not part]),
+        + power.note(one[0] for one, names in zip(found, own, strict=True) if "all" in names),
     )
     return Comparison(table, tuple(notes), (one,) if other is one else (one, other))
 

@@ -1,6 +1,7 @@
 """Is a difference shown to be small: two one-sided tests, with a margin that the user states."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.contrasts import START, Contrast
@@ -27,7 +28,7 @@ def equivalence_table(
     """
     found = [one for one in contrasts if one.table in ("effects", "equivalence")]
     paired = {(one.simulator, one.system) for one in found if one.system != one.against[0]}
-    tests = [
+    tests: list[tuple[Any, ...]] = [
         (one.simulator, one.system, one.condition, *one.against, "rows", one.pairs, one.complete)
         for one in found
     ]
@@ -55,9 +56,7 @@ def equivalence_table(
     )
 
 
-def _with_published(
-    cells: Iterable[Cell], published: Sequence[Cell]
-) -> Iterator[tuple[object, ...]]:
+def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterator[tuple[Any, ...]]:
     starts = {(one.simulator, one.system): one for one in published if one.condition == START}
     for cell in cells:
         start = starts.get((cell.simulator, base_of(cell.system) or ""))

@@ -84,12 +84,12 @@ def changes(first: Statuses, second: Statuses) -> Pairs:
     spread = float(old.std() * new.std())
     phi = float(((old - old.mean()) * (new - new.mean())).mean()) / spread if spread else 0.0
     gap = round(other.change.value - one.change.value, 12)
-    intervals = [
-        Interval(gap, *combined(b.value, b[1:], a.value, a[1:], phi, limit=2.0))
+    change, within = (
+        Interval(gap, *combined(b.value, (b.low, b.high), a.value, (a.low, a.high), phi, 2.0))
         for a, b in ((one.change, other.change), (one.within, other.within))
-    ]
+    )
     steps = (new - old).round(12)
     counts = (n, int((steps > 0).sum()), int((steps < 0).sum()))
     kind = other.interval if one.interval == other.interval else "clusters"
-    told = (one.change.value, other.change.value, *intervals, kind, *counts)
-    return Pairs(n, *told, *sign_flip(steps.tolist()))
+    sides = (one.change.value, other.change.value)
+    return Pairs(n, *sides, change, within, kind, *counts, *sign_flip(steps.tolist()))

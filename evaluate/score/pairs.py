@@ -86,9 +86,9 @@ def pair(
     n = len(before)
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
-    levels = [_clusters(first, second, level) for level in (LEVEL, WITHIN)]
+    change, within = (_clusters(first, second, level) for level in (LEVEL, WITHIN))
     tests = sign_flip((after - before).tolist())
-    rates = (float(side.mean()) for side in (before, after))
+    rate, other_rate = float(before.mean()), float(after.mean())
     if matched is not None:
         one, other = zip(*matched, strict=True)
         first, second = first[:, one], second[:, other]
@@ -97,7 +97,8 @@ def pair(
     seed = both[found].argmax(-1)
     old, new = (side[found, seed] == 0 for side in (first, second))
     gained, lost = int((new & ~old).sum()), int((old & ~new).sum())
-    return Pairs(n, *rates, *levels, "clusters", len(found), gained, lost, *tests)
+    counts = (len(found), gained, lost)
+    return Pairs(n, rate, other_rate, change, within, "clusters", *counts, *tests)
 
 
 def _of_single(before: Floats, after: Floats) -> Pairs:
@@ -107,13 +108,15 @@ def _of_single(before: Floats, after: Floats) -> Pairs:
         return NO_PAIRS
     one, other, both = (int(part) for part in (before.sum(), after.sum(), before @ after))
     gained, lost = other - both, one - both
-    change = round((other - one) / n, 12)
-    levels = [
-        Interval(change, *newcombe_paired(both, gained, lost, n - both - gained - lost, level))
+    gap, neither = round((other - one) / n, 12), n - both - gained - lost
+    change, within = (
+        Interval(gap, *newcombe_paired(both, gained, lost, neither, level))
         for level in (LEVEL, WITHIN)
-    ]
-    tests = mcnemar(gained, lost)
-    return Pairs(n, one / n, other / n, *levels, "newcombe", n, gained, lost, *tests)
+    )
+    counts = (n, gained, lost)
+    return Pairs(
+        *(n, one / n, other / n), change, within, "newcombe", *counts, *mcnemar(gained, lost)
+    )
 
 
 def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
@@ -131,10 +134,9 @@ def apart(sides: Sequence[tuple[float, float, int]]) -> Pairs:
     """Compare two sides that cannot be paired: rate, trials that it is worth, and episodes."""
     (first, worth, n), (second, other_worth, m) = sides
     counts = (second * other_worth, other_worth, first * worth, worth)
-    change = round(second - first, 12)
-    intervals = [Interval(change, *newcombe(*counts, level)) for level in (LEVEL, WITHIN)]
-    p = two_proportions(*counts)
-    return Pairs(min(n, m), first, second, *intervals, "unpaired", 0, 0, 0, p, math.nan)
+    gap, p = round(second - first, 12), two_proportions(*counts)
+    change, within = (Interval(gap, *newcombe(*counts, level)) for level in (LEVEL, WITHIN))
+    return Pairs(min(n, m), first, second, change, within, "unpaired", 0, 0, 0, p, math.nan)
 
 
 def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:

@@ -116,7 +116,7 @@ def power(margin: float, episodes: int, flips: float) -> float:
 def _powers(base: float, exponents: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the logarithm of a power; that of 0 to the 0 is 0."""
     if base > 0:
-        return exponents * math.log(base)
+        return np.asarray(exponents * math.log(base))
     return np.where(exponents == 0, 0.0, -np.inf)
 
 

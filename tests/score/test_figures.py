@@ -104,8 +104,8 @@ def test_the_retention_figure_names_whom_it_leaves_out(tmp_path: Path, figure: A
     assert explained(figure).replace("\n", " ") == (
         "Not shown (no lift at k0 with p < 0.05, or rows missing at k7): my-memory"
     )
-    # Too few episodes differ for intervals: no bars, two points and the lines at 0 and 1.
-    assert len(axes.lines) == 4
+    # Two points with their bars, and the lines at 0 and 1.
+    assert len(axes.lines) == 6
     with open_figure() as other:
         assert draw_figure("retention", other, data(tmp_path, rows))
         assert explained(other) == ""
