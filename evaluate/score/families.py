@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,23 +127,24 @@ def over_families(
     labels, values = labels[order], values[order]
     starts = np.flatnonzero(np.diff(labels, prepend=-1))
     known: Flags = ~np.isnan(values)
-    both = np.concatenate([np.where(known, values, 0.0), known], axis=1)
+    # Most comparisons lack the same episodes, mostly none: each mask is summed once.
+    masks, place = np.unique(known, axis=1, return_inverse=True)
+    both = np.concatenate([np.where(known, values, 0.0), masks], axis=1)
     generator = generator_of(f"{key}, families")
 
     def apart(at: Floats) -> tuple[Floats, Floats]:
-        sums, counts = np.split(at, 2, axis=-1)
-        return sums, counts
+        return at[..., : len(place)], at[..., len(place) :][..., place]
 
     def spread(rows: Floats) -> Floats:
         sums, counts = apart(np.add.reduceat(rows, starts, axis=0))
-        return np.asarray((sums**2 / np.maximum(counts, 1)).sum(axis=0).round(9))
+        return np.asarray((sums * sums / np.maximum(counts, 1)).sum(axis=0).round(9))
 
     observed = spread(both)
     reached = sum(spread(generator.permutation(both)) >= observed for _ in range(draws))
     p = (1 + np.asarray(reached)) / (1 + draws)
 
     sums, counts = apart(np.add.reduceat(both, starts, axis=0))
-    alike = _mean(sums, counts, np.ones(len(starts)))
+    alike = _mean(sums[None], counts[None], np.ones((1, len(starts))))[0]
     taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
     intervals = []
     for often in (np.ones_like(taken), taken):
@@ -152,7 +152,7 @@ def over_families(
             generator.multinomial(often[:, n] * len(part), np.full(len(part), 1 / len(part))) @ part
             for n, part in enumerate(np.split(both, starts[1:]))
         ]
-        means = _mean(*apart(np.stack(drawn, axis=1)), often[..., None])
+        means = _mean(*apart(np.stack(drawn, axis=1)), often.astype(float))
         intervals.append(np.nanquantile(means, (0.025, 0.975), axis=0))
     return [
         (
@@ -168,10 +168,12 @@ def over_families(
     ]
 
 
-def _mean(sums: Floats, counts: Floats, weights: Any) -> Floats:
-    """Return the weighted mean over families, the last axis but one, of their means."""
-    weights = np.broadcast_to(weights if weights.ndim > 1 else weights[:, None], counts.shape)
-    weights = weights * (counts > 0)
+def _mean(sums: Floats, counts: Floats, weights: Floats) -> Floats:
+    """Return the weighted mean of the families' means, `(D, K)`, of `(D, F, K)` and `(D, F)`.
+
+    A family without an episode has no weight; NaN where none has any.
+    """
     means = sums / np.maximum(counts, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((weights * means).sum(axis=-2) / weights.sum(axis=-2))
+        total = np.einsum("dfk,df->dk", means, weights)
+        return np.asarray(total / np.einsum("dfk,df->dk", counts > 0, weights))
