@@ -5,16 +5,17 @@ SciPy, which takes seconds to import; the tests hold them against SciPy's.
 """
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Sequence
-from functools import reduce
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 SURE = 0.05
 """Below this p something is taken as found."""
 
-_LATTICE = 840  # divided by every number up to 8: means of so many repeats lie on it exactly
+_LATTICE = 27720  # divided by every number up to 12: means of so many repeats lie on it exactly
+_STEPS = 12
 
 
 def mcnemar(gained: int, lost: int) -> tuple[float, float]:
@@ -38,7 +39,7 @@ def mcnemar(gained: int, lost: int) -> tuple[float, float]:
     return min(1.0, 2 * total / 2**pairs), min(1.0, (2 * total - ways) / 2**pairs)
 
 
-def sign_flip(differences: Iterable[float]) -> tuple[float, float]:
+def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     """Return the two-sided p-value of the exact sign-flip test of paired means, and its mid-p.
 
     Under the null hypothesis each difference d is as likely its opposite. Of the 2ⁿ ways to give
@@ -46,30 +47,42 @@ def sign_flip(differences: Iterable[float]) -> tuple[float, float]:
     observed one, or farther; the mid-p counts those that are as far by half, and is 1 where the
     observed sum is 0. Of differences of single rollouts, −1, 0 and 1, it is McNemar's exact test.
 
-    Exact for means of up to eight repeats a side; of more they are rounded to 1/840.
+    The differences are whole numbers of some common step. Where the largest is more than twelve
+    such steps, as of more than twelve repeats, they are rounded to twelfths: as exact a test, of
+    slightly other numbers.
 
     Source: Fisher (1935), The Design of Experiments, section 21; Edgington and Onghena (2007),
     Randomization Tests, chapter 6.
+
+    Args:
+        differences: Of the episodes' means, `(E,) float64`.
     """
-    steps = [round(_LATTICE * one) for one in differences]
-    unit = reduce(math.gcd, steps, 0) or 1
-    sizes = Counter(abs(one) // unit for one in steps)
-    observed = abs(sum(steps)) // unit
+    steps = np.rint(_LATTICE * differences).astype(np.int64)
+    steps //= max(1, int(np.gcd.reduce(steps)))
+    if np.abs(steps).max(initial=0) > _STEPS:
+        steps = np.rint(_STEPS * differences).astype(np.int64)
+        steps //= max(1, int(np.gcd.reduce(steps)))
+    observed, counts = abs(int(steps.sum())), np.bincount(np.abs(steps))
     if not observed:
         return 1.0, 1.0
-    if sizes.keys() <= {0, 1}:
-        return mcnemar((sizes[1] + observed) // 2, (sizes[1] - observed) // 2)
-    chances = np.ones(1)  # of each sum, from the least to the most, in steps of two units
-    for size, count in sizes.items():
-        for _ in range(count * (size > 0)):
-            spread = np.zeros(len(chances) + size)
-            spread[:-size] = chances / 2
-            spread[size:] += chances / 2
-            chances = spread
+    if len(counts) == 2:
+        ones = int(counts[1])
+        return mcnemar((ones + observed) // 2, (ones - observed) // 2)
+    chances = np.ones(1)  # of each sum, from the least to the most, in twice the step
+    for size in np.flatnonzero(counts[1:]) + 1:
+        own = np.zeros(int(size * counts[size]) + 1)
+        own[:: int(size)] = _heads(int(counts[size]))
+        chances = np.convolve(chances, own)
     # A sum that is `observed` or more: so many of the last.
     last = (len(chances) - 1 - observed) // 2 + 1
     tail = chances[len(chances) - last :]
     return min(1.0, 2 * float(tail.sum())), min(1.0, float(2 * tail.sum() - tail[0]))
+
+
+@lru_cache(maxsize=1024)
+def _heads(coins: int) -> NDArray[np.float64]:
+    """Return the chances of 0 to all heads of some coins."""
+    return np.array([math.comb(coins, heads) / 2**coins for heads in range(coins + 1)])
 
 
 def two_proportions(

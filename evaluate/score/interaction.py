@@ -92,4 +92,4 @@ def changes(first: Statuses, second: Statuses) -> Pairs:
     counts = (n, int((steps > 0).sum()), int((steps < 0).sum()))
     kind = other.interval if one.interval == other.interval else "clusters"
     sides = (one.change.value, other.change.value)
-    return Pairs(n, *sides, change, within, kind, *counts, *sign_flip(steps.tolist()))
+    return Pairs(n, *sides, change, within, kind, *counts, *sign_flip(steps))

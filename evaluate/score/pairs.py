@@ -87,7 +87,7 @@ def pair(
     if n == counting(first).sum() == counting(second).sum():
         return _of_single(before, after)
     change, within = (_clusters(first, second, level) for level in (LEVEL, WITHIN))
-    tests = sign_flip((after - before).tolist())
+    tests = sign_flip(after - before)
     rate, other_rate = float(before.mean()), float(after.mean())
     if matched is not None:
         one, other = zip(*matched, strict=True)

@@ -141,7 +141,7 @@ def test_fiellers_interval_by_hand() -> None:
 
 @given(st.lists(st.sampled_from([-1, -2 / 3, -0.5, -1 / 3, 0, 0.25, 0.5, 1]), max_size=9))
 def test_sign_flips_are_counted(differences: list[float]) -> None:
-    p, mid = sign_flip(differences)
+    p, mid = sign_flip(np.array(differences))
     sums = [
         abs(sum(map(math.prod, zip(differences, signs, strict=True))))
         for signs in itertools.product((1, -1), repeat=len(differences))
@@ -153,9 +153,17 @@ def test_sign_flips_are_counted(differences: list[float]) -> None:
     assert mid == pytest.approx((above + equal / 2) / len(sums) if observed > 1e-9 else 1)
 
 
+def test_sign_flips_of_many_repeats_are_of_twelfths() -> None:
+    # Thirteenths of 3, 6 and −1 are 2.8, 5.5 and −0.9 twelfths, hence 3, 6 and −1.
+    found = sign_flip(np.array([3, 6, -1]) / 13)
+    assert found == sign_flip(np.array([3, 6, -1]) / 12) == (0.5, 0.375)
+
+
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(0, 50))
 def test_of_single_rollouts_sign_flips_are_mcnemars(gained: int, lost: int, same: int) -> None:
-    assert sign_flip([1.0] * gained + [-1.0] * lost + [0.0] * same) == mcnemar(gained, lost)
+    assert sign_flip(np.array([1.0] * gained + [-1.0] * lost + [0.0] * same)) == mcnemar(
+        gained, lost
+    )
 
 
 def test_mcnemar_by_hand() -> None:

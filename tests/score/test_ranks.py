@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
@@ -98,7 +99,11 @@ def test_which_system_falls_more(tmp_path: Path) -> None:
     )
     # The base loses 2 to 9, retrieval 10 alone: eight are higher, one is lower.
     assert (row["difference"], row["gained"], row["lost"]) == (0.35, 8, 1)
-    assert (row["p"], row["p_mid"]) == mcnemar(8, 1) == sign_flip([1] * 8 + [-1] + [0] * 11)
+    assert (
+        (row["p"], row["p_mid"])
+        == mcnemar(8, 1)
+        == sign_flip(np.array([1.0] * 8 + [-1.0] + [0.0] * 11))
+    )
     changes = newcombe_paired(9, 0, 1, 10), newcombe_paired(2, 0, 8, 10)
     # Of the changes: mean product 0, means −0.05 and −0.4.
     phi = -0.05 * 0.4 / math.sqrt(0.05 * 0.95 * 0.4 * 0.6)
