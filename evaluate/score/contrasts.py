@@ -220,8 +220,9 @@ def interaction_table(contrasts: Iterable[Contrast]) -> Table:
         f"change: rate under the condition − rate at {START}; difference: of the changes, positive "
         "where the system falls less than the other one, which is the best at k0, or the one "
         "without retrieval. The best at k0 is chosen by that rate, which overstates its fall where "
-        "others are about as good. Over the n episodes that count in all four cells; pairs are "
-        "episodes, gained and lost those whose change is higher, or lower, than the other's. 95% "
+        "others are about as good. Systems whose histories may differ are left out. Over the n "
+        "episodes that count in all four cells; pairs are episodes, gained and lost "
+        "those whose change is higher, or lower, than the other's. 95% "
         "intervals: from those of both changes and their correlation. p: the exact sign-flip test "
         "of the episodes' differences, p_mid its mid-p, p_holm corrected by Holm's method among "
         f"{_TOGETHER}.",

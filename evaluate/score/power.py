@@ -146,6 +146,6 @@ def note(found: Iterable[Pairs]) -> str:
     least = smallest(n, flips)
     shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
     return (
-        f" {n:,} episodes of which {percent(flips)} flip both ways, as here in the median, show "
-        f"{shown} with 80% power."
+        f" {n:,} episode{'s' * (n > 1)} of which {percent(flips)} flip both ways, as here in the "
+        f"median, show {shown} with 80% power."
     )
