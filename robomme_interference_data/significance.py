@@ -72,7 +72,7 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     for size in np.flatnonzero(counts[1:]) + 1:
         own = np.zeros(int(size * counts[size]) + 1)
         own[:: int(size)] = _heads(int(counts[size]))
-        chances = np.convolve(chances, own)
+        chances = np.convolve(chances, own).astype(float)
     # A sum that is `observed` or more: so many of the last.
     last = (len(chances) - 1 - observed) // 2 + 1
     tail = chances[len(chances) - last :]
