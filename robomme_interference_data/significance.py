@@ -68,11 +68,13 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     if len(counts) == 2:
         ones = int(counts[1])
         return mcnemar((ones + observed) // 2, (ones - observed) // 2)
-    chances = np.ones(1)  # of each sum, from the least to the most, in twice the step
+    chances: NDArray[np.float64] = np.ones(
+        1
+    )  # of each sum, from the least to the most, in twice the step
     for size in np.flatnonzero(counts[1:]) + 1:
         own = np.zeros(int(size * counts[size]) + 1)
         own[:: int(size)] = _heads(int(counts[size]))
-        chances = np.convolve(chances, own).astype(float)
+        chances = np.convolve(chances, own).astype(np.float64)
     # A sum that is `observed` or more: so many of the last.
     last = (len(chances) - 1 - observed) // 2 + 1
     tail = chances[len(chances) - last :]

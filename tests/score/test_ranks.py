@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
-from robomme_interference_data.significance import mcnemar, sign_flip, two_proportions
+from robomme_interference_data.evaluate.score.pairs import corrected
+from robomme_interference_data.significance import holm, mcnemar, sign_flip, two_proportions
 from robomme_interference_data.stats import combined, newcombe, newcombe_paired
 
 # Of 24 episodes: 12, 11, 6 and 5, each a part of the one before.
@@ -114,3 +117,11 @@ def test_which_system_falls_more(tmp_path: Path) -> None:
 def test_nothing_interacts_without_k0(tmp_path: Path) -> None:
     found = scored(tmp_path, {(BASE, "k1"): "sf", (OWN, "k1"): "ff", (OWN, "k7"): "ff"})
     assert "interaction" not in found.tables
+
+
+@given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from("abc")), max_size=9))
+def test_groups_are_corrected_apart(tests: list[tuple[float, str]]) -> None:
+    found = corrected([p for p, _ in tests], [group for _, group in tests])
+    for group in "abc":
+        own = [p for p, name in tests if name == group]
+        assert [p for p, (_, name) in zip(found, tests, strict=True) if name == group] == holm(own)
