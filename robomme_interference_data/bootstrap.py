@@ -16,7 +16,7 @@ DRAWS = 10_000
 """Bootstrap samples."""
 
 LEAST = 10
-"""So many episodes must stand out for a paired comparison to have a bootstrap interval."""
+"""So many episodes must stand out for a slope, or a mean over families, to have an interval."""
 
 _CHUNK = 2**15  # numbers at a time: they stay in the cache, and BLAS starts no threads for them
 _NORMAL = NormalDist()
@@ -36,7 +36,7 @@ class Statistic(NamedTuple):
     Attributes:
         columns: Places of the columns.
         combine: From their means, `(D, M) float64`, to the statistic, `(D,) float64`. Of single
-            episodes in their place it is what each adds to a difference or a slope.
+            episodes in their place it is what each adds to a slope.
     """
 
     columns: tuple[int, ...]
@@ -54,11 +54,6 @@ class Statistic(NamedTuple):
 def mean(column: int) -> Statistic:
     """Return the mean of a column."""
     return Statistic((column,), lambda m: m[:, 0])
-
-
-def difference(first: int, second: int) -> Statistic:
-    """Return mean of column `second` − mean of column `first`."""
-    return Statistic((first, second), lambda m: m[:, 1] - m[:, 0])
 
 
 def slope(columns: Sequence[int], ks: Sequence[int]) -> Statistic:

@@ -68,9 +68,8 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     if len(counts) == 2:
         ones = int(counts[1])
         return mcnemar((ones + observed) // 2, (ones - observed) // 2)
-    chances: NDArray[np.float64] = np.ones(
-        1
-    )  # of each sum, from the least to the most, in twice the step
+    # Of each sum, from the least to the most, in twice the step.
+    chances: NDArray[np.float64] = np.ones(1)
     for size in np.flatnonzero(counts[1:]) + 1:
         own = np.zeros(int(size * counts[size]) + 1)
         own[:: int(size)] = _heads(int(counts[size]))

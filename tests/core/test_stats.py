@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from robomme_interference_data.bootstrap import (
     Statistic,
     bootstrap,
-    difference,
     enough,
     mean,
     slope,
@@ -212,6 +211,11 @@ def test_effect_sizes_by_hand() -> None:
     found = float(slope([0, 1, 2, 3], [0, 1, 3, 7]).combine(np.array([rates]))[0])
     assert found == pytest.approx(-0.0864)
     assert found == pytest.approx(scipy.stats.linregress([0, 1, 2, 3], rates).slope)
+
+
+def difference(first: int, second: int) -> Statistic:
+    """The slope over one doubling: second − first."""
+    return slope([first, second], [0, 1])
 
 
 def outcomes(episodes: int = 80) -> Any:
