@@ -18,7 +18,9 @@ _NOTE = (
     "Published: RoboMME-Interference: Benchmarking Robot Memory Under Interference (Rathi, August "
     "2026), Tables 3 and 4. complete: over the benchmark's 450 episodes, as the published rates "
     "are. 95% intervals: Wilson for rates; Newcombe's hybrid score for differences, which takes "
-    "both sides as independent samples: the paper's rows are not at hand to be paired."
+    "both sides as independent samples: the paper's rows are not at hand to be paired. "
+    "published_best: it cannot be told from the highest published rate of its condition, by the "
+    "test of two proportions, corrected by Holm's method over the others (0.05 or more)."
 )
 
 
@@ -81,13 +83,13 @@ def paper_table(cells: Sequence[Cell]) -> Table:
         )
         ours = (cell.system, cell.condition, paper.system, cell.n, cell.rate, *cell.interval)
         change = (cell.rate - paper.rate, *bounds, cell.complete)
-        rows.append((*ours, paper.n, paper.rate, *paper.interval, *change))
+        rows.append((*ours, paper.n, paper.rate, *paper.interval, paper.best, *change))
     return Table.make(
         "paper",
         "Beside the published rates",
         "system condition published_system n:count rate:rate low:rate high:rate published_n:count "
-        "published_rate:rate published_low:rate published_high:rate difference:points "
-        "difference_low:points difference_high:points complete:flag",
+        "published_rate:rate published_low:rate published_high:rate published_best:flag "
+        "difference:points difference_low:points difference_high:points complete:flag",
         rows,
         " ".join([_NOTE, *not_compared(cells)]),
     )

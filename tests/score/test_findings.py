@@ -130,7 +130,7 @@ def test_rates_stand_beside_the_published_ones(beside: Score) -> None:
     assert (base["n"], base["published_n"]) == (12, 450)
     # Only the benchmark's whole grid is complete, whatever the grid of the scoring.
     assert not base["complete"]
-    assert base["published_rate"] == 204 / 450
+    assert base["published_rate"] == 204 / 450 and base["published_best"]
     assert (base["difference_low"], base["difference_high"]) == newcombe(7, 12, 204, 450)
 
 
