@@ -46,7 +46,7 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
             f"{display_name(leader.system)} succeeds in {percent(leader.rate)} of {leader.n} "
             f"episodes under {_named(leader.condition)} (95% interval {_interval(leader)})."
         )
-        return [first, *_alike(others)]
+        return [first, *_alike(others), *_hurting(score, leader)]
     fall = max(falls, key=lambda one: parse_condition(one.condition).k)
     sentences = [_from_start(leader, fall, _corrected(score, fall)), *_alike(others)]
     if fall.complete:
@@ -56,7 +56,8 @@ def _leading(score: Score, complete: Sequence[Cell]) -> list[str]:
             sentences.append(f"The highest rate at {fall.condition} is {rate}, of {_listed(best)}.")
         else:
             sentences += _alike([cell for cell in best if cell.system != leader.system])
-    return sentences + _equal(score, fall) + _beside_base(score, fall)
+    sentences += _equal(score, fall) + _beside_base(score, fall)
+    return sentences + _hurting(score, leader)
 
 
 def _alike(others: Sequence[Cell]) -> list[str]:
@@ -90,7 +91,6 @@ def _corrected(score: Score, fall: Contrast) -> str:
     The leader is the highest of all at k0, and the highest of equal ones is so by luck: its fall
     is overstated, and it has to stand out from as many falls as it was chosen from.
     """
-    test = "McNemar" if fall.pairs.interval == "newcombe" else "sign-flip"
     own = (fall.simulator, fall.condition, "effects")
     falls = [
         one
@@ -102,7 +102,32 @@ def _corrected(score: Score, fall: Contrast) -> str:
     ]
     p = holm([one.pairs.p for one in falls])[falls.index(fall)]
     among = f", corrected for the falls of {len(falls)} systems" * (len(falls) > 1)
-    return f"{test} p = {_p(p)}{among}{'' if fall.complete else ', provisional'}"
+    return f"{_test(fall)} p = {_p(p)}{among}{'' if fall.complete else ', provisional'}"
+
+
+def _test(contrast: Contrast) -> str:
+    return "McNemar" if contrast.pairs.interval == "newcombe" else "sign-flip"
+
+
+def _hurting(score: Score, leader: Cell) -> list[str]:
+    """Say which kind of condition beyond the paper lowers the leader's rate most, if one does."""
+    own = ("interference", leader.simulator, leader.system)
+    found = [
+        one
+        for one in score.contrasts
+        if (one.table, one.simulator, one.system) == own and one.complete
+    ]
+    worst = min(found, key=lambda one: one.pairs.change.value, default=None)
+    if worst is None or worst.pairs.change.value >= 0:
+        return []
+    change = worst.pairs.change
+    p = holm([one.pairs.p for one in found])[found.index(worst)]
+    among = f", corrected for {len(found)} comparisons" * (len(found) > 1)
+    return [
+        f"Of what is beyond the paper, {worst.asks} costs it most: {worst.condition} against "
+        f"{_named(worst.against[1])} {points(change.value)} points ({points(change.low)} to "
+        f"{points(change.high)}; {_test(worst)} p = {_p(p)}{among})."
+    ]
 
 
 def _from_start(leader: Cell, contrast: Contrast, tested: str) -> str:
