@@ -2,6 +2,7 @@
 
     python benchmarks/score.py               # the full grid, then a million rows; minutes
     python benchmarks/score.py --repeats 20  # fewer repeats in the second part
+    python benchmarks/score.py --command     # the command alone, figures and report included
 
 Each way reads the rows, checks them, and writes the same rates, intervals, exact tests and
 bootstrap intervals. With pandas the bootstrap is done twice: as one would write it down, a call of
@@ -12,6 +13,8 @@ install it for this.
 
 import argparse
 import math
+import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +24,7 @@ from functools import partial
 from importlib.util import find_spec
 from operator import mul
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -57,7 +61,10 @@ def main() -> None:
         "--repeats", type=positive, default=40, help="repeats of the grid in the second part"
     )
     parser.add_argument("--draws", type=positive, default=10_000, help="of each bootstrap")
+    parser.add_argument("--command", action="store_true", help="time the command alone")
     options = parser.parse_args()
+    if options.command:
+        return time_command(options.rounds)
     if not find_spec("pandas"):
         sys.exit("pandas is needed to compare with: pip install pandas")
     print(machine("pyarrow", "pandas", "numpy", "scipy"), end="\n\n")
@@ -103,6 +110,29 @@ def main() -> None:
                 lines,
             )
         )
+
+
+def time_command(rounds: int) -> None:
+    """Time `score` as a command on the full grid, tables, figures and report, and print."""
+    print(machine("pyarrow", "numpy", "matplotlib"), end="\n\n")
+    seconds, busy = [], []
+    with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
+        rows = write_rows(Path(name) / "grid.parquet", 1)
+        program = Path(sys.executable).with_name("robomme-interference")
+        for _ in range(rounds):
+            before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+            subprocess.run(
+                [program, "score", rows, "--out", Path(name) / "out"],
+                check=True,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            seconds.append(time.perf_counter() - began)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            busy.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    line = [f"{grid():,}", f"{median(seconds):.1f}", f"{median(busy):.1f}"]
+    title = f"The command, tables, figures and report; medians of {rounds} rounds."
+    print(table(title, [">rows", ">s", ">processor s"], [line]))
 
 
 def measure(way: str, rows: Path, out: Path, draws: int) -> Run:

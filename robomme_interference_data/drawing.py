@@ -27,8 +27,14 @@ class Hue:
 
 
 _DPI = 180
-_METADATA = {".png": ("Software",), ".svg": ("Creator", "Date", "Format", "Type")}
-"""For each suffix that can be written, what matplotlib would note: its version and the date."""
+MAKER = "robomme-interference"
+"""What a picture says that it was made by."""
+
+_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": MAKER},
+    ".svg": {"Creator": MAKER, "Date": None, "Format": None, "Type": None},
+}
+"""For each suffix that can be written, what it says; without matplotlib's version and the date."""
 
 
 @contextmanager
@@ -69,7 +75,8 @@ def open_figure() -> Iterator[Any]:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtraError.needs("drawing", "matplotlib", "score") from error
-    settings = {"svg.hashsalt": "robomme-interference", "image.composite_image": False}
+    settings = {"svg.hashsalt": MAKER, "image.composite_image": False}
+    settings |= {"svg.fonttype": "none"}  # text stays text: small, quick, to be found and read out
     with (
         matplotlib.style.context("default"),
         matplotlib.rc_context(settings),
@@ -88,8 +95,7 @@ def save_figure(figure: Any, out: Path) -> None:
     suffix = _suffix(out)
     try:
         with atomic_path(out) as partial:
-            metadata = dict.fromkeys(_METADATA[suffix])
-            figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=metadata)
+            figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=_METADATA[suffix])
     except OSError as error:
         raise InvalidOptionError(
             f"{out} cannot be written: {error.strerror or error}", "Choose another file."

@@ -29,6 +29,7 @@ def score(
         Path | None,
         typer.Option("--export", help="Also write the rows here as the released CSVs have them."),
     ] = None,
+    png: Annotated[bool, typer.Option("--png", help="Figures as PNG, too, not SVG alone.")] = False,
     as_json: AsJson = False,
 ) -> None:
     r"""Score rollout rows: tables, statistics, figures and one report.
@@ -51,7 +52,7 @@ def score(
     found = compute(settings)
     _tell([found.rows], found.notes)
     with WorkProgress() as progress, progress.status("Drawing the figures"):
-        exported = write_score(found, out, export_to, command_line())
+        exported = write_score(found, out, export_to, command_line(), png=png)
     for path in exported:
         say(f"{path} written")
     if as_json:

@@ -42,8 +42,13 @@ FIGURES = {
 """Name to what a figure shows."""
 
 
-def draw_figures(score: Score, folder: Path) -> dict[str, Path]:
-    """Draw every figure for which there is data, as `<figure>-<simulator>.svg` and `.png`.
+def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, Path]:
+    """Draw every figure for which there is data, as `<figure>-<simulator>.svg`.
+
+    Args:
+        score: What is drawn.
+        folder: Where to write.
+        png: Whether to write each as `.png`, too.
 
     Returns:
         Name without suffix to the SVG, in the order of `FIGURES`.
@@ -55,7 +60,7 @@ def draw_figures(score: Score, folder: Path) -> dict[str, Path]:
             with open_figure() as figure:
                 if draw_figure(kind, figure, data):
                     name = f"{kind}-{simulator}"
-                    for suffix in (".png", ".svg"):
+                    for suffix in (".svg", *[".png"] * png):
                         save_figure(figure, folder / (name + suffix))
                     drawn[name] = folder / f"{name}.svg"
     return drawn

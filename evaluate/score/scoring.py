@@ -164,7 +164,12 @@ def _unpaired(rows: Rows, cube: Cube, system: str, other: str) -> str:
 
 
 def write_score(
-    score: Score, out: Path, export_to: Path | None = None, command: str | None = None
+    score: Score,
+    out: Path,
+    export_to: Path | None = None,
+    command: str | None = None,
+    *,
+    png: bool = False,
 ) -> list[Path]:
     """Write tables, figures and the report, each atomically and the report last.
 
@@ -176,6 +181,7 @@ def write_score(
         out: Folder for `tables/`, `figures/` and `report.html`.
         export_to: Folder for the rows in the released layout (see `export`); None writes none.
         command: The command line that made the score, for the report.
+        png: Whether figures are written as PNG, too, not as SVG alone.
 
     Returns:
         The exported files.
@@ -184,7 +190,7 @@ def write_score(
         MissingExtraError: matplotlib or jinja2 is not installed.
         InvalidOptionError: The released layout cannot hold the rows (see `export`).
     """
-    from robomme_interference_data.drawing import open_figure
+    from robomme_interference_data.drawing import MAKER, open_figure
     from robomme_interference_data.evaluate.score import export, figures, report
 
     with open_figure():
@@ -195,15 +201,16 @@ def write_score(
     texts["main.md"] = "\n".join(grid.markdown() for grid in score.grids)
     for name, text in texts.items():
         write_text(out / "tables" / name, text)
-    drawn = figures.draw_figures(score, out / "figures")
+    drawn = figures.draw_figures(score, out / "figures", png=png)
     for name in {f"{table}{suffix}" for table in TABLES for suffix in (".csv", ".md")} - {*texts}:
         (out / "tables" / name).unlink(missing_ok=True)
     for kind in figures.FIGURES:
         for drawing in (out / "figures").glob(f"{kind}-*.svg"):
-            # A score draws both: a lone file of such a name is somebody else's.
-            picture = drawing.with_suffix(".png")
-            if drawing.stem not in drawn and picture.exists():
-                picture.unlink()
+            if MAKER.encode() not in drawing.read_bytes():
+                continue  # somebody else's
+            if drawing.stem not in drawn or not png:
+                drawing.with_suffix(".png").unlink(missing_ok=True)
+            if drawing.stem not in drawn:
                 drawing.unlink()
     report.write_report(score, drawn, out / "report.html", command)
     return exported

@@ -1,6 +1,7 @@
 """The film strip: its layout by hand, pictures read back, their bytes, and what cannot be drawn."""
 
 import base64
+import html
 import io
 import re
 import xml.etree.ElementTree as ET
@@ -32,8 +33,9 @@ pytest.importorskip("matplotlib")
 
 
 def labels(svg: Path) -> list[str]:
-    """All texts of the picture; matplotlib notes each in a comment beside its outline."""
-    return re.findall(r"<!-- (.*?) -->", svg.read_text(encoding="utf-8"))
+    """All texts of the picture."""
+    found = re.findall(r"<text[^>]*>(.*?)</text>", svg.read_text(encoding="utf-8"))
+    return [html.unescape(text) for text in found]
 
 
 def pictures(svg: Path) -> list[NDArray[np.uint8]]:

@@ -14,6 +14,7 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, run
 
+from robomme_interference_data.drawing import MAKER
 from robomme_interference_data.errors import (
     BadRowsError,
     InvalidIdError,
@@ -34,7 +35,7 @@ def files(folder: Path) -> set[str]:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures take most of the time, and have tests of their own."""
-    monkeypatch.setattr(figures, "draw_figures", lambda score, folder: {})
+    monkeypatch.setattr(figures, "draw_figures", lambda score, folder, png: {})
 
 
 @made.needs_released
@@ -59,7 +60,7 @@ def test_score_and_export_on_the_command_line(
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
     kinds = ("difficulty", "families", "heatmap", "retrieval", "success")
-    assert drawn == [f"{kind}-robomme{s}" for kind in kinds for s in (".png", ".svg")]
+    assert drawn == [f"{kind}-robomme.svg" for kind in kinds]
     # The released rows come back byte for byte.
     (exported,) = (tmp_path / "export").iterdir()
     assert exported.read_bytes() == made.RELEASED.read_bytes()
@@ -130,12 +131,13 @@ def test_a_name_that_is_none_is_a_bad_option_not_bad_rows(
 def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def draw(score: Any, folder: Path) -> dict[str, Path]:
+    def draw(score: Any, folder: Path, png: bool) -> dict[str, Path]:
         folder.mkdir(parents=True, exist_ok=True)
         names = [f"success-{simulator}" for simulator in score.cubes]
         for name in names:
-            (folder / f"{name}.png").touch()
-            (folder / f"{name}.svg").touch()
+            (folder / f"{name}.svg").write_text(MAKER)
+            if png:
+                (folder / f"{name}.png").touch()
         return {name: folder / f"{name}.svg" for name in names}
 
     monkeypatch.setattr(figures, "draw_figures", draw)
@@ -144,7 +146,7 @@ def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
     first = made.score(made.write_parquet(tmp_path / "a.parquet", both), paper=True)
     own = [row for row in rows if row.system == OWN]
     second = made.score(made.write_parquet(tmp_path / "b.parquet", own))
-    write_score(first, out)
+    write_score(first, out, png=True)
     assert {"tables/paper.csv", "tables/paper.md", "figures/success-robomme.png"} <= files(out)
     others = {"tables/notes.csv", "tables/mine.md", "figures/mine.svg", "figures/success-me.svg"}
     for name in (*others, "notes.txt"):

@@ -62,7 +62,7 @@ def small(run: Path) -> Score:
 @pytest.fixture(scope="module")
 def report(small: Score, run: Path) -> Path:
     out = run.parent / "score"
-    write_report(small, draw_figures(small, out / "figures"), out / "report.html")
+    write_report(small, draw_figures(small, out / "figures", png=True), out / "report.html")
     return out / "report.html"
 
 
