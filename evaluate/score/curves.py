@@ -1,12 +1,8 @@
-"""How systems look in figures, and the curves, axes and legends that figures share.
-
-Systems are told apart without colour, too, and in print.
-"""
+"""What figures show of a score, and the curves, axes and labels that they share."""
 
 import math
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Self
 
@@ -17,86 +13,16 @@ from robomme_interference_data.conditions import (
     in_order,
     parse_condition,
 )
-from robomme_interference_data.drawing import GREY, INK, Hue, tidy
+from robomme_interference_data.drawing import INK, tidy
 from robomme_interference_data.evaluate.score.cells import Cell
+from robomme_interference_data.evaluate.score.looks import Look, looks_of
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import SYSTEMS, base_of
+from robomme_interference_data.evaluate.systems import base_of
 
-# One for what the memory is made of.
-_COLOURS = {
-    "none": GREY,
-    "frames": Hue.BLUE,
-    "tokens": Hue.SKY,
-    "hidden state": Hue.GREEN,
-    "text": Hue.ORANGE,
-    "text with points": Hue.VERMILION,
-    "text with points and key frames": Hue.PINK,
-    "all frames": Hue.GREEN,
-    "last frames": Hue.ORANGE,
-}
-_OWN = (Hue.PINK, Hue.GREEN, Hue.ORANGE, Hue.SKY, Hue.VERMILION, Hue.BLUE)
-# Marker and line: one for how it enters the policy.
-_SHAPES = {
-    "modulator": ("o", "-"),
-    "context": ("s", "--"),
-    "expert": ("^", ":"),
-    "subgoals": ("D", "-."),
-}
-_LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
+_PUBLISHED = ", published"
 
-
-@dataclass(frozen=True)
-class Look:
-    """How a system is drawn: `#rrggbb`, matplotlib's marker and line style, width in points."""
-
-    label: str
-    colour: str
-    marker: str
-    line: Any
-    width: float = 1.6
-
-    @property
-    def point(self) -> dict[str, Any]:
-        """How matplotlib draws its points; an outline is all there is of a dash."""
-        size, edge = {"*": (8, 1), "_": (10, 2)}.get(self.marker, (4.5, 1))
-        style = {"marker": self.marker, "color": self.colour}
-        return style | {"markersize": size, "markeredgewidth": edge}
-
-
-# Of those that share no shape with the paper's, each has its own pair of marker and line.
-_FREE = [(marker, line) for line in _LINES for marker in "vPX<>dph8"]
-_TABLE = {
-    system.name: Look(
-        system.display,
-        _COLOURS[system.representation],
-        *(_SHAPES.get(system.integration or "") or _FREE.pop(0)),
-    )
-    for system in SYSTEMS.values()
-    if not system.retrieval
-}
-
-
-def looks_of(names: Sequence[str]) -> dict[str, Look]:
-    """Return the looks of systems; those of the table look the same in every figure.
-
-    A system with retrieval is a black star; several are stars in the colours of what they are
-    without it. Systems that are not in the table differ from each other and from the rest by
-    marker or line, up to two dozen; beyond that colours tell them apart.
-    """
-    looks: dict[str, Look] = {}
-    retrieving = [name for name in names if name in SYSTEMS and SYSTEMS[name].retrieval]
-    own = [name for name in names if name not in SYSTEMS]
-    for name in names:
-        if name in own:
-            round_, shape = divmod(own.index(name), len(_FREE))
-            looks[name] = Look(name, _OWN[(shape + round_) % len(_OWN)], *_FREE[shape])
-        elif name in retrieving:
-            system, number = SYSTEMS[name], retrieving.index(name)
-            colour = _COLOURS[system.representation] if len(retrieving) > 1 else "#000000"
-            looks[name] = Look(system.display, colour, "*", _LINES[number % len(_LINES)], 2.2)
-        else:
-            looks[name] = _TABLE[name]
-    return looks
+FEW = 4
+"""Up to so many systems, curves have intervals."""
 
 
 class Data:
@@ -113,6 +39,8 @@ class Data:
         conditions: Of all of them, in the order of tables.
         least: The fewest sessions that one of them counts.
         contrasts: The comparisons of the systems that have rows.
+        flips: Share of outcomes that differ between repeats; None without repeats.
+        access: The rows of the table `access`, without the simulator.
     """
 
     def __init__(self, score: Score, simulator: str):
@@ -120,6 +48,11 @@ class Data:
         found = [one for one in score.cells if one.simulator == simulator and one.n]
         self.systems = list(dict.fromkeys(one.system for one in found))
         self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
+        repeats = [row[3:5] for row in score.tables["noise"].rows if row[0] == simulator]
+        pairs, flips = map(sum, zip(*repeats, strict=True)) if repeats else (0, 0)
+        self.flips = flips / pairs if pairs else None
+        access = score.tables.get("access")
+        self.access = [row[1:] for row in access.rows if row[0] == simulator] if access else []
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
         self.looks = looks_of([*self.systems, *bases])
         self.cells: dict[tuple[str, str, str], Cell] = {
@@ -128,7 +61,7 @@ class Data:
         self.absent, self.beside = list[str](), list[str]()
         for one in score.published:
             if one.simulator == simulator and one.system in self.looks:
-                name = f"{one.system}, published"
+                name = f"{one.system}{_PUBLISHED}"
                 names = self.absent if one.system in bases else self.beside
                 names += [name] if name not in names else []
                 look, line = self.looks[one.system], (0, (4, 2)) if one.system in bases else "none"
@@ -169,49 +102,62 @@ class Data:
         return [one.name for one in self.conditions if one.name in found]
 
 
-def dodged(systems: Sequence[str]) -> Iterator[tuple[str, float]]:
-    """Yield systems, each with its shift on the x axis, so that intervals do not overlap."""
-    for place, system in enumerate(systems):
-        yield system, (place - (len(systems) - 1) / 2) * min(0.09, 0.5 / len(systems))
+def shifts(systems: Sequence[str]) -> dict[str, float]:
+    """Return each system's shift on the x axis: where there are intervals, they do not overlap."""
+    step = 0.09 if len(systems) <= FEW else 0.0
+    return {name: (place - (len(systems) - 1) / 2) * step for place, name in enumerate(systems)}
+
+
+def mark(artists: Any, system: str) -> None:
+    """Say of what is drawn which system it is of: pages set one apart by it."""
+    for artist in artists:
+        artist.set_gid(f"system:{system.removesuffix(_PUBLISHED)}")
 
 
 def curve(
     axes: Any, data: Data, system: str, part: str, shift: float, *, bars: bool = True
-) -> list[tuple[float, Look]]:
+) -> dict[str, float]:
     """Draw a system's rates over the conditions, in a part of the episodes or (empty) in all.
 
     Points of incomplete cells are hollow. no-history is joined by a thin line: it is the rate
     without memory, not a smaller k.
 
     Returns:
-        The last rate in percent, and the system's look; nothing without any rate.
+        The system's last rate in percent; nothing without any rate.
     """
     look = data.looks[system]
     found = [c for one in data.conditions if (c := data.cells.get((system, one.name, part)))]
     if not found:
-        return []
+        return {}
     points = [(c.condition, data.x(c.condition) + shift, 100 * c.rate) for c in found]
+    drawn = []
     for kind, group in groupby(points, lambda point: parse_condition(point[0]).kind):
         _, xs, ys = zip(*group, strict=True)
         if kind.counted:
-            axes.plot(xs, ys, linestyle=look.line, color=look.colour, linewidth=look.width)
+            line = {"linestyle": look.line, "linewidth": look.width}
+            drawn += axes.plot(xs, ys, color=look.colour, **line)
     if points[0][0] == NO_HISTORY and look.line != "none":
         if len(points) > 1:
             _, xs, ys = zip(*points[:2], strict=True)
-            axes.plot(xs, ys, ":", color=look.colour, linewidth=0.7)
+            drawn += axes.plot(xs, ys, ":", color=look.colour, linewidth=0.7)
         elif len(data.conditions) > 1:  # without memory: the floor
-            axes.axhline(points[0][2], color=look.colour, linewidth=0.8, linestyle="--", zorder=0)
-    for (_, x, y), cell in zip(points, found, strict=True):
-        if bars:
-            bounds = [100 * bound for bound in cell.interval]
-            axes.plot((x, x), bounds, color=look.colour, linewidth=0.9, alpha=0.7)
-        face = look.colour if cell.complete else "white"
-        # Not clipped: whole at 0 and at 100%.
-        axes.plot(x, y, **look.point, markerfacecolor=face, clip_on=False, zorder=3)
-    return [(points[-1][2], look)]
+            floor = {"linewidth": 0.8, "linestyle": "--", "zorder": 0}
+            drawn.append(axes.axhline(points[0][2], color=look.colour, **floor))
+    if bars:
+        low, high = zip(*([100 * bound for bound in cell.interval] for cell in found), strict=True)
+        xs = [x for _, x, _ in points]
+        drawn.append(axes.vlines(xs, low, high, color=look.colour, linewidth=0.9, alpha=0.7))
+    for whole, face in ((True, look.colour), (False, "white")):
+        chosen = [(x, y) for (_, x, y), c in zip(points, found, strict=True) if c.complete is whole]
+        if chosen:
+            # Not clipped: whole at 0 and at 100%.
+            style = look.point | {"markerfacecolor": face, "linestyle": "none"}
+            drawn += axes.plot(*zip(*chosen, strict=True), **style, clip_on=False, zorder=3)
+    mark(drawn, system)
+    return {system: points[-1][2]}
 
 
-# --- axes, labels and legends ------------------------------------------------------------------
+# --- axes and labels ---------------------------------------------------------------------------
 
 
 def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None:
@@ -244,30 +190,26 @@ def explained(data: Data, systems: Sequence[str], parts: Sequence[str], *notes: 
     return "; ".join([*said, *filter(None, notes)])
 
 
-def legend(figure: Any, looks: Sequence[Look], note: str = "") -> None:
-    """Write a legend at the foot of a figure, under a note."""
-    from matplotlib.lines import Line2D
-
-    if looks or note:
-        widest = 0.7 + 0.066 * max((len(look.label) for look in looks), default=0)
-        figure.legend(
-            [Line2D([], [], linestyle=k.line, linewidth=k.width, **k.point) for k in looks],
-            [look.label for look in looks],
-            title=note or None,
-            title_fontsize=7.5,
-            loc="outside lower center",
-            ncols=max(1, min(len(looks), int(figure.get_figwidth() / widest))),
-            fontsize=8,
-            frameon=False,
-            handlelength=3.2,  # long enough for a line's dashes to be seen
-        )
+def legend(figure: Any, note: str) -> None:
+    """Write a note at the foot of a figure, if there is any."""
+    if note:
+        place = {"loc": "outside lower center", "frameon": False}
+        figure.legend([], [], title=note, title_fontsize=7.5, **place)
 
 
-def label_ends(axes: Any, ends: Sequence[tuple[float, Look]], gap: float) -> None:
-    """Write labels at the right ends of lines, moved apart to at least `gap` on the y axis.
+def label_ends(
+    axes: Any,
+    ends: Mapping[str, float],
+    looks: Mapping[str, Look],
+    height: float,
+    size: float,
+    of: str | None = None,
+) -> None:
+    """Name the systems at the right ends of their lines, moved apart as far as need be.
 
     Each stands behind the system's marker, in ink: not all colours can be read as letters. The
-    axes have their final limits.
+    axes have their final limits, and are about `height` inches high; letters are `size` points.
+    Where the lines are not systems, but all `of` one, they are marked as that one's.
     """
     from matplotlib.transforms import ScaledTranslation
 
@@ -275,25 +217,41 @@ def label_ends(axes: Any, ends: Sequence[tuple[float, Look]], gap: float) -> Non
         scale = axes.figure.dpi_scale_trans
         return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, scale)
 
-    ordered = sorted(ends, key=lambda end: end[0])
-    heights = spread([value for value, _ in ordered], gap)
-    for (value, look), height in zip(ordered, heights, strict=True):
-        axes.annotate(
-            "",
-            (1, value),
-            (1, height),
-            xycoords=beside(0),
-            textcoords=beside(0.16),
-            arrowprops={"arrowstyle": "-", "color": look.colour, "linewidth": 0.5, "shrinkA": 0},
-        )
-        axes.plot(1, height, **look.point, clip_on=False, transform=beside(0.23))
-        axes.text(1, height, look.label, color=INK, size=8, va="center", transform=beside(0.33))
+    top = axes.get_ylim()[1]
+    ordered = sorted(ends.items(), key=lambda end: end[1])
+    gap = min(top * 1.2 * size / 72 / height, top / max(1, len(ordered) - 1))
+    heights = spread([value for _, value in ordered], gap, 0, top)
+    for (system, value), label in zip(ordered, heights, strict=True):
+        look, thin = looks[system], {"color": looks[system].colour, "linewidth": 0.5}
+        arrow = {"arrowstyle": "-", "shrinkA": 0, **thin}
+        drawn = [
+            axes.annotate(
+                "",
+                (1, value),
+                (1, label),
+                xycoords=beside(0),
+                textcoords=beside(0.02 * size),
+                arrowprops=arrow,
+            ),
+            *axes.plot(1, label, **look.point, clip_on=False, transform=beside(0.029 * size)),
+            axes.text(
+                *(1, label, look.label),
+                color=INK,
+                size=size,
+                va="center",
+                transform=beside(0.041 * size),
+            ),
+        ]
+        mark(drawn, of or system)
 
 
-def spread(values: Sequence[float], gap: float) -> list[float]:
+def spread(
+    values: Sequence[float], gap: float, low: float = -math.inf, high: float = math.inf
+) -> list[float]:
     """Return ascending values moved as little as need be to lie at least `gap` apart.
 
-    Those that are too close form a stack around their mean; stacks that meet become one.
+    Those that are too close form a stack around their mean; stacks that meet become one. All lie
+    from `low` to `high`, where there is room for that.
     """
     stacks: list[tuple[float, int]] = []  # mean and size
     for value in values:
@@ -302,4 +260,6 @@ def spread(values: Sequence[float], gap: float) -> list[float]:
             before, count = stacks.pop()
             mean, size = (mean * size + before * count) / (size + count), size + count
         stacks.append((mean, size))
-    return [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
+    found = [mean + gap * (i - (size - 1) / 2) for mean, size in stacks for i in range(size)]
+    last = len(found) - 1
+    return [min(max(v, low + gap * i), high - gap * (last - i)) for i, v in enumerate(found)]

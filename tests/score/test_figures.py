@@ -1,17 +1,23 @@
 """What figures tell beside their points: who is who, what a hollow point means, who is left out."""
 
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import full_grid
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.drawing import open_figure
-from robomme_interference_data.evaluate.score.curves import Data, Look, looks_of
+from robomme_interference_data.evaluate.score.curves import Data, spread
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure
+from robomme_interference_data.evaluate.score.looks import Look, looks_of
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
 from robomme_interference_data.records import Rollout
 
@@ -32,9 +38,10 @@ def explained(figure: Any) -> str:
     return "; ".join(legend.get_title().get_text() for legend in figure.legends)
 
 
-def names(figure: Any) -> list[str]:
-    """Whom the figure's legend names."""
-    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+def names(figure: Any) -> list[set[str]]:
+    """Whom each panel names at the ends of lines."""
+    panels = ({text.get_text() for text in axes.texts} - {""} for axes in figure.axes)
+    return [found for found in panels if found]
 
 
 # --- looks -------------------------------------------------------------------------------------
@@ -89,7 +96,9 @@ def test_a_retrieval_system_stands_beside_its_published_base(tmp_path: Path, fig
     rows = [row for row in made.rows() if row.system == RETRIEVAL]
     shown = data(tmp_path, made.changed(rows, simulator="robomme"), paper=True)
     assert draw_figure("retrieval", figure, shown)
-    assert names(figure) == ["Retrieval-FrameSamp-Modul", "FrameSamp-Modul, published"]
+    retrieval = "Retrieval-FrameSamp-Modul"
+    # The paper tells no rates of families.
+    assert names(figure) == [{retrieval, "FrameSamp-Modul, published"}, {retrieval}, {retrieval}]
     assert not draw_figure("retrieval", figure, data(tmp_path, rows))  # nobody to stand beside
 
 
@@ -124,3 +133,50 @@ def test_only_conditions_of_a_kind_are_joined(tmp_path: Path, figure: Any, fille
     for kind in FIGURES:
         with open_figure() as other:
             draw_figure(kind, other, data(tmp_path, cells(given)))
+
+
+# --- many systems ------------------------------------------------------------------------------
+
+
+def test_twelve_systems_are_named_at_their_values_without_dodge(
+    tmp_path: Path, figure: Any
+) -> None:
+    shown = Data(made.score(full_grid.write(tmp_path / "a.parquet"), draws=50), "robomme")
+    everyone = {shown.looks[system].label for system in shown.systems}
+    places = {shown.x(name) for name in shown.shown(shown.systems)}
+    for kind, panels in (("success", 1), ("families", 9), ("difficulty", 3)):
+        with open_figure() as other:
+            assert draw_figure(kind, other, shown)
+            assert names(other) == [everyone] * panels
+            for axes in other.axes[:panels]:
+                heights = sorted(text.get_position()[1] for text in axes.texts if text.get_text())
+                letter = 6.5 / 72 * axes.get_ylim()[1] / axes.bbox.height * other.dpi
+                assert np.diff(heights).min() > letter
+                assert heights[0] >= 0 and heights[-1] <= axes.get_ylim()[1]
+                points = {x for line in axes.lines for x in line.get_xdata()}
+                assert points - {0, 1} <= places  # floors and labels: 0 and 1 of the width
+
+    # Each row of effects is marked as its system's, and an id occurs once.
+    assert draw_figure("effects", figure, shown)
+    first, *others = figure.axes
+    rows = [label.get_text() for label in first.get_yticklabels()]
+    assert len(rows) == 11 and rows[-1] == "FrameSamp-Modul"  # it falls most
+    titles = [axes.get_title() for axes in (first, *others)]
+    assert titles == ["k0 − none", "k1 − k0", "k3 − k0", "k7 − k0"]
+    marks = [one.get_gid() for one in figure.findobj(lambda one: one.get_gid())]
+    assert len(marks) == len(set(marks)) == 11 * 4 * 2  # an interval and a point
+    assert {gid.split(":")[1] for gid in marks} == {*shown.systems} - {"pi05_baseline"}
+    # 196 √(0.06 / 450) points of noise, assumed.
+    assert "±2.3 points" in explained(figure) and "assumed" in explained(figure)
+
+
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=12).map(sorted), st.floats(0.1, 9))
+def test_labels_keep_their_order_their_distance_and_their_bounds(
+    values: list[float], gap: float
+) -> None:
+    found = spread(values, gap, 0, 100)
+    assert len(found) == len(values)
+    assert all(b - a >= gap - 1e-9 for a, b in pairwise(found))
+    assert found[0] >= -1e-9 and found[-1] <= 100 + 1e-9
+    if all(b - a >= gap for a, b in pairwise(values)):
+        assert found == pytest.approx(values)
