@@ -75,7 +75,9 @@ def open_figure() -> Iterator[Any]:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtraError.needs("drawing", "matplotlib", "score") from error
-    settings = {"svg.hashsalt": MAKER, "image.composite_image": False}
+    settings: dict[str, Any] = {"svg.hashsalt": MAKER, "image.composite_image": False}
+    names = ("text.color", "axes.labelcolor", "xtick.color", "ytick.color")
+    settings |= dict.fromkeys(names, INK)
     settings |= {"svg.fonttype": "none"}  # text stays text: small, quick, to be found and read out
     with (
         matplotlib.style.context("default"),

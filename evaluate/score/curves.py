@@ -211,36 +211,26 @@ def label_ends(
     axes have their final limits, and are about `height` inches high; letters are `size` points.
     Where the lines are not systems, but all `of` one, they are marked as that one's.
     """
+    from matplotlib.patches import ConnectionPatch
     from matplotlib.transforms import ScaledTranslation
 
     def beside(inches: float) -> Any:  # from the right edge, y in data
         scale = axes.figure.dpi_scale_trans
         return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, scale)
 
+    letters = {"color": INK, "size": size, "va": "center"}
     top = axes.get_ylim()[1]
     ordered = sorted(ends.items(), key=lambda end: end[1])
     gap = min(top * 1.2 * size / 72 / height, top / max(1, len(ordered) - 1))
     heights = spread([value for _, value in ordered], gap, 0, top)
     for (system, value), label in zip(ordered, heights, strict=True):
-        look, thin = looks[system], {"color": looks[system].colour, "linewidth": 0.5}
-        arrow = {"arrowstyle": "-", "shrinkA": 0, **thin}
+        look = looks[system]
+        ends_at = {"coordsA": beside(0), "coordsB": beside(0.02 * size)}
+        line = {"color": look.colour, "linewidth": 0.5, "clip_on": False}
         drawn = [
-            axes.annotate(
-                "",
-                (1, value),
-                (1, label),
-                xycoords=beside(0),
-                textcoords=beside(0.02 * size),
-                arrowprops=arrow,
-            ),
+            axes.add_artist(ConnectionPatch((1, value), (1, label), **ends_at, **line)),
             *axes.plot(1, label, **look.point, clip_on=False, transform=beside(0.029 * size)),
-            axes.text(
-                *(1, label, look.label),
-                color=INK,
-                size=size,
-                va="center",
-                transform=beside(0.041 * size),
-            ),
+            axes.text(1, label, look.label, transform=beside(0.041 * size), **letters),
         ]
         mark(drawn, of or system)
 

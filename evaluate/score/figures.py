@@ -190,8 +190,8 @@ def _heatmap(figure: Any, data: Data) -> bool:
     labels = [curves.short(condition) for condition in conditions]
     turned = 90 if max(map(len, labels)) > len("none") else 0
     many = max(5, len(conditions))
-    wide = max(1, min(20 // many, len(data.systems)))
-    rows = -(-len(data.systems) // wide)
+    rows = -(-len(data.systems) // max(1, 25 // many))
+    wide = -(-len(data.systems) // rows)
     figure.set_size_inches(1.3 + 1.65 * wide * many / 5, 0.6 + (0.6 + 0.24 * len(names)) * rows)
     panels = figure.subplots(rows, wide, sharey=True, squeeze=False)
     colours = colormaps["cividis"]  # the same to the colour-blind, and even in grey

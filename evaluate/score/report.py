@@ -1,11 +1,13 @@
 """One self-contained page about a score. It needs no network and no other file."""
 
-import base64
 import json
 import math
 import os
 import platform
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from html import escape
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
@@ -17,18 +19,31 @@ from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.contrasts import START
 from robomme_interference_data.evaluate.score.cube import STATUSES, success
+from robomme_interference_data.evaluate.score.curves import FEW
 from robomme_interference_data.evaluate.score.figures import FIGURES
 from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.files import sha256_file, write_text
 from robomme_interference_data.rows import to_dict
+from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import fill
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
+
+_N = re.compile(r" n=([0-9]+)")
+
+_SHOWN_IN = {
+    **{"effects": ("lift", "effects"), "success": ("main", "paper"), "families": ("family",)},
+    **{"difficulty": ("difficulty",), "retention": ("lift",), "heatmap": ("family",)},
+    **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
+    **{"access": ("access",), "ceiling": ("ceiling",)},
+}
+"""Figure to the tables that have its numbers."""
 
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
@@ -54,11 +69,15 @@ def write_report(
     conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
     values = {
         "headlines": {simulator: headline(score, simulator) for simulator in score.cubes},
-        "grids": score.grids,
+        "grids": [_with_one_n(grid) for grid in score.grids],
         "tables": score.tables.values(),
-        "display_name": display_name,
-        "figures": {name: _data(path) for name, path in figures.items()},
+        "systems": _names(score),
+        "known": {name: system.display for name, system in SYSTEMS.items()},
+        "leader": _leader(score),
+        "figures": _inline(figures),
         "titles": FIGURES,
+        "shown_in": _SHOWN_IN,
+        "number": _number,
         "conditions": conditions,
         "episodes": _episodes(score, conditions, out.parent),
         "sources": {str(path): _source(path, run) for path, run in score.rows.sources.items()},
@@ -68,8 +87,50 @@ def write_report(
     write_text(out, html)
 
 
-def _data(path: Path) -> str:
-    return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
+def _with_one_n(grid: Table) -> Table:
+    """Return a grid of which each cell has the same n with that in the note alone."""
+    found = {match[1] for row in grid.rows for text in row[1:] if (match := _N.search(text))}
+    if len(found) != 1:
+        return grid
+    rows = [(row[0], *(_N.sub("", text) for text in row[1:])) for row in grid.rows]
+    return replace(grid, rows=tuple(rows), note=f"n = {found.pop()} in each cell. {grid.note}")
+
+
+def _number(text: str) -> str:
+    """Return what a cell of a grid is sorted by; empty without any rate."""
+    found = re.match(r"\**([0-9.]+)%", text)
+    return found[1] if found else ""
+
+
+def _leader(score: Score) -> str:
+    """Return the system that figures set apart at first; none of few."""
+    best = [c.system for c in score.cells if c.rank == 1 and not c.part and c.condition == START]
+    return best[0] if best and max(len(cube.systems) for cube in score.cubes.values()) > FEW else ""
+
+
+def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
+    """Return SVG as parts of one page: ids are their own, and what is drawn tells its system."""
+    found = {}
+    for number, (name, path) in enumerate(figures.items()):
+        kind, _, simulator = name.partition("-")
+        found[name] = _part(
+            path.read_text(encoding="utf-8"), number, f"{FIGURES[kind]}, {simulator}"
+        )
+    return found
+
+
+def _part(text: str, number: int, title: str) -> str:
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
+    text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
+    return text.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
+
+
+def _names(score: Score) -> dict[str, str]:
+    """Return what the systems that have rows are called."""
+    systems = {one: None for cube in score.cubes.values() for one in cube.systems}
+    return {system: display_name(system) for system in systems}
 
 
 # --- single episodes ---------------------------------------------------------------------------
@@ -78,9 +139,9 @@ def _data(path: Path) -> str:
 def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     """Return what came of each episode as JSON that is safe inside a script element.
 
-    A row for each system and episode: simulator, system, family, the rest of the id, difficulty,
-    the outcome under each condition, where it flips, and the address of a video, from the page's
-    folder, under each.
+    `names` has what systems are called; `rows` a row for each system and episode: simulator,
+    system, family, the rest of the id, difficulty, the outcome under each condition, where it
+    flips, and the address of a video, from the page's folder, under each.
     """
     videos = _videos(score.rows)
     rows = []
@@ -93,14 +154,15 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                 came = dict(zip(cube.conditions, counts[number], strict=True))
                 found = [videos.get((cube.simulator, system, c, str(episode))) for c in conditions]
                 row = (
-                    *(cube.simulator, display_name(system), episode.family),
+                    *(cube.simulator, system, episode.family),
                     *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
                     [_outcome(came[c]) if c in came else "" for c in conditions],
                     flips(cube.conditions, rates[number]),
                     [_address(one, folder) if one else "" for one in found],
                 )
                 rows.append(row)
-    text = json.dumps(rows, ensure_ascii=False, separators=(",", ":"))
+    found = {"names": _names(score), "rows": rows}
+    text = json.dumps(found, ensure_ascii=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
 

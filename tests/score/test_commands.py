@@ -59,7 +59,7 @@ def test_score_and_export_on_the_command_line(
     beyond |= {"equivalence"}  # nobody asked for it
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
-    kinds = ("difficulty", "families", "heatmap", "retrieval", "success")
+    kinds = ("difficulty", "effects", "families", "heatmap", "retrieval", "success")
     assert drawn == [f"{kind}-robomme.svg" for kind in kinds]
     # The released rows come back byte for byte.
     (exported,) = (tmp_path / "export").iterdir()
@@ -135,7 +135,7 @@ def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
         folder.mkdir(parents=True, exist_ok=True)
         names = [f"success-{simulator}" for simulator in score.cubes]
         for name in names:
-            (folder / f"{name}.svg").write_text(MAKER)
+            (folder / f"{name}.svg").write_text(f"<svg>{MAKER}</svg>")
             if png:
                 (folder / f"{name}.png").touch()
         return {name: folder / f"{name}.svg" for name in names}

@@ -6,13 +6,14 @@ import platform
 import re
 from dataclasses import replace
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support import scoring as made
 from support.browser import open_page
-from support.scoring import BASE, OWN, cells
+from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.drawing import open_figure, save_figure
 from robomme_interference_data.evaluate.log import Start
@@ -71,7 +72,7 @@ def episodes(found: Score, folder: Path) -> list[list[Any]]:
     write_report(found, {}, folder / "page.html")
     text = (folder / "page.html").read_text(encoding="utf-8")
     (data,) = re.findall(r'id="episode-data">(.*?)</script>', text, re.DOTALL)
-    return list(json.loads(data))
+    return list(json.loads(data)["rows"])
 
 
 def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
@@ -91,8 +92,10 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         shown = texts("#grid-tabletop tbody :is(th, td)")
         assert shown == [cell.replace("**", "") for row in small.grids[0].rows for cell in row]
         assert shown[1] == "8.3% [1.5, 35.4] n=12"
-        images = "[...document.images].map(i => i.complete && i.naturalWidth > 100)"
-        assert page.run(images) == [True] * 6
+        pictures = "[...document.querySelectorAll('.picture svg')].map(p => p.clientWidth > 600)"
+        assert page.run(pictures) == [True] * 7
+        ids = "[...document.querySelectorAll('[id]')].map(e => e.id)"
+        assert len(set(page.run(ids))) == len(page.run(ids))
 
         # Sorting by the rate: a click upwards, another downwards; a number, not a text.
         rates, head = "#table-main tbody td:nth-child(5)", "#table-main th:nth-child(5)"
@@ -110,6 +113,22 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert texts("#table-family tbody td:nth-child(2)") == ["Retrieval-FrameSamp-Modul"] * 2
         assert texts("#table-family tbody td:nth-child(4)") == ["InsertPeg"] * 2
         assert texts("#table-family .count") == ["2 of 18 rows"]
+        # An id of the CSVs finds what its name finds; a system and a condition can be chosen.
+        page.run("document.querySelector('#table-family input').value = ''")
+        page.type("#table-family input", RETRIEVAL)
+        assert texts("#table-family .count") == ["4 of 18 rows"]
+        page.choose("#table-lift select[name=system]", BASE)
+        page.choose("#table-lift select[name=condition]", "k7")
+        assert texts("#table-lift tbody td:nth-child(2)") == ["FrameSamp-Modul"]
+
+        # The table of a figure is a link away, and one system is set apart from the others.
+        assert texts("#figure-success-tabletop figcaption a") == ["Success by system and condition"]
+        page.run("document.querySelector('#highlight').value = 'my-memory'")
+        page.run("document.querySelector('#highlight').dispatchEvent(new Event('change'))")
+        apart = (
+            "[...document.querySelectorAll('[data-system]:not(.dim)')].map(e => e.dataset.system)"
+        )
+        assert set(page.run(apart)) == {OWN}
 
         # Every episode; then only those that flip; then of one system.
         rows = "#table-episodes tbody tr"
@@ -135,6 +154,46 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         page.call("Emulation.setDeviceMetricsOverride", **size)
         assert page.run("document.documentElement.scrollWidth") == 400
         assert page.complaints() == []
+
+
+def test_the_report_can_be_used_by_keyboard_and_read_aloud_and_printed(report: Path) -> None:
+    with open_page() as page:
+        page.open(report)
+        unnamed = """[...document.querySelectorAll('input, select, svg, [role], nav, button, th')]
+            .filter(e => !(e.labels?.length || e.getAttribute('aria-label') || e.textContent.trim()
+                           || e.getAttribute('role') === 'status'))
+            .map(e => e.outerHTML.slice(0, 200))"""
+        assert page.run(unnamed) == []
+        # What scrolls can be reached, and headings skip no level.
+        scrolling = "[...document.querySelectorAll('.wide, .picture')].map(e => e.tabIndex)"
+        assert set(page.run(scrolling)) == {0}
+        levels = page.run("[...document.querySelectorAll('h1,h2,h3')].map(e => +e.tagName[1])")
+        assert levels[0] == 1 and levels.count(1) == 1
+        assert all(after - before <= 1 for before, after in pairwise(levels))
+        # Letters stand out from their ground by WCAG's 4.5, on a light page and on a dark one.
+        contrast = """(() => {
+            const light = c => { const v = c.match(/[0-9.]+/g).slice(0, 3).map(x => x / 255)
+                .map(x => x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+                return 0.2126 * v[0] + 0.7152 * v[1] + 0.0722 * v[2]; };
+            const ground = e => { const c = getComputedStyle(e).backgroundColor;
+                return c === 'rgba(0, 0, 0, 0)' && e.parentElement ? ground(e.parentElement) : c; };
+            const letters = document.querySelectorAll('p, a, th, td, .o, .note, dt');
+            return Math.min(...[...letters].map(e => {
+                const a = light(getComputedStyle(e).color), b = light(ground(e));
+                return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05); })); })()"""
+        for scheme in ("light", "dark"):
+            media = [{"name": "prefers-color-scheme", "value": scheme}]
+            page.call("Emulation.setEmulatedMedia", features=media)
+            assert page.run(contrast) >= 4.5
+        # The keyboard sorts.
+        page.run("document.querySelector('#table-main thead button').focus()")
+        for kind in ("keyDown", "keyUp"):
+            page.call("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", text="\r")
+        assert page.run("document.querySelector('#table-main th').ariaSort") == "ascending"
+        # On paper nothing is cut off, and controls are gone.
+        page.call("Emulation.setEmulatedMedia", media="print")
+        assert page.run("getComputedStyle(document.querySelector('.filters')).display") == "none"
+        assert page.run("getComputedStyle(document.querySelector('.wide')).overflow") == "visible"
 
 
 def test_the_report_says_how_it_was_made(report: Path, run: Path) -> None:
@@ -164,7 +223,8 @@ def test_the_report_and_figures_are_the_same_bytes_each_time(
     folder = report.parent / "figures"
     suffixes = (".png", ".svg")
     # Rows of the paper's conditions have no figures of others.
-    names = [f"{kind}-tabletop" for kind in FIGURES if kind not in ("kinds", "interference")]
+    beyond = ("kinds", "interference", "access", "ceiling")
+    names = [f"{kind}-tabletop" for kind in FIGURES if kind not in beyond]
     assert {p.name for p in folder.iterdir()} == {n + s for n in names for s in suffixes}
     again = {name: folder / f"{name}.svg" for name in names}
     write_report(small, again, report.parent / "again.html")
@@ -184,7 +244,7 @@ def test_episodes_show_every_outcome(tmp_path: Path) -> None:
     found = episodes(made.score(made.write_csv(tmp_path / "a.csv", rows)), tmp_path)
     assert len(found) == 36
     assert found[0] == [
-        *("tabletop", "FrameSamp-Modul", "MoveCube", "test/0", "easy"),
+        *("tabletop", BASE, "MoveCube", "test/0", "easy"),
         ["success", "1/2", "success", "success", "success"],
         "k1 gained",
         [""] * 5,

@@ -76,6 +76,13 @@ class Page:
         self.click(selector)
         self.call("Input.insertText", text=text)
 
+    def choose(self, selector: str, value: str) -> None:
+        """Choose an option of the first list that a selector finds."""
+        self.run(
+            f"{{ const e = document.querySelector({json.dumps(selector)});"
+            f"e.value = {json.dumps(value)}; e.dispatchEvent(new Event('change')); }}"
+        )
+
     def complaints(self) -> list[str]:
         """What went wrong in the page so far: exceptions, and errors on its console."""
         bad = ("Runtime.exceptionThrown", "Log.entryAdded")
