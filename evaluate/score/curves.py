@@ -16,6 +16,7 @@ from robomme_interference_data.conditions import (
 from robomme_interference_data.drawing import INK, tidy
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.looks import Look, looks_of
+from robomme_interference_data.evaluate.score.paper import by_family
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 
@@ -59,14 +60,14 @@ class Data:
             (one.system, one.condition, one.part): one for one in found
         }
         self.absent, self.beside = list[str](), list[str]()
-        for one in score.published:
+        for one in (*score.published, *(by_family() if score.published else ())):
             if one.simulator == simulator and one.system in self.looks:
                 name = f"{one.system}{_PUBLISHED}"
                 names = self.absent if one.system in bases else self.beside
                 names += [name] if name not in names else []
                 look, line = self.looks[one.system], (0, (4, 2)) if one.system in bases else "none"
                 self.looks[name] = Look(f"{look.label}, published", look.colour, "_", line, 1.2)
-                self.cells[name, one.condition, ""] = one
+                self.cells[name, one.condition, one.part] = one
         conditions = {condition for _, condition, _ in self.cells}
         self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
         self.least = min((one.k for one in self.conditions if one.kind.counted), default=0)
@@ -93,8 +94,13 @@ class Data:
         return 0.3 + 1.3 * len(plain) + math.log2((one.k + 1) / (self.least + 1))
 
     def parts(self, names: Sequence[str]) -> list[str]:
-        """Return those of some parts that any cell is of."""
-        return [name for name in names if any(part == name for _, _, part in self.cells)]
+        """Return those of some parts that any cell with rows is of."""
+        own = {part for system, _, part in self.cells if system in self.systems}
+        return [name for name in names if name in own]
+
+    def has_parts(self, system: str) -> bool:
+        """Whether any cell of a system is of a part of the episodes."""
+        return any(name == system and part for name, _, part in self.cells)
 
     def shown(self, systems: Sequence[str]) -> list[str]:
         """Return the conditions that any cell of some systems is of."""

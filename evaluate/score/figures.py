@@ -124,7 +124,9 @@ def _success(figure: Any, data: Data) -> bool:
 
 def _families(figure: Any, data: Data) -> bool:
     panels = {part: (data, part) for part in data.parts(FAMILIES)}
-    return _panels(figure, data, panels, data.systems)
+    few = len(data.systems) <= FEW
+    published = [name for name in (*data.absent, *data.beside) if few and data.has_parts(name)]
+    return _panels(figure, data, panels, [*data.systems, *published])
 
 
 def _difficulty(figure: Any, data: Data) -> bool:

@@ -95,7 +95,7 @@ def _forest(
     ranked = sorted(
         systems, key=lambda s: -leading[s].pairs.change.value if s in leading else math.inf
     )
-    figure.set_size_inches(10, 1.5 + 0.27 * len(ranked))
+    figure.set_size_inches(10, 1.5 + 0.27 * max(3, len(ranked)))
     panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
     for axes, (name, group) in zip(panels, found.items(), strict=True):
         if band:

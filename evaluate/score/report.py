@@ -38,8 +38,13 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 _N = re.compile(r" n=([0-9]+)")
 
 _SHOWN_IN = {
-    **{"effects": ("lift", "effects"), "success": ("main", "paper"), "families": ("family",)},
-    **{"difficulty": ("difficulty",), "retention": ("lift",), "heatmap": ("family",)},
+    **{
+        "effects": ("lift", "effects"),
+        "success": ("main", "paper"),
+        "families": ("family", "paper_family"),
+    },
+    **{"difficulty": ("difficulty",), "heatmap": ("family",)},
+    **{"families": ("family", "paper_family")},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
     **{"access": ("access",), "ceiling": ("ceiling",)},
 }

@@ -32,7 +32,7 @@ from robomme_interference_data.templates import load_jinja2
 TABLES = (
     *("main", "systems", "ranks", "family", "difficulty", "lift", "effects", "interaction"),
     *("equivalence", "interference", "access", "ceiling", "decay", "noise", "families"),
-    *("family_effects", "matrix", "coverage", "paper"),
+    *("family_effects", "matrix", "coverage", "paper", "paper_family"),
 )
 """Every table that a score may have."""
 
@@ -137,7 +137,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     if published:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
         whole = cells.cells_of(cubes_of(rows, Grid.BENCHMARK).values())
-        tables.append(paper.paper_table(whole))
+        tables += [paper.paper_table(whole), paper.paper_family_table(whole)]
         notes += paper.not_compared(whole)
     return Score(
         settings,

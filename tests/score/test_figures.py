@@ -97,8 +97,10 @@ def test_a_retrieval_system_stands_beside_its_published_base(tmp_path: Path, fig
     shown = data(tmp_path, made.changed(rows, simulator="robomme"), paper=True)
     assert draw_figure("retrieval", figure, shown)
     retrieval = "Retrieval-FrameSamp-Modul"
-    # The paper tells no rates of families.
-    assert names(figure) == [{retrieval, "FrameSamp-Modul, published"}, {retrieval}, {retrieval}]
+    assert names(figure) == [{retrieval, "FrameSamp-Modul, published"}] * 3
+    with open_figure() as other:  # the paper's own figure: family by family
+        assert draw_figure("families", other, shown)
+        assert names(other) == [{retrieval, "FrameSamp-Modul, published"}] * 2
     assert not draw_figure("retrieval", figure, data(tmp_path, rows))  # nobody to stand beside
 
 

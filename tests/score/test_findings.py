@@ -11,7 +11,7 @@ from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.compare import compare
 from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.paper import published
+from robomme_interference_data.evaluate.score.paper import by_family, differing, published
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.stats import newcombe, wilson
@@ -163,6 +163,36 @@ def test_published_rates_are_the_papers() -> None:
     assert best["k0"] == [BASE, RETRIEVAL]  # 45.3% and 44.9%, then 35.3% with p = 0.002
 
 
+def test_rates_by_family_are_used_where_they_add_up_to_the_published_ones() -> None:
+    known = {(one.system, one.condition): 450 * one.rate for one in published()}
+    found: dict[tuple[str, str], list[float]] = {}
+    for one in by_family():
+        assert one.n == 50 and one.complete and one.simulator == "robomme"
+        found.setdefault((one.system, one.condition), []).append(50 * one.rate)
+    assert len(found) == 21 and {len(counts) for counts in found.values()} == {9}
+    assert all(sum(counts) == pytest.approx(known[key]) for key, counts in found.items())
+    # Without distractors none differs, and of FrameSamp-Modul none at all.
+    apart = differing()
+    assert len(apart) == 20 and not {*apart} & {*found}
+    assert {condition for _, condition in apart} == {"k1", "k3", "k7"}
+    modul = [(BASE, condition) for condition in (NO_HISTORY, "k0", "k1", "k3", "k7")]
+    assert {*modul, ("pi05_baseline", NO_HISTORY)} <= {*found}
+    own = [one for one in by_family() if (one.system, one.part) == (BASE, "MoveCube")]
+    cube = {one.condition: round(50 * one.rate) for one in own}
+    assert cube == {NO_HISTORY: 18, "k0": 43, "k1": 33, "k3": 25, "k7": 16}
+
+
+def test_where_paper_and_repository_differ_is_told(tmp_path: Path) -> None:
+    system = "perceptual-tokendrop-modul"
+    rows = made.changed(cells({(system, "k0"): "sf", (system, "k7"): "ff"}), simulator="robomme")
+    found = made.score(made.write_csv(tmp_path / "a.csv", rows), paper=True)
+    table = found.tables["paper_family"]
+    assert table.note.endswith("They do not under: TokenDrop-Modul k1, k3, k7.")
+    (own,) = table.records()
+    assert (own["condition"], own["family"], own["n"]) == ("k0", "MoveCube", 2)
+    assert own["difference"] == own["rate"] - own["published_rate"] and not own["complete"]
+
+
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
 def test_published_rates_are_in_the_papers_source() -> None:
     lines = PAPER.read_text(encoding="utf-8").splitlines()
@@ -200,6 +230,8 @@ def test_the_released_rows_give_the_published_numbers() -> None:
     assert [cell["successes"] for cell in cells] == [26, 28, 25, 30]
     ours = made.records(found, "paper", published_system=RETRIEVAL)
     assert {one["difference"] for one in ours} == {0.0}
+    cube = made.records(found, "paper_family", family="MoveCube", condition="k7")
+    assert [(one["n"], one["rate"], one["published_rate"]) for one in cube] == [(50, 0.86, 0.32)]
     assert headline(found, "robomme") == (
         "Retrieval-FrameSamp-Modul succeeds in 44.9% of 450 episodes when the history holds the "
         "lesson alone (k0, 95% interval 40.4 to 49.5), and in 44.9% with 7 distractor sessions "
