@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from textwrap import wrap
 from typing import Any, Literal, Self, cast
 
 import pyarrow as pa
@@ -101,6 +102,20 @@ class Table:
         cells = ([cell.replace("|", "\\|") for cell in self.cells(row)] for row in self.rows)
         return "\n".join(f"| {' | '.join(line)} |" for line in [heads, rule, *cells])
 
+    def latex(self) -> str:
+        """Return the table as LaTeX, for the package booktabs; title and note are comments."""
+        sides = ["l" if column.kind in ("text", "flag") else "r" for column in self.columns]
+        heads = [column.name.replace("_", " ") for column in self.columns]
+        head, *lines = (
+            " & ".join(map(_tex, line)) for line in [heads, *map(self.cells, self.rows)]
+        )
+        body = "".join(f"{line} \\\\\n" for line in lines)
+        note = "".join(f"% {line}\n" for line in wrap(self.note, 96))
+        return (
+            f"% {self.title}\n\\begin{{tabular}}{{{''.join(sides)}}}\n\\toprule\n{head} \\\\\n"
+            f"\\midrule\n{body}\\bottomrule\n\\end{{tabular}}\n{note}"
+        )
+
     def html(self) -> str:
         """Return the table as HTML, under its title."""
         sides = ["left" if column.kind in ("text", "flag") else "right" for column in self.columns]
@@ -129,6 +144,22 @@ class Table:
         ]
         text = "\n".join([laid[0], "  ".join("-" * width for width in widths), *laid[1:]])
         return visible("\n\n".join(part for part in (self.title, text, self.note) if part))
+
+
+_TEX = {one: f"\\{one}" for one in "&%$#_{}"}
+_TEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_TEX |= {"−": "$-$", "–": "--", "<": "$<$", ">": "$>$", "×": r"$\times$", "π": r"$\pi$"}
+_TEX |= {"†": r"\textdagger{}", "±": r"$\pm$", "₂": "$_2$"}
+
+
+def _tex(text: str) -> str:
+    """Return a cell as LaTeX; what stands between `**` is bold."""
+    plain, *bold = text.split("**")
+    told = "".join(_TEX.get(one, one) for one in plain)
+    if not bold:
+        return told
+    inner, *rest = bold
+    return f"{told}\\textbf{{{_tex(inner)}}}{_tex('**'.join(rest))}"
 
 
 def percent(value: float) -> str:

@@ -74,7 +74,7 @@ def write_report(
     conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
     values = {
         "headlines": {simulator: headline(score, simulator) for simulator in score.cubes},
-        "grids": [_with_one_n(grid) for grid in score.grids],
+        "grids": [with_one_n(grid) for grid in score.grids],
         "tables": score.tables.values(),
         "systems": _names(score),
         "known": {name: system.display for name, system in SYSTEMS.items()},
@@ -92,7 +92,7 @@ def write_report(
     write_text(out, html)
 
 
-def _with_one_n(grid: Table) -> Table:
+def with_one_n(grid: Table) -> Table:
     """Return a grid of which each cell has the same n with that in the note alone."""
     found = {match[1] for row in grid.rows for text in row[1:] if (match := _N.search(text))}
     if len(found) != 1:
@@ -227,14 +227,19 @@ def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
     return facts
 
 
+def versions() -> str:
+    """Return what a score is computed with, in its versions."""
+    libraries = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
+    return ", ".join([f"Python {platform.python_version()}", *libraries])
+
+
 def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
     rows, settings = score.rows, score.settings
-    libraries = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
     call = {"command": command} if command else {"call": f"score({settings}, draws={score.draws})"}
     seeds = rows.names("model_seed")
     told = {
         **call,
-        "scored with": ", ".join([f"Python {platform.python_version()}", *libraries]),
+        "scored with": versions(),
         "rows": f"{len(rows):,}",
         "episodes of a complete cell": _GRIDS[settings.grid],
         "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",

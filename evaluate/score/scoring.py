@@ -36,6 +36,8 @@ TABLES = (
 )
 """Every table that a score may have."""
 
+_SUFFIXES = (".csv", ".md", ".tex")
+
 
 @dataclass(frozen=True)
 class Score:
@@ -180,7 +182,7 @@ def write_score(
 
     Args:
         score: What is written.
-        out: Folder for `tables/`, `figures/` and `report.html`.
+        out: Folder for `tables/`, `figures/`, `methods.md`, `methods.bib` and `report.html`.
         export_to: Folder for the rows in the released layout (see `export`); None writes none.
         command: The command line that made the score, for the report.
         png: Whether figures are written as PNG, too, not as SVG alone.
@@ -194,18 +196,22 @@ def write_score(
         InvalidOptionError: The released layout cannot hold the rows (see `export`).
     """
     from robomme_interference_data.drawing import MAKER, open_figure
-    from robomme_interference_data.evaluate.score import export, figures, report
+    from robomme_interference_data.evaluate.score import export, figures, methods, report
 
     with open_figure():
         load_jinja2("the report")
     exported = [] if export_to is None else export.export(score.rows, export_to)
     texts = {f"{name}.csv": table.csv() for name, table in score.tables.items()}
     texts |= {f"{name}.md": table.markdown() for name, table in score.tables.items()}
+    texts |= {f"{name}.tex": table.latex() for name, table in score.tables.items()}
     texts["main.md"] = "\n".join(grid.markdown() for grid in score.grids)
+    texts["main.tex"] = "\n".join(report.with_one_n(grid).latex() for grid in score.grids)
     for name, text in texts.items():
         write_text(out / "tables" / name, text)
+    for suffix, text in zip((".md", ".bib"), methods.methods(score), strict=True):
+        write_text(out / f"methods{suffix}", text)
     drawn = figures.draw_figures(score, out / "figures", png=png, executor=executor)
-    for name in {f"{table}{suffix}" for table in TABLES for suffix in (".csv", ".md")} - {*texts}:
+    for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - {*texts}:
         (out / "tables" / name).unlink(missing_ok=True)
     for kind in figures.FIGURES:
         for drawing in (out / "figures").glob(f"{kind}-*.svg"):
