@@ -19,6 +19,7 @@ from robomme_interference_data.evaluate.score.looks import Look, looks_of
 from robomme_interference_data.evaluate.score.paper import by_family
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.significance import SURE
 
 _PUBLISHED = ", published"
 
@@ -41,6 +42,7 @@ class Data:
         least: The fewest sessions that one of them counts.
         contrasts: The comparisons of the systems that have rows.
         flips: Share of outcomes that differ between repeats; None without repeats.
+        apart: Condition and two systems that can be told apart under it.
         access: The rows of the table `access`, without the simulator.
     """
 
@@ -52,6 +54,11 @@ class Data:
         repeats = [row[3:5] for row in score.tables["noise"].rows if row[0] == simulator]
         pairs, flips = map(sum, zip(*repeats, strict=True)) if repeats else (0, 0)
         self.flips = flips / pairs if pairs else None
+        self.apart = {
+            (one["condition"], frozenset((one["system"], one["against_system"])))
+            for one in (score.tables["matrix"].records() if "matrix" in score.tables else ())
+            if one["simulator"] == simulator and one["p_holm"] < SURE
+        }
         access = score.tables.get("access")
         self.access = [row[1:] for row in access.rows if row[0] == simulator] if access else []
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -17,6 +17,7 @@ from robomme_interference_data.evaluate.score.curves import FEW, Data, curve, ex
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.execution import Executor, Serial, Worker
+from robomme_interference_data.significance import SURE
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
 _ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
@@ -36,6 +37,7 @@ FIGURES = {
     "interference": "What kind of interference hurts",
     "access": "Success where all, some or none of the evidence was kept",
     "ceiling": "Gap to the ideal observer with the same memory",
+    "matrix": "Which systems can be told apart",
 }
 """Name to what a figure shows."""
 
@@ -85,7 +87,7 @@ def draw_figure(kind: str, figure: Any, data: Data) -> bool:
     """Draw one of `FIGURES`, and tell whether there is data for it."""
     drawers = (
         *(forests.effects, _success, _families, _difficulty, forests.retention, _heatmap),
-        *(_retrieval, _kinds, forests.interference, forests.access, forests.ceiling),
+        *(_retrieval, _kinds, forests.interference, forests.access, forests.ceiling, _matrix),
     )
     shown = data if kind in _ALL_KINDS else data.of(_PAPER)
     figure.set_layout_engine("constrained")
@@ -216,4 +218,45 @@ def _heatmap(figure: Any, data: Data) -> bool:
     for axes in panels.flat[len(data.systems) :]:
         axes.set_axis_off()
     figure.suptitle(f"Success in %, {data.simulator}", size=9, color=INK)
+    return True
+
+
+def _matrix(figure: Any, data: Data) -> bool:
+    """Draw all pairs of systems at k0 and at the most sessions: the row's rate − the column's."""
+    pairs = [one for one in data.contrasts if one.table == "matrix"]
+    last = max((parse_condition(one.condition).k for one in pairs), default=0)
+    shown = [c.name for c in data.conditions if c.kind.counted and c.k in (0, last)]
+    panels = {name: found for name in shown if (found := [p for p in pairs if p.condition == name])}
+    if not panels:
+        return False
+    many = max(len({one.system for one in found}) for found in panels.values()) + 1
+    figure.set_size_inches(1.6 + 5.2 * len(panels), 2.1 + 0.3 * many)
+    widest = 100 * max(abs(one.pairs.change.value) for one in pairs)
+    for axes, (condition, found) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+    ):
+        changes = {(one.system, one.against[0]): 100 * one.pairs.change.value for one in found}
+        changes |= {(other, one): -change for (one, other), change in changes.items()}
+        systems = sorted(
+            {one for one, _ in changes}, key=lambda s: -data.cells[s, condition, ""].rate
+        )
+        values = np.full((len(systems), len(systems)), np.nan)
+        for y, x in combinations(range(len(systems)), 2):
+            row, column = systems[x], systems[y]
+            apart = (condition, frozenset((row, column))) in data.apart
+            change = changes[column, row]
+            if apart:
+                values[y, x] = change
+            look = {"weight": "bold", "color": "black"} if apart else {"color": INK}
+            look |= {"ha": "center", "va": "center", "in_layout": False}
+            axes.text(x, y, f"{change:.0f}".replace("-", "−"), size=7, **look)
+        axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
+        labels = [data.looks[system].label for system in systems]
+        axes.set_xticks(range(len(systems)), labels, size=7, rotation=90)
+        axes.set_yticks(range(len(systems)), labels, size=7)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        axes.set_title(condition, size=9, color=INK)
+    figure.suptitle(f"Row − column, points, {data.simulator}", size=10, color=INK)
+    legend(figure, f"filled and bold: told apart, p < {SURE} after Holm's correction; else not")
     return True

@@ -46,7 +46,7 @@ _SHOWN_IN = {
     **{"difficulty": ("difficulty",), "heatmap": ("family",)},
     **{"families": ("family", "paper_family")},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
-    **{"access": ("access",), "ceiling": ("ceiling",)},
+    **{"access": ("access",), "ceiling": ("ceiling",), "matrix": ("matrix", "systems", "ranks")},
 }
 """Figure to the tables that have its numbers."""
 
@@ -128,6 +128,7 @@ def _part(text: str, number: int, title: str) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
+    text = re.sub(r' id="image[0-9a-f]+"', "", text)  # equal images share one
     text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
     return text.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
 

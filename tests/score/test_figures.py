@@ -171,6 +171,26 @@ def test_twelve_systems_are_named_at_their_values_without_dodge(
     # 196 √(0.06 / 450) points of noise, assumed.
     assert "±2.3 points" in explained(figure) and "assumed" in explained(figure)
 
+    # All pairs of the eleven at k0 and at k7, best first; filled are those that can be told apart.
+    with open_figure() as other:
+        assert draw_figure("matrix", other, shown)
+        for axes, condition in zip(other.axes, ("k0", "k7"), strict=True):
+            told = {one for name, one in shown.apart if name == condition}
+            assert axes.get_title() == condition and len(axes.texts) == 11 * 10 / 2
+            assert sum(text.get_weight() == "bold" for text in axes.texts) == len(told) > 0
+            assert (~np.isnan(axes.images[0].get_array().filled(np.nan))).sum() == len(told)
+        best = [axes.get_yticklabels()[0].get_text() for axes in other.axes]
+        assert best == ["FrameSamp-Modul", "GroundSG"]
+
+    # Of FrameSamp's systems it is known what was kept: at k0 all of it.
+    with open_figure() as other:
+        assert draw_figure("access", other, shown)
+        labels = {"all kept", "some kept", "none kept"}
+        assert names(other) == [labels] * 3
+        lines = [line for line in other.axes[0].lines if len(line.get_xdata()) > 1]
+        assert lines[0].get_ydata()[0] == pytest.approx(100 * 204 / 450)
+        assert len(lines[0].get_xdata()) == 4
+
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=12).map(sorted), st.floats(0.1, 9))
 def test_labels_keep_their_order_their_distance_and_their_bounds(

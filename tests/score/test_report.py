@@ -93,7 +93,7 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         assert shown == [cell.replace("**", "") for row in small.grids[0].rows for cell in row]
         assert shown[1] == "8.3% [1.5, 35.4] n=12"
         pictures = "[...document.querySelectorAll('.picture svg')].map(p => p.clientWidth > 600)"
-        assert page.run(pictures) == [True] * 7
+        assert page.run(pictures) == [True] * 8
         ids = "[...document.querySelectorAll('[id]')].map(e => e.id)"
         assert len(set(page.run(ids))) == len(page.run(ids))
 
