@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from robomme_interference_data.evaluate.score.rows import Rows
 
 
-_MANY = 4
-"""From more systems on, figures are drawn in two processes."""
-
-
 @with_settings
 def score(
     settings: Settings,
@@ -50,17 +46,13 @@ def score(
     from robomme_interference_data.evaluate.score.headline import headline
     from robomme_interference_data.evaluate.score.scoring import score as compute
     from robomme_interference_data.evaluate.score.scoring import write_score
-    from robomme_interference_data.execution import Processes, Serial
     from robomme_interference_data.work_progress import WorkProgress
 
     check_output(out, export_to)
     found = compute(settings)
     _tell([found.rows], found.notes)
     with WorkProgress() as progress, progress.status("Drawing the figures"):
-        # A second process costs a second to start.
-        many = sum(len(cube.systems) for cube in found.cubes.values()) > _MANY
-        who = Processes(2) if many else Serial()
-        exported = write_score(found, out, export_to, command_line(), png=png, executor=who)
+        exported = write_score(found, out, export_to, command_line(), png=png)
     for path in exported:
         say(f"{path} written")
     if as_json:

@@ -1,7 +1,6 @@
 """Figures of a score, one set for each simulator."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations, product
 from pathlib import Path
 from textwrap import fill
@@ -16,7 +15,6 @@ from robomme_interference_data.evaluate.score import curves, forests
 from robomme_interference_data.evaluate.score.curves import FEW, Data, curve, explained, legend
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
-from robomme_interference_data.execution import Executor, Serial, Worker
 from robomme_interference_data.significance import SURE
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
@@ -42,45 +40,28 @@ FIGURES = {
 """Name to what a figure shows."""
 
 
-@dataclass(frozen=True)
-class _Draw:
-    """Draws a figure, of a simulator, into a folder; as a task, see `execution`."""
-
-    score: Score
-    folder: Path
-    png: bool
-
-    def __call__(self, task: tuple[str, str], worker: Worker) -> bool:
-        simulator, kind = task
-        with open_figure() as figure:
-            if there := draw_figure(kind, figure, Data(self.score, simulator)):
-                for suffix in (".svg", *[".png"] * self.png):
-                    save_figure(figure, self.folder / f"{kind}-{simulator}{suffix}")
-        return there
-
-
-def draw_figures(
-    score: Score, folder: Path, *, png: bool = False, executor: Executor | None = None
-) -> dict[str, Path]:
+def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, Path]:
     """Draw every figure for which there is data, as `<figure>-<simulator>.svg`.
 
     Args:
         score: What is drawn.
         folder: Where to write.
         png: Whether to write each as `.png`, too.
-        executor: Who draws; None for this process.
 
     Returns:
         Name without suffix to the SVG, in the order of `FIGURES`.
     """
-    tasks = [(simulator, kind) for simulator in score.cubes for kind in FIGURES]
-    there = set()
-    for outcome in (executor or Serial()).run(_Draw(score, folder, png), tasks):
-        if outcome.error is not None:
-            raise outcome.error
-        there |= {outcome.task} if outcome.value else set()
-    names = [f"{kind}-{simulator}" for simulator, kind in tasks if (simulator, kind) in there]
-    return {name: folder / f"{name}.svg" for name in names}
+    drawn = {}
+    for simulator in score.cubes:
+        data = Data(score, simulator)
+        for kind in FIGURES:
+            with open_figure() as figure:
+                if draw_figure(kind, figure, data):
+                    name = f"{kind}-{simulator}"
+                    for suffix in (".svg", *[".png"] * png):
+                        save_figure(figure, folder / (name + suffix))
+                    drawn[name] = folder / f"{name}.svg"
+    return drawn
 
 
 def draw_figure(kind: str, figure: Any, data: Data) -> bool:

@@ -24,7 +24,6 @@ from robomme_interference_data.evaluate.score import (
 from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
 from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.evaluate.systems import base_of
-from robomme_interference_data.execution import Executor
 from robomme_interference_data.files import write_text
 from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import load_jinja2
@@ -173,7 +172,6 @@ def write_score(
     command: str | None = None,
     *,
     png: bool = False,
-    executor: Executor | None = None,
 ) -> list[Path]:
     """Write tables, figures and the report, each atomically and the report last.
 
@@ -186,7 +184,6 @@ def write_score(
         export_to: Folder for the rows in the released layout (see `export`); None writes none.
         command: The command line that made the score, for the report.
         png: Whether figures are written as PNG, too, not as SVG alone.
-        executor: Who draws them; None for this process.
 
     Returns:
         The exported files.
@@ -210,7 +207,7 @@ def write_score(
         write_text(out / "tables" / name, text)
     for suffix, text in zip((".md", ".bib"), methods.methods(score), strict=True):
         write_text(out / f"methods{suffix}", text)
-    drawn = figures.draw_figures(score, out / "figures", png=png, executor=executor)
+    drawn = figures.draw_figures(score, out / "figures", png=png)
     for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - {*texts}:
         (out / "tables" / name).unlink(missing_ok=True)
     for kind in figures.FIGURES:
