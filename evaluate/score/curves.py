@@ -158,8 +158,8 @@ def curve(
             drawn.append(axes.axhline(points[0][2], color=look.colour, **floor))
     if bars:
         low, high = zip(*([100 * bound for bound in cell.interval] for cell in found), strict=True)
-        xs = [x for _, x, _ in points]
-        drawn.append(axes.vlines(xs, low, high, color=look.colour, linewidth=0.9, alpha=0.7))
+        places = [x for _, x, _ in points]
+        drawn.append(axes.vlines(places, low, high, color=look.colour, linewidth=0.9, alpha=0.7))
     for whole, face in ((True, look.colour), (False, "white")):
         chosen = [(x, y) for (_, x, y), c in zip(points, found, strict=True) if c.complete is whole]
         if chosen:
@@ -231,15 +231,15 @@ def label_ends(
         scale = axes.figure.dpi_scale_trans
         return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, scale)
 
-    letters = {"color": INK, "size": size, "va": "center"}
+    letters: dict[str, Any] = {"color": INK, "size": size, "va": "center"}
     top = axes.get_ylim()[1]
     ordered = sorted(ends.items(), key=lambda end: end[1])
     gap = min(top * 1.2 * size / 72 / height, top / max(1, len(ordered) - 1))
     heights = spread([value for _, value in ordered], gap, 0, top)
     for (system, value), label in zip(ordered, heights, strict=True):
         look = looks[system]
-        ends_at = {"coordsA": beside(0), "coordsB": beside(0.02 * size)}
-        line = {"color": look.colour, "linewidth": 0.5, "clip_on": False}
+        ends_at: dict[str, Any] = {"coordsA": beside(0), "coordsB": beside(0.02 * size)}
+        line: dict[str, Any] = {"color": look.colour, "linewidth": 0.5, "clip_on": False}
         drawn = [
             axes.add_artist(ConnectionPatch((1, value), (1, label), **ends_at, **line)),
             *axes.plot(1, label, **look.point, clip_on=False, transform=beside(0.029 * size)),

@@ -188,7 +188,7 @@ def _heatmap(figure: Any, data: Data) -> bool:
                 rates[y, x] = cell.rate
                 text = f"{100 * cell.rate:.0f}" + ("" if cell.complete else "†")
                 ink = ink_on(to_hex(colours(cell.rate / highest if highest else 0.0)))
-                inside = {"ha": "center", "va": "center", "in_layout": False}
+                inside: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
                 axes.text(x, y, text, **inside, size=7, color=ink)
         axes.imshow(rates, cmap=colours, vmin=0, vmax=highest, aspect="auto")
         axes.set_xticks(range(len(conditions)), labels, size=7, rotation=turned)
@@ -228,7 +228,7 @@ def _matrix(figure: Any, data: Data) -> bool:
             change = changes[column, row]
             if apart:
                 values[y, x] = change
-            look = {"weight": "bold", "color": "black"} if apart else {"color": INK}
+            look: dict[str, Any] = {"weight": "bold", "color": "black"} if apart else {"color": INK}
             look |= {"ha": "center", "va": "center", "in_layout": False}
             axes.text(x, y, f"{change:.0f}".replace("-", "−"), size=7, **look)
         axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")

@@ -90,7 +90,7 @@ def _forest(
     is the highest stand first.
     """
     sizes = [len(group) for group in found.values()]
-    leading = next(group for group in reversed(found.values()) if len(group) == max(sizes))
+    leading = next(group for group in reversed([*found.values()]) if len(group) == max(sizes))
     systems = [one for one in data.systems if any(one in group for group in found.values())]
     ranked = sorted(
         systems, key=lambda s: -leading[s].pairs.change.value if s in leading else math.inf

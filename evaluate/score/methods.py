@@ -4,6 +4,8 @@ import re
 from importlib import resources
 from typing import Any
 
+import numpy as np
+
 from robomme_interference_data.evaluate.score.cube import Cube
 from robomme_interference_data.evaluate.score.report import versions
 from robomme_interference_data.evaluate.score.scoring import Score
@@ -48,14 +50,15 @@ def methods(score: Score) -> tuple[str, str]:
 
 
 def _part(score: Score, cube: Cube) -> dict[str, Any]:
+    there = np.flatnonzero(cube.there.any(axis=0)).tolist()
     cells = [one for one in score.cells if one.simulator == cube.simulator and not one.part]
     return {
         "simulator": cube.simulator,
         "systems": list(map(display_name, cube.systems)),
         "conditions": list(dict.fromkeys(one.condition for one in cells if one.n)),
         "rollouts": sum(sum(one.counts) for one in cells),
-        "episodes": int(cube.there.any(axis=0).sum()),
-        "families": len({cube.episodes[i].family for i in cube.there.any(axis=0).nonzero()[0]}),
+        "episodes": len(there),
+        "families": len({cube.episodes[place].family for place in there}),
         "seeds": len(cube.model_seeds),
         "complete": sum(one.complete for one in cells),
         "cells": len(cells),

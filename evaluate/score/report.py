@@ -167,8 +167,8 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
                     [_address(one, folder) if one else "" for one in found],
                 )
                 rows.append(row)
-    found = {"names": _names(score), "rows": rows}
-    text = json.dumps(found, ensure_ascii=False, separators=(",", ":"))
+    told = {"names": _names(score), "rows": rows}
+    text = json.dumps(told, ensure_ascii=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
 
