@@ -62,7 +62,7 @@ def compare(
     """
     if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
         raise InvalidOptionError(
-            f"{len(conditions)} conditions to compare; expected two, or none and two runs",
+            f"conditions to compare: {' '.join(conditions) or 'none'}; expected two, or two runs",
             f"To set k7 against k0 of one run: compare {first} --conditions k0 k7",
         )
     for name in conditions:

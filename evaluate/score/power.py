@@ -64,14 +64,16 @@ def plan(margin: float, episodes: int, flips: float) -> Plan:
     Raises:
         InvalidOptionError: A value is out of range, or more than all episodes would flip.
     """
-    for name, value, high in (("margin", margin, 1), ("flips", flips, 1)):
-        if not 0 <= value <= high or (name == "margin" and not value):
-            raise InvalidOptionError.expected(name, value, "a share between 0 and 1")
+    if not 0 < margin <= 1:
+        expected = "points, more than 0 up to 100"
+        raise InvalidOptionError.expected("margin", float(f"{100 * margin:g}"), expected)
+    if not 0 <= flips <= 1:
+        raise InvalidOptionError.expected("flips", flips, "a share from 0 to 1, such as 0.06")
     if not 1 <= episodes <= MOST:
         raise InvalidOptionError.expected("episodes", episodes, f"a number from 1 to {MOST:,}")
     if margin + flips > 1:
         raise InvalidOptionError(
-            f"margin {margin} and flips {flips} are more than all episodes",
+            f"{100 * margin:g} points and flips {flips} are more than all episodes",
             "A difference adds its own flips to those: their sum is 1 at most.",
         )
     noise = math.sqrt(flips / episodes)

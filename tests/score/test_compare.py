@@ -105,7 +105,7 @@ def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:
     # Episode 7 broke: the cell is not complete, and every p provisional.
     assert not overall["complete"] and "0.219†" in found.table.markdown()
     assert len(found.runs) == 1 and "noise" not in " ".join(found.notes)
-    with pytest.raises(InvalidOptionError, match="0 conditions to compare"):
+    with pytest.raises(InvalidOptionError, match="conditions to compare: none"):
         compare(tmp_path / "a.csv")
     with pytest.raises(InvalidOptionError, match="no episode under k0 and k3"):
         compare(tmp_path / "a.csv", conditions=("k0", "k3"))
