@@ -33,7 +33,7 @@ from robomme_interference_data.cards.provenance import (
 )
 from robomme_interference_data.cards.publication import OTHER, Publication
 from robomme_interference_data.cards.results import ResultsFacts, results_values
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS
+from robomme_interference_data.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     FPS,
@@ -175,6 +175,13 @@ def _demonstrations_text(facts: DatasetFacts, about: Publication) -> tuple[str, 
     return head + "\n" + _filled("demonstrations.md.j2", values), film
 
 
+def _beyond(conditions: Iterable[str]) -> list[tuple[list[str], str]]:
+    """Return the conditions beyond the paper's, kind by kind, with what they hold in words."""
+    named = {one: parse_condition(one).kind for one in conditions if one not in DEFAULT_CONDITIONS}
+    kinds = dict.fromkeys(named.values())
+    return [([f"`{one}`" for one in named if named[one] == kind], kind.holds) for kind in kinds]
+
+
 def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
     film = film_of_split(facts)
     split, units = facts.split, facts.units
@@ -193,7 +200,7 @@ def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
         "split_name": facts.split_name,
         "units_split": facts.units_split,
         "header": split.header,
-        "other_conditions": [one for one in split.conditions if one not in DEFAULT_CONDITIONS],
+        "other_conditions": _beyond(split.conditions),
         "same_family": facts.same_family,
         "skipped": sum(one.skipped for one in units.values()),
         "check": f"robomme-interference verify {about.repo_id}@{about.tag}",

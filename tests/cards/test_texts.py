@@ -141,7 +141,7 @@ def test_a_split_of_the_own_family_is_labelled(tmp_path: Path) -> None:
 def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
     split = made_up(tmp_path, conditions=("k0", "k2"), position_limit=None, seed=3)
     text = split_text(split, OF_SPLIT)
-    assert "Conditions beyond the paper's: k2." in text
+    assert "- Beyond the paper's conditions, `k2`: lesson, n units." in text
     assert "no limit on the length" in text
     assert "seed 3" in text
     assert "| k0 | paper |" in text
