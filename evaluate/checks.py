@@ -20,10 +20,10 @@ from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
 from robomme_interference_data.evaluate.systems import (
-    SYSTEMS,
     System,
     base_of,
     check_history,
+    known_system,
     name_system,
 )
 from robomme_interference_data.evaluate.worker import simulator_options
@@ -102,7 +102,7 @@ def _check_name(config: RunConfig, system: System) -> None:
     kind, step = parse_policy(config.policy).kind, config.retrieval is not None
     why = None
     if not system.paper:
-        if system.name in SYSTEMS and (
+        if known_system(system.name) is not None and (
             kind not in BUILTINS or default_system(config) != system.name
         ):
             why = f"the policy {config.policy} is not the control {system.name}"

@@ -7,7 +7,7 @@ your own.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from typing import Any
 
@@ -122,8 +122,21 @@ SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS,
 """Name to system: the paper's, then the built-in policies. The order is that of tables."""
 
 
+def known_system(name: str) -> System | None:
+    """Return a system of the table, or a control behind another retrieval step than the usual.
+
+    Such a step stands behind the control's name, as in `retrieval-replay-window-joined`. None for
+    any other name.
+    """
+    for control in _CONTROLS:
+        step = name.removeprefix(f"{control.name}-")
+        if control.retrieval and step != name:
+            return replace(control, name=name, display=f"{control.display} ({step})")
+    return SYSTEMS.get(name)
+
+
 def name_system(name: str) -> System:
-    """Return a system of the table, or one with a name of your own.
+    """Return a system that is known, or one with a name of your own.
 
     A name of your own is free of conditions and limits. It may not read like one of the table:
     what differs from one in case, separators or one letter in ten is refused, so that neither a
@@ -134,13 +147,13 @@ def name_system(name: str) -> System:
             does not begin with a letter or digit.
         UnknownNameError: It reads like a system of the table, without being one.
     """
-    if name in SYSTEMS:
-        return SYSTEMS[name]
     if not _FREE_NAME.fullmatch(name):
         raise InvalidIdError(
             f"{name!r} is not the name of a system",
             "Expected up to 64 letters, digits, '.', '_' and '-', such as my-memory.",
         )
+    if (known := known_system(name)) is not None:
+        return known
     for system in SYSTEMS.values():
         if any(_alike(name, known) for known in (system.name, system.display)):
             raise UnknownNameError(
@@ -158,21 +171,24 @@ def _alike(name: str, known: str) -> bool:
 
 
 def display_name(name: str) -> str:
-    """Return the name for tables and figures; a name that is not in the table stays as it is."""
-    return SYSTEMS[name].display if name in SYSTEMS else name
+    """Return the name for tables and figures; a name of your own stays as it is."""
+    known = known_system(name)
+    return name if known is None else known.display
 
 
 def base_of(name: str) -> str | None:
     """Return the system without the retrieval step; None for one that has none."""
-    if name not in SYSTEMS or not SYSTEMS[name].retrieval:
+    known = known_system(name)
+    if known is None or not known.retrieval:
         return None
     plain = name.removeprefix("retrieval-")
-    return plain if plain in SYSTEMS else f"perceptual-{plain}"
+    return next((one for one in SYSTEMS if plain.startswith(one)), f"perceptual-{plain}")
 
 
 def is_bound(name: str) -> bool:
     """Whether a system only bounds what a memory can reach; one of your own never does."""
-    return name in SYSTEMS and SYSTEMS[name].bound
+    known = known_system(name)
+    return known is not None and known.bound
 
 
 def check_history(system: System, frames: Mapping[str, int]) -> None:

@@ -79,7 +79,6 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "--retrieval-rule says nothing"),
         ({"retrieval_camera": "wrist"}, InvalidOptionError, "--retrieval-camera says nothing"),
         ({"retrieval": "thumbnail", "retrieval_rule": "best!"}, UnknownNameError, "best!"),
-        ({"retrieval": "thumbnail", "retrieval_rule": "top32"}, InvalidOptionError, "top32"),
         ({"retrieval": "thumbnail"}, MissingIndexError, "'thumbnail'"),
         (SAYS | {"policy_options": ("what=text",)}, PolicyError, "returned a str"),
         (SAYS | {"policy_options": ("what=nan",)}, PolicyError, "holds nan"),
@@ -249,6 +248,7 @@ def check_name(tiny_split: Path, system: str, **changes: Any) -> None:
         ("replay", "replay-window", "replay is not the control replay-window"),
         (CHEAT, "oracle", "is not the control oracle"),
         ("replay", "retrieval-replay-full", "replay is not the control"),
+        (CHEAT, "retrieval-replay-full-mean", "is not the control"),
         ("websocket://h:1", "memer", "sends the server none"),
         ("oracle", "oracle", None),
         ("oracle", "my-upper-end", None),
@@ -275,6 +275,7 @@ def test_a_name_of_the_table_is_for_the_policy_that_it_stands_for(
     [
         ({}, "replay-window"),
         ({"retrieval": "siglip"}, "retrieval-replay-window"),
+        ({"retrieval": "siglip", "retrieval_rule": "mean"}, "retrieval-replay-window-mean"),
         (
             {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
             "retrieval-replay-window-max-0.9-wrist",

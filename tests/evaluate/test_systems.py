@@ -7,6 +7,8 @@ from robomme_interference_data.evaluate.systems import (
     SYSTEMS,
     base_of,
     check_history,
+    display_name,
+    is_bound,
     name_system,
 )
 
@@ -26,6 +28,19 @@ def test_a_retrieval_system_has_one_without() -> None:
     assert base_of("retrieval-replay-window") == "replay-window"
     assert base_of("replay-window") is base_of("my-memory") is None
     assert all((base_of(name) in SYSTEMS) == one.retrieval for name, one in SYSTEMS.items())
+
+
+@pytest.mark.parametrize("step", ["mean", "joined", "last", "top32", "max-0.9-wrist", "oracle"])
+def test_a_control_behind_another_step_is_that_control(step: str) -> None:
+    system = name_system(f"retrieval-recall-framesamp-{step}")
+    assert (system.display, system.sampling) == (
+        f"Retrieval-Recall-FrameSamp ({step})",
+        "framesamp",
+    )
+    assert not system.applies("no-history") and system.applies("k0")
+    assert is_bound(system.name) and not is_bound(f"retrieval-replay-window-{step}")
+    assert base_of(system.name) == "recall-framesamp"
+    assert display_name(system.name) == system.display
 
 
 def test_position_limits_are_told_condition_by_condition() -> None:
