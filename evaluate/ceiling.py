@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.conditions import in_order
+from robomme_interference_data.conditions import NO_HISTORY, in_order
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.config import CeilingConfig, unusual_retrieval
 from robomme_interference_data.evidence import known_parts
@@ -68,8 +68,8 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
 
     Raises:
         UnknownNameError: There is no such memory, condition, encoder or method.
-        InvalidOptionError: No lesson of the split has evidence, or a setting of a retrieval step is
-            given without one.
+        InvalidOptionError: No lesson of the split has evidence, a setting of a retrieval step is
+            given without one, or one is to choose under `no-history`.
         MissingFileError: The split has no views under the shift.
         MissingIndexError, StaleIndexError: See `measure`.
     """
@@ -81,6 +81,16 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
             f"--shift {config.shift} says nothing without a retrieval step: memories do not look",
             "Add --retrieval ENCODER, such as --retrieval thumbnail, or leave it out.",
         )
+    if config.retrieval is not None and NO_HISTORY in config.conditions:
+        raise InvalidOptionError(
+            f"a retrieval step has nothing to retrieve from under {NO_HISTORY}",
+            f"Leave {NO_HISTORY} out: the ceiling there is that of the memory without --retrieval.",
+        )
+    if all(split.query(one).record.evidence is None for one in split.episode_ids):
+        raise InvalidOptionError(
+            f"it is unknown which frames of {split.location} show the answer",
+            "Build it from tabletop, or from recordings with subgoals: see docs/sources.md.",
+        )
     names = [one.name for one in in_order(config.conditions or split.conditions)]
     found = [
         what_is_left(buffer, config.memory, frames)
@@ -88,11 +98,6 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
         for buffer in split.buffers(condition=name)
         if (frames := _given(split, buffer, config)) is not None
     ]
-    if all(one.evidence_kept is None for one in found):
-        raise InvalidOptionError(
-            f"it is unknown which frames of {split.location} show the answer",
-            "Build it from tabletop, or from recordings with subgoals: see docs/sources.md.",
-        )
     return [*_cells(found, split.families), *_cells(found, (ALL,))]
 
 
@@ -169,5 +174,6 @@ def ceiling_table(cells: Sequence[Ceiling], title: str) -> Table:
         ((c.family, c.condition, c.queries, c.evidence_kept, c.success) for c in cells),
         "evidence kept: mean share of the lesson's evidence spans of which the memory keeps a "
         "frame at the first step; expected success: of the ideal observer (recall), which knows "
-        "these parts of the answer and draws one of those that agree. Empty where unknown.",
+        "these parts of the answer and draws one of those that agree. Empty where unknown; "
+        "evidence kept also where the history holds no lesson.",
     )
