@@ -33,6 +33,7 @@ class System:
         subgoals: What a vision-language model in front of the policy writes:
             `simple_subgoal`, `grounded_subgoal`, or None where there is none.
         retrieval: Whether a retrieval step chooses what the memory gets.
+        step: What of that step is unusual, in the name of a control, such as `joined`.
         sampling: By which of `sampling.MEMORIES` it keeps frames; None where that is not known, or
             it keeps none.
         position_limit: History and live frames together that the memory holds; None: no limit.
@@ -48,6 +49,7 @@ class System:
     with_history: bool = True
     subgoals: str | None = None
     retrieval: bool = False
+    step: str = ""
     sampling: str | None = None
     position_limit: int | None = None
     paper: bool = False
@@ -131,7 +133,7 @@ def known_system(name: str) -> System | None:
     for control in _CONTROLS:
         step = name.removeprefix(f"{control.name}-")
         if control.retrieval and step != name:
-            return replace(control, name=name, display=f"{control.display} ({step})")
+            return replace(control, name=name, display=f"{control.display} ({step})", step=step)
     return SYSTEMS.get(name)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from robomme_interference_data.evaluate.score.cube import Cube, counting, success, trials
-from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.evaluate.systems import known_system
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table
 
@@ -20,10 +20,11 @@ def ceiling_of(system: str) -> str | None:
 
     Of a system with retrieval it is the observer behind the same step.
     """
-    known = SYSTEMS.get(system)
+    known = known_system(system)
     if known is None or known.sampling is None:
         return None
-    name = f"{'retrieval-' * known.retrieval}recall-{known.sampling}"
+    name = f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(known.step)}"
+    name += known.step
     return name if name != system else None
 
 

@@ -10,7 +10,7 @@ from robomme_interference_data.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.rows import Rows
-from robomme_interference_data.evaluate.systems import SYSTEMS, name_system
+from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import Status
 from robomme_interference_data.stats import effective
@@ -190,4 +190,7 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
 
 
 def _table_order(system: str) -> tuple[int, str]:
-    return [*SYSTEMS].index(system) if system in SYSTEMS else len(SYSTEMS), system
+    known = known_system(system)
+    if known is None:
+        return len(SYSTEMS), system
+    return [*SYSTEMS].index(system.removesuffix(f"-{known.step}")), system

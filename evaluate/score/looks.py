@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robomme_interference_data.drawing import GREY, INK, Hue
-from robomme_interference_data.evaluate.systems import SYSTEMS
+from robomme_interference_data.evaluate.systems import SYSTEMS, known_system
 
 # One for what the memory is made of.
 _COLOURS = {
@@ -69,14 +69,15 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
     marker or line, up to two dozen; beyond that colours tell them apart.
     """
     looks: dict[str, Look] = {}
-    retrieving = [name for name in names if name in SYSTEMS and SYSTEMS[name].retrieval]
-    own = [name for name in names if name not in SYSTEMS]
+    known = {name: system for name in names if (system := known_system(name)) is not None}
+    retrieving = [name for name, system in known.items() if system.retrieval]
+    own = [name for name in names if name not in known]
     for name in names:
         if name in own:
             round_, shape = divmod(own.index(name), len(_FREE))
             looks[name] = Look(name, _OWN[(shape + round_) % len(_OWN)], *_FREE[shape])
         elif name in retrieving:
-            system, number = SYSTEMS[name], retrieving.index(name)
+            system, number = known[name], retrieving.index(name)
             colour = _COLOURS[system.representation] if len(retrieving) > 1 else INK
             looks[name] = Look(system.display, colour, "*", _LINES[number % len(_LINES)], 2.2)
         else:

@@ -185,6 +185,8 @@ def test_what_is_no_share_is_a_bad_row(tmp_path: Path, value: str) -> None:
         ("replay-framesamp", "recall-framesamp"),
         ("replay-full", "recall-full"),
         ("retrieval-replay-window", "retrieval-recall-window"),
+        ("retrieval-replay-window-joined", "retrieval-recall-window-joined"),
+        ("retrieval-recall-window-joined", None),
         ("perceptual-framesamp-context", "recall-framesamp"),
         ("retrieval-framesamp-modul", "retrieval-recall-framesamp"),
         ("perceptual-tokendrop-modul", None),  # it keeps parts of frames
