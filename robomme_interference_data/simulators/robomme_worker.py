@@ -130,10 +130,11 @@ class Episodes:
         self._env = builder.make_env_for_episode(index)
         self._cameras = cameras
         observations, info = self._env.reset()
+        goals = info["task_goal"]
         about = {
             "seed": int(seed),
             "difficulty": str(difficulty),
-            "goals": [str(goal) for goal in info["task_goal"]],
+            "goals": [goals] if isinstance(goals, str) else [str(goal) for goal in goals],
         }
         return about, self._arrays(observations, slice(None) if demonstration else slice(-1, None))
 

@@ -60,6 +60,8 @@ def test_an_episode_is_what_robomme_returns(simulator: RoboMMESimulator) -> None
     assert first.state[:7].tolist() == [*(5 + joints)]
     assert info.goals == ("move the cube as before", "do it again, Schritt für Schritt")
     assert info.goal == info.goals[0]
+    # One wording may come as a text instead of a list.
+    assert simulator.reset("RouteStick/test/0")[2].goals == ("move the cube as before",)
     assert (info.difficulty, info.seed, info.simulator) == ("easy", 640_003, "robomme")
     # Seeds: 640000 + 1000 times the rank of test, val, train + index.
     seeds = [simulator.reset(f"MoveCube/{split}/1")[2].seed for split in ("val", "train")]

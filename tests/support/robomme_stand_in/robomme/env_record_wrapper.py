@@ -73,6 +73,8 @@ class Environment:
 
     def _info(self, status):
         goals = ["move the cube as before", "do it again, Schritt für Schritt"]
+        if self.family == "RouteStick":
+            goals = goals[0]
         if self.family == "VideoRepick":
             goals.append(f"open environments: {len(open_environments)}")
         return {"task_goal": goals, "status": status}
