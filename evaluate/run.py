@@ -1,17 +1,16 @@
 """Run an evaluation: check everything, then roll out what is not done yet, and never lose a row."""
 
 import dataclasses
-import datetime
-import platform
-import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from robomme_interference_data.constants import PROTOCOL_VERSION
-from robomme_interference_data.errors import InterferenceError, SimulatorCrashError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    ServerKeepaliveError,
+    SimulatorCrashError,
+)
 from robomme_interference_data.evaluate.checks import (
     applicable,
     check_plan,
@@ -22,29 +21,24 @@ from robomme_interference_data.evaluate.checks import (
 from robomme_interference_data.evaluate.config import Run, RunConfig
 from robomme_interference_data.evaluate.log import (
     RunLog,
-    Start,
     clip_name,
     count_statuses,
     is_done,
     open_log,
     read_record,
 )
-from robomme_interference_data.evaluate.plan import Plan, WorkItem, plan_work, shuffle_work
-from robomme_interference_data.evaluate.policies.identity import (
-    describe_policy,
-    plain,
-    policy_identity,
-)
+from robomme_interference_data.evaluate.plan import WorkItem, plan_work, shuffle_work
+from robomme_interference_data.evaluate.policies.identity import describe_policy, plain
 from robomme_interference_data.evaluate.policies.registry import pin_policy
+from robomme_interference_data.evaluate.policies.servers import check_kind, hold_servers
+from robomme_interference_data.evaluate.start import now, run_identity, start_of
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.evaluate.worker import RolloutTask, make_selector
+from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import Executor, Outcome, Processes, end_if_starting
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.records import Rollout, Status
 from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.split import Split
-
-_PACKAGES = ("robomme-interference-data", "numpy", "av", "mani-skill", "sapien", "torch")
 
 _ERROR_LETTERS = 2000
 """Most letters of what broke that a row has."""
@@ -104,7 +98,8 @@ def run_evaluation(
         MissingFileError: The split is not there.
         RunFolderError: `out` holds another run, or something else.
         PolicyError: The policy cannot be made.
-        PolicyServerError: A policy server cannot be reached, or no longer any of them.
+        PolicyServerError: A policy server cannot be reached, or no longer any of them; another run
+            drives it; or it is not what the system's is.
         WorkerError: The worker processes cannot start.
         HubError: The Hub does not know the policy's model, or cannot be reached.
         FormatError: Files of a run in `out` are damaged.
@@ -114,29 +109,31 @@ def run_evaluation(
     name = config.system or default_system(config)
     pinned = pin_policy(config.policy)  # and the split, if it is on the Hub: one commit for all
     config = dataclasses.replace(config, policy=pinned, split=Path(split.location))
-    policy, said = describe_policy(config.policy, config.policy_options, workers=config.workers)
-    check_settings(config, name, split, policy)
-    system = name_system(name)
-    plan = plan_work(
-        split.episode_ids,
-        conditions=config.conditions or applicable(system, split, policy),
-        families=config.families,
-        episodes=config.episodes,
-        episode_split=config.episode_split,
-        shard=config.shard,
-    )
-    items = check_plan(config, system, split, policy, plan)
-    executor = executor or Processes(config.workers)
-    there = read_record(folder)
-    if any(item not in there or not is_done(there[item]) for item in items):
-        check_simulator(config, policy.cameras, executor)
-    versions = simulator_versions(config.simulator, config.robomme_python)
-    identity = _identity(config, name, split, plan, said, versions)
-    with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
-        # The same split may be in another folder by now: rows keep one label for it.
-        run = Run(config, name, log.header.split, split.revision)
-        log.begin(_start(config, plan, said, versions, command))
-        return _roll_out(run, items, split, log, executor, listener)
+    with hold_servers(config.policy, folder):
+        policy, said = describe_policy(config.policy, config.policy_options, workers=config.workers)
+        check_settings(config, name, split, policy)
+        system = name_system(name)
+        plan = plan_work(
+            split.episode_ids,
+            conditions=config.conditions or applicable(system, split, policy),
+            families=config.families,
+            episodes=config.episodes,
+            episode_split=config.episode_split,
+            shard=config.shard,
+        )
+        items = check_plan(config, system, split, policy, plan)
+        executor = executor or Processes(config.workers)
+        there = read_record(folder)
+        if any(item not in there or not is_done(there[item]) for item in items):
+            check_simulator(config, policy.cameras, executor)
+            check_kind(config.policy, config.policy_options, system)
+        versions = simulator_versions(config.simulator, config.robomme_python)
+        identity = run_identity(config, name, split, plan, said, versions)
+        with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
+            # The same split may be in another folder by now: rows keep one label for it.
+            run = Run(config, name, log.header.split, split.revision)
+            log.begin(start_of(config, plan, said, versions, command))
+            return _roll_out(run, items, split, log, executor, listener)
 
 
 def _roll_out(
@@ -154,7 +151,7 @@ def _roll_out(
         RolloutTask(run, log.folder),
         shuffle_work(item for item in items if item not in done),
         time_limit=run.config.rollout_timeout,
-        again=(SimulatorCrashError,),
+        again=(SimulatorCrashError, ServerKeepaliveError),
     )
     stopped: str | None = "interrupted"
     errors, full = 0, False
@@ -179,7 +176,7 @@ def _roll_out(
     finally:
         outcomes.close()
         *earlier, last = log.header.starts
-        last = dataclasses.replace(last, ended=_now(), stopped=stopped)
+        last = dataclasses.replace(last, ended=now(), stopped=stopped)
         if not full:
             log.end(dataclasses.replace(log.header, starts=(*earlier, last)))
     rows = tuple(log.rows[item] for item in items if item in log.rows)
@@ -209,7 +206,7 @@ def _row(run: Run, outcome: Outcome, split: Split, log: RunLog) -> tuple[Rollout
             video=clip if run.config.videos and (log.folder / clip).exists() else None,
         )
     before = log.rows[item].attempt if item in log.rows else 0
-    row = dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=_now())
+    row = dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=now())
     return row, trace
 
 
@@ -220,86 +217,3 @@ def _told(error: BaseException) -> str:
         hint = f" ({error.hint})" if error.hint else ""
         text = f"{type(error).__name__}: {error.message}{hint}"
     return str(plain(" ".join(text.split())[:_ERROR_LETTERS]))
-
-
-def _identity(
-    config: RunConfig,
-    system: str,
-    split: Split,
-    plan: Plan,
-    said: Mapping[str, Any],
-    versions: Mapping[str, str],
-) -> dict[str, Any]:
-    """Return what makes the run the one that it is, as plain values."""
-    return {
-        "system": system,
-        "simulator": config.simulator,
-        "simulator_version": versions.get(config.simulator),
-        "revision": split.revision,
-        "episode_split": config.episode_split,
-        "shift": config.shift,
-        "model_seed": config.model_seed,
-        "retrieval_index": _retrieval_index(config, split, plan),
-        "protocol_version": PROTOCOL_VERSION,
-        **policy_identity(config.policy, config.policy_options, said),
-    }
-
-
-def _retrieval_index(config: RunConfig, split: Split, plan: Plan) -> Any:
-    """Return what the retrieval step's choices depend on; None without one.
-
-    Looks for the index of every dataset that a planned condition needs.
-    """
-    selector = make_selector(config)
-    if selector is None:
-        return None
-    found = None  # the same for all: the buffers of a condition need the same datasets
-    for name in plan.conditions:
-        found = selector.identity(next(split.buffers(condition=name)))
-    return plain(found)
-
-
-def _start(
-    config: RunConfig,
-    plan: Plan,
-    said: Mapping[str, Any],
-    versions: Mapping[str, str],
-    command: Sequence[str],
-) -> Start:
-    names = [*_PACKAGES]
-    names += ["lerobot"] if config.policy.startswith("lerobot:") else []
-    names += ["transformers"] if config.retrieval is not None else []
-    installed = {"python": platform.python_version()}
-    for name in names:
-        try:
-            installed[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return Start(
-        command=tuple(map(plain, command)),
-        settings=plain(dataclasses.asdict(config)),
-        plan=plan,
-        versions=installed | dict(versions),
-        git=_git(),
-        machine=platform.machine(),
-        policy=dict(said),
-        started=_now(),
-    )
-
-
-def _now() -> str:
-    """Return the time, UTC, `2026-01-31T12:00:00Z`."""
-    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _git() -> str | None:
-    """Return the commit of the source tree that runs, with `-dirty` if it was changed."""
-    root = Path(__file__).resolve().parent.parent
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty"]
-    try:
-        done = subprocess.run(
-            [*command, "--exclude=*"], check=True, capture_output=True, text=True, timeout=20
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() if (root / ".git").exists() else None

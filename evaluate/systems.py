@@ -55,6 +55,11 @@ class System:
     paper: bool = False
     bound: bool = False
 
+    @property
+    def keeps_frames(self) -> bool | None:
+        """Whether its released server keeps frames; None where none was released under the name."""
+        return self.position_limit is not None if self.paper else None
+
     def applies(self, condition: str) -> bool:
         """Whether a condition says anything: retrieval needs a history, a memory-free one none."""
         return not self.retrieval if condition == NO_HISTORY else self.with_history

@@ -6,8 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robomme_interference_data.console import say
 from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.errors import PolicyServerError, WorkerRetiredError, first_line
+from robomme_interference_data.errors import (
+    PolicyServerError,
+    ServerKeepaliveError,
+    WorkerRetiredError,
+    first_line,
+)
 from robomme_interference_data.evaluate.clips import Clip
 from robomme_interference_data.evaluate.config import Run, RunConfig
 from robomme_interference_data.evaluate.log import clip_name
@@ -56,6 +62,8 @@ class RolloutTask:
             if clip is not None:
                 clip.close(Status.ERROR, f"{type(error).__name__}: {first_line(error)}")
             self.close()
+            if isinstance(error, ServerKeepaliveError):
+                say(f"{task}: {error.message}. A rollout that ends so is begun again, once.")
             if isinstance(error, PolicyServerError):
                 self._check_server(worker)
             raise

@@ -165,6 +165,10 @@ class PolicyServerError(InterferenceError, ConnectionError):
     """A policy server that cannot be reached, reports an error, or does not answer in time."""
 
 
+class ServerKeepaliveError(PolicyServerError):
+    """A policy server that closed its own connection, over a call that kept it for too long."""
+
+
 class WireError(InterferenceError, ValueError):
     """A message that the protocol of the policy servers cannot carry."""
 

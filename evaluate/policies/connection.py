@@ -1,6 +1,6 @@
 """One connection to a policy server: connecting with patience, and questions with a time limit."""
 
-import http
+import http.client
 import os
 import socket
 import threading
@@ -13,7 +13,11 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMes
 from websockets.sync.client import ClientConnection, connect
 
 from robomme_interference_data.console import say
-from robomme_interference_data.errors import PolicyServerError, WireError
+from robomme_interference_data.errors import (
+    PolicyServerError,
+    ServerKeepaliveError,
+    WireError,
+)
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
 
 API_KEY_VARIABLE = "ROBOMME_POLICY_API_KEY"
@@ -24,6 +28,9 @@ _QUIET_S = 2.0
 
 _PAUSES_S = (0.2, 5.0)
 """The first pause between two attempts, which doubles, and the longest."""
+
+_HEALTH_S = 5.0
+"""Most seconds for the answer whether a server can be used: one that computes gives none."""
 
 _CLOSE_S = 2.0
 _GUIDE = "docs/systems.md says how to start one."
@@ -39,6 +46,17 @@ def _after(seconds: float, call: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def _headers() -> dict[str, str]:
+    key = os.environ.get(API_KEY_VARIABLE)
+    return {"Authorization": f"Api-Key {key}"} if key else {}
+
+
+def _is_keepalive(error: Exception) -> bool:
+    """Whether a server closed as it saw no answer to its ping: it reads none while it computes."""
+    closing = error.rcvd if isinstance(error, ConnectionClosed) else None
+    return closing is not None and "keepalive" in closing.reason
 
 
 class ServerConnection:
@@ -57,6 +75,7 @@ class ServerConnection:
 
     def __init__(self, host: str, port: int, *, connect_s: float, response_s: float):
         self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        self._address = host, port
         self.metadata: dict[str, Any] | None = None
         self._connect_s, self._response_s = connect_s, response_s
         self._connection: ClientConnection | None = None
@@ -75,7 +94,10 @@ class ServerConnection:
             PolicyServerError: The server cannot be reached, refuses, or is no policy server.
         """
         self.close()
-        told = f"Waiting for policy server {self.name}, for {self._connect_s:g} s at most …"
+        told = (
+            f"Waiting until policy server {self.name} answers (http://{self.name}/healthz), for "
+            f"{self._connect_s:g} s at most …"
+        )
         with _after(_QUIET_S, lambda: say(told)):
             self._connect()
 
@@ -83,15 +105,17 @@ class ServerConnection:
         until = time.monotonic() + self._connect_s
         pause, longest = _PAUSES_S
         while True:
+            left = max(until - time.monotonic(), pause)
             try:
-                self._connection = self._handshake(max(until - time.monotonic(), pause))
+                self._check_health(min(left, _HEALTH_S))
+                self._connection = self._handshake(left)
                 break
             except InvalidStatus as error:
                 status = error.response.status_code
                 reason = f"it answers {status}"
                 if status < http.HTTPStatus.INTERNAL_SERVER_ERROR:
                     raise self._refusal(status) from error
-            except (OSError, EOFError, InvalidMessage) as error:
+            except (OSError, EOFError, InvalidMessage, http.client.HTTPException) as error:
                 reason = str(error) or type(error).__name__
                 if isinstance(error, TimeoutError):
                     reason = "it does not answer"
@@ -139,11 +163,24 @@ class ServerConnection:
         self._connection = None
         self._stack.close()
 
+    def _check_health(self, seconds: float) -> None:
+        """Raise `OSError` while the server does not answer, or says that it is not ready.
+
+        Any other answer will do, for a server need not know the path.
+        """
+        asking = http.client.HTTPConnection(*self._address, timeout=seconds)
+        try:
+            asking.request("GET", "/healthz", headers=_headers())
+            status = asking.getresponse().status
+        finally:
+            asking.close()
+        if status >= http.HTTPStatus.INTERNAL_SERVER_ERROR:
+            raise OSError(f"it answers {status}")
+
     def _handshake(self, seconds: float) -> ClientConnection:
-        key = os.environ.get(API_KEY_VARIABLE)
         connecting = connect(
             f"ws://{self.name}",
-            additional_headers={"Authorization": f"Api-Key {key}"} if key else {},
+            additional_headers=_headers(),
             open_timeout=seconds,
             close_timeout=_CLOSE_S,
             compression=None,
@@ -191,9 +228,8 @@ class ServerConnection:
             self.close()
             late = f"did not answer within {seconds:.3g} s"
             why = late if expired.is_set() else f"closed the connection: {error}"
-            raise PolicyServerError(
-                f"policy server {self.name} {why}", "Its log may say why."
-            ) from error
+            kind = ServerKeepaliveError if _is_keepalive(error) else PolicyServerError
+            raise kind(f"policy server {self.name} {why}", "Its log may say why.") from error
         except BaseException:
             # An answer that nobody read would be taken for that of the next message.
             self.close()

@@ -12,7 +12,7 @@ import numpy as np
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.console import say
-from robomme_interference_data.errors import PolicyError, PolicyServerError
+from robomme_interference_data.errors import PolicyError
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     BUILTINS,
@@ -21,6 +21,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     parse_policy,
     policy_options,
 )
+from robomme_interference_data.evaluate.policies.servers import check_metadata
 
 _WITHOUT_EFFECT = {
     "websocket": ("server", "connect_s", "response_s"),
@@ -40,7 +41,8 @@ def describe_policy(
 
     Raises:
         InterferenceError: It cannot be made, a server cannot be reached, servers say different
-            things of themselves, or it does not say what it is.
+            things of themselves, nobody says which checkpoint they serve, or it does not say what
+            it is.
     """
     spec = parse_policy(text)
     check_workers(spec, workers)
@@ -51,14 +53,7 @@ def describe_policy(
         said = [_metadata(text, policy) for policy in policies]
     policy, metadata = policies[0], dict(said[0])
     if spec.kind == "websocket":
-        for other in said:
-            if other["server_metadata"] != metadata["server_metadata"]:
-                raise PolicyServerError(
-                    f"the policy servers {metadata['server']} and {other['server']} serve "
-                    f"different models: one says {metadata['server_metadata']}, the other "
-                    f"{other['server_metadata']}",
-                    "Start all of them with the same checkpoint and seed.",
-                )
+        check_metadata(said, policy_options(text, options)["checkpoint"])
         metadata["server"] = ", ".join(one["server"] for one in said)
     if policy.privileged:
         metadata["privileged"] = True

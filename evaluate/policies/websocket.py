@@ -11,10 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK
-from robomme_interference_data.errors import InvalidOptionError, PolicyServerError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    PolicyServerError,
+    ServerKeepaliveError,
+)
 from robomme_interference_data.evaluate.policies.connection import ServerConnection
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
-from robomme_interference_data.simulators.base import Observation
+from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+
+_NO_FRAMES = "history feats is empty"
+"""In the error of a server that keeps frames and is asked for actions before it has any."""
 
 
 class WebsocketPolicy(Policy):
@@ -28,9 +35,11 @@ class WebsocketPolicy(Policy):
     Args:
         host: Name or address of the server.
         port: Its port.
+        checkpoint: Which checkpoint it serves, for the record; needed where the server does not say
+            so itself.
         chunk_frames: Most frames in a message. Its default is what a live message carries too: a
             server that compiles for each length (JAX) compiles no further ones for the history.
-        connect_s: Most seconds to wait until the server can be used, such as while it loads.
+        connect_s: Most seconds to wait until the server can be used: loading takes minutes.
         response_s: Most seconds from a message to its answer. The first of a kind takes long, as
             servers compile then.
     """
@@ -44,10 +53,13 @@ class WebsocketPolicy(Policy):
         host: str,
         port: int,
         *,
+        checkpoint: str | None = None,
         chunk_frames: int = ACTION_CHUNK,
-        connect_s: float = 60.0,
+        connect_s: float = 600.0,
         response_s: float = 600.0,
     ):
+        if checkpoint is not None and not checkpoint.strip():
+            raise InvalidOptionError.expected("checkpoint", checkpoint, "its name")
         if chunk_frames < 1 or not min(connect_s, response_s) > 0:
             raise InvalidOptionError(
                 f"chunk_frames {chunk_frames}, connect_s {connect_s}, response_s {response_s}; "
@@ -106,14 +118,39 @@ class WebsocketPolicy(Policy):
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the actions that the server gives, `(n, 8)`; they are checked where executed."""
-        message = {
+        message = self.message(observation, goal)
+        actions: NDArray[np.float32] = self._server.request(message, "actions")["actions"]
+        return actions
+
+    def message(self, observation: Observation, goal: str) -> dict[str, Any]:
+        """Return what the server is asked for actions with; a subclass may send more."""
+        return {
             "observation/image": observation.images["front"],
             "observation/wrist_image": observation.images["wrist"],
             "observation/state": np.asarray(observation.state, np.float32),
             "prompt": goal,
         }
-        actions: NDArray[np.float32] = self._server.request(message, "actions")["actions"]
-        return actions
+
+    def keeps_frames(self) -> bool:
+        """Return whether the server keeps frames: one that does refuses to act when it has none.
+
+        It is reset, and lost to a rollout that runs.
+        """
+        try:
+            try:
+                self._act_at_once()
+            except ServerKeepaliveError:  # it compiled for long; now it has
+                self._act_at_once()
+        except PolicyServerError as error:
+            if _NO_FRAMES in error.message:
+                return True
+            raise
+        return False
+
+    def _act_at_once(self) -> None:
+        view, state = np.zeros((256, 256, 3), np.uint8), np.zeros(ACTION_SIZE, np.float32)
+        self.reset(RolloutInfo("nothing", history_frames=0, seed=0))
+        self.act(Observation(dict.fromkeys(self.cameras, view), state), "nothing")
 
     def metadata(self) -> dict[str, Any]:
         """Return the server's address and what it said of itself, connecting if need be."""

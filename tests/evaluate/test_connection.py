@@ -63,7 +63,8 @@ def test_a_port_that_never_answers_is_told_soon_and_given_up(
         with pytest.raises(PolicyServerError, match="it does not answer"):
             policy.metadata()
         assert 2.5 < time.monotonic() - began < 10
-    told = f"Waiting for policy server 127.0.0.1:{port}, for 3 s at most …\n"
+    where = f"127.0.0.1:{port} answers (http://127.0.0.1:{port}/healthz)"
+    told = f"Waiting until policy server {where}, for 3 s at most …\n"
     assert capsys.readouterr().err == told
 
 

@@ -82,7 +82,7 @@ def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
         return run(tmp_path / out, policy=server.url, conditions=("k0",), **changes)
 
     with PolicyServer().running() as first, PolicyServer().running() as second:
-        first.metadata = second.metadata = {"model": "a"}
+        first.metadata = second.metadata = {"checkpoint": "a"}
         serve("one", first, shard="1/2")
         serve("two", second, shard="2/2")
         merged = merge_runs([tmp_path / "one", tmp_path / "two"], tmp_path / "merged")
@@ -91,8 +91,9 @@ def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
         assert again.counts["fail"] == 2
         addresses = {start["policy"]["server"] for start in header(tmp_path / "merged")["starts"]}
         assert addresses == {f"127.0.0.1:{first.port}", f"127.0.0.1:{second.port}"}
-        first.metadata = {"model": "b"}
-        with pytest.raises(RunFolderError, match=r"server_metadata\.model is 'a' there, 'b' here"):
+        first.metadata = {"checkpoint": "b"}
+        difference = r"server_metadata\.checkpoint is 'a' there, 'b' here"
+        with pytest.raises(RunFolderError, match=difference):
             serve("one", first, shard="1/2")
 
 
@@ -116,9 +117,9 @@ def test_what_of_a_policy_can_change_a_result() -> None:
     assert [pin_policy(text) for text in ("replay", "replay:full")] == ["replay:full"] * 2
     assert policy_identity("replay:window", (), {})["policy"] == "replay:window"
     here = {"policy": "websocket", "server": "a:1", "server_metadata": {"model": "m"}}
-    assert policy_identity("websocket://a:1,b:2", ("response_s=5",), here) == {
+    assert policy_identity("websocket://a:1,b:2", ("response_s=5", "checkpoint=7"), here) == {
         "policy": "websocket",
-        "policy_options": {"chunk_frames": 16},
+        "policy_options": {"checkpoint": "7", "chunk_frames": 16},
         "policy_metadata": {"policy": "websocket", "server_metadata": {"model": "m"}},
     }
     assert policy_identity(STILL, ("gripper=1",), {}) == policy_identity(STILL, (), {})

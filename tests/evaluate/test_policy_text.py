@@ -101,8 +101,9 @@ def test_options_reach_the_policy_with_the_declared_type() -> None:
     policy: Any = make_policy(f"{OWN}Still", ["gripper=-1"], worker=3)
     assert (policy.action[0, 7], policy.worker) == (-1, 3)  # it asks for its worker
     assert policy_options("websocket://a:1", ["response_s=5"]) == {
+        "checkpoint": None,
         "chunk_frames": 16,
-        "connect_s": 60.0,
+        "connect_s": 600.0,
         "response_s": 5.0,
     }
 
@@ -126,7 +127,7 @@ def test_what_is_no_option(texts: list[str]) -> None:
         ("websocket://a:1", "chunk_frames=2.5", "chunk_frames is 2.5; expected a whole number"),
         ("websocket://a:1", "chunk_frames=true", "is True; expected a whole number"),
         ("websocket://a:1", "connect_s=soon", "connect_s is 'soon'; expected a number"),
-        ("websocket://a:1", "memory=full", "Its options: chunk_frames, connect_s, response_s."),
+        ("websocket://a:1", "memory=full", "Its options: checkpoint, chunk_frames, "),
         ("websocket://a:1", "port=2", "port"),
         ("websocket://a:1", "connect_s=-1", "expected positive numbers"),
         (f"{OWN}still", "gripper=null", "gripper is None; expected a number"),

@@ -14,6 +14,8 @@ from support.runs import run
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.identity import plain
+from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
+from robomme_interference_data.simulators.base import Observation
 
 
 @pytest.mark.parametrize(
@@ -106,7 +108,7 @@ def test_a_traceback_becomes_one_error_with_its_last_line(server: PolicyServer) 
         # The memory is lost with the connection: this rollout cannot go on.
         with pytest.raises(PolicyServerError, match="was lost, and its memory with it"):
             policy.observe(*section(0, 1))
-        assert policy.metadata()["server_metadata"] == {"model": "none", "seed": 7}
+        assert policy.metadata()["server_metadata"] == {}
         assert server.connections == 1
         rollout(policy, 3, [3], [])  # the next one connects again
     assert server.connections == 2
@@ -136,10 +138,36 @@ def test_every_answer_is_checked(server: PolicyServer, call: str, answer: Any, t
         rollout(policy, 2, [2], [])
 
 
+def test_a_memory_has_4096_positions(server: PolicyServer) -> None:
+    with client(server, chunk_frames=2000) as policy:
+        rollout(policy, 4095, [4095], [])
+        with pytest.raises(PolicyServerError, match="reports: .*index 4096 is out of bounds"):
+            rollout(policy, 4096, [4096], [])
+    # All frames were taken; it is the asking that fails.
+    assert (server.memory.count, server.calls[-1]) == (4097, INFER)
+
+
+def test_a_subclass_may_send_more(server: PolicyServer) -> None:
+    class Guided(WebsocketPolicy):
+        def message(self, observation: Observation, goal: str) -> dict[str, Any]:
+            return super().message(observation, goal) | {"simple_subgoal": f"{goal} it"}
+
+    sent = []
+    server.before = lambda message: sent.append(message.get("simple_subgoal"))
+    policy = Guided("127.0.0.1", server.port)
+    rollout(policy, 0, [], [])
+    policy.close()
+    assert sent == [None, None, "pick it"]
+
+
 def test_a_run_keeps_the_servers_account(tmp_path: Path, world: None, server: PolicyServer) -> None:
     """With history and without: the server checks the order of its calls."""
-    system, names = "perceptual-framesamp-modul", ("no-history", "k1")
-    result = run(tmp_path / "run", policy=server.url, system=system, conditions=names)
+    named = {"system": "perceptual-framesamp-modul", "policy_options": ("checkpoint=a",)}
+    conditions = ("no-history", "k1")
+    result = run(tmp_path / "run", policy=server.url, conditions=conditions, **named)
+    # Before the first rollout it was asked for its kind.
+    assert server.calls[:2] == [RESET, {"call": "infer", "prompt": "nothing"}]
+    del server.calls[:2]
     # The policy holds still, so every episode ends after 40 steps: asked three times a rollout.
     assert [(row.status, row.error) for row in result.rows] == [("fail", None)] * 4
     assert {call.get("exec_start_idx") for call in server.calls} == {None, 0, 80}

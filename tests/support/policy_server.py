@@ -2,13 +2,15 @@
 
 It keeps the account of a memory as the released servers do: frames are counted on from the last
 reset, `exec_start_idx` above 0 sets the length of the history, actions are refused while the
-memory is empty, an error goes out as a traceback in a text frame and then close code 1011, and
-while it works it answers nothing else, pings included. Beyond them it holds clients to the order
-of calls. It answers with actions that hold the arm where it is.
+memory is empty or has more frames than positions, an error goes out as a traceback in a text frame
+and then close code 1011, its metadata is empty, and while it works it answers nothing else, pings
+included. Beyond them it holds clients to the order of calls. It answers with actions that hold the
+arm where it is, float64 `(20, 8)`.
 """
 
 import asyncio
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ import msgpack
 import numpy as np
 from websockets.asyncio.server import Request, Response, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.protocol import State
 
 CHUNK = 20
 """Actions in an answer, more than are executed, as the released servers give them."""
@@ -91,18 +94,21 @@ class Memory:
             self.exec_start_idx = start
         self.count += len(images)
         self._fresh += len(images)
-        assert self.count <= POSITIONS, f"index {self.count - 1} is out of bounds"
         if self.keep:
             self.frames += [image[0].copy() for image in images]
             self.states += [state.copy() for state in states]
 
     def infer(self, message: dict[str, Any]) -> dict[str, Any]:
         assert self.count > 0, "history feats is empty, add buffer first"
+        assert self.count <= POSITIONS, f"index {self.count - 1} is out of bounds"
         live = self.count - self.exec_start_idx
         if not self._answers:
             assert live == 1, f"{live} live frames before the first answer"
         else:
             assert 0 < self._fresh <= LIVE, f"{self._fresh} frames since the last answer"
+        return self.answer(message)
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
         image, wrist = message["observation/image"], message["observation/wrist_image"]
         state, prompt = message["observation/state"], message["prompt"]
         for picture in (image, wrist):
@@ -116,6 +122,16 @@ class Memory:
         return {"state": state, "actions": actions, "infer_time_ms": 1.0}
 
 
+class Memoryless(Memory):
+    """What a server without a memory knows of it: such a one takes frames, and keeps none."""
+
+    def add_buffer(self, message: dict[str, Any]) -> None:
+        pass
+
+    def infer(self, message: dict[str, Any]) -> dict[str, Any]:
+        return self.answer(message)
+
+
 class PolicyServer:
     """Serves one memory.
 
@@ -124,17 +140,18 @@ class PolicyServer:
         port: The port, once the server runs.
         api_key: Refuse clients without this key with 401.
         before: Called with each message before it is handled; it may raise, sleep, or return a
-            `str` or `bytes` that is sent instead of an answer, or `CLOSE`.
+            `str` or `bytes` that is sent instead of an answer, `CLOSE`, or `COMPILE`, which works
+            for so long that the server's keepalive closes the connection; give it short `options`.
         status: Status that all requests are answered with; None to serve them.
-        connections: How many there were.
+        connections: How many there were; `/healthz` is none.
         options: For websockets' `serve`.
     """
 
-    CLOSE = object()
+    CLOSE, COMPILE = object(), object()
 
     def __init__(self, memory: Memory | None = None, *, port: int = 0):
         self.memory = memory if memory is not None else Memory()
-        self.metadata: dict[str, Any] = {"model": "none", "seed": np.int64(7)}
+        self.metadata: dict[str, Any] = {}
         self.port = port
         self.api_key: str | None = None
         self.before: Callable[[dict[str, Any]], Any] = lambda message: None
@@ -181,7 +198,9 @@ class PolicyServer:
         key = request.headers.get("Authorization")
         if self.api_key is not None and key != f"Api-Key {self.api_key}":
             return connection.respond(HTTPStatus.UNAUTHORIZED, "no\n")
-        return None if self.status is None else connection.respond(self.status, "no\n")
+        if self.status is not None:
+            return connection.respond(self.status, "no\n")
+        return connection.respond(HTTPStatus.OK, "OK\n") if request.path == "/healthz" else None
 
     async def _handle(self, connection: ServerConnection) -> None:
         self.connections += 1
@@ -189,7 +208,14 @@ class PolicyServer:
         while True:
             try:
                 data = await connection.recv()
-                answer = self._answer(msgpack.unpackb(data, object_hook=decode))
+                message = msgpack.unpackb(data, object_hook=decode)
+                answer = self._answer(message)
+                if answer is self.COMPILE:
+                    while connection.state is State.OPEN:
+                        time.sleep(0.12)
+                        await asyncio.sleep(0)  # here its keepalive wakes up
+                    self._call(message)
+                    return
                 if answer is self.CLOSE:
                     connection.transport.abort()
                     return
