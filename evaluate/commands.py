@@ -65,6 +65,7 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
 
     robomme-interference evaluate --policy websocket://localhost:8000 \
       --system perceptual-framesamp-modul --split S --out runs/mine \
+      --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999 \
       --conditions k0 k7 --families MoveCube RouteStick
 
     robomme-interference evaluate --policy lerobot:me/act@v1 \
