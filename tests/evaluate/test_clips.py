@@ -58,7 +58,7 @@ def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
     assert shown[0].shape == (280, 1024, 3)
     assert banner(shown[0]) == pytest.approx([0x55] * 3, abs=12)
     assert banner(shown[-1]) == pytest.approx([0xD5, 0x5E, 0x00], abs=12)
-    picture = history_picture(buffer, 0, 80)
+    picture = history_picture(buffer, range(80))
     assert np.abs(shown[0][24:, :256].astype(int) - picture).mean() < 10
     assert [path.name for path in (tmp_path / "videos").iterdir()] == ["MoveCube_test_0_k1.mp4"]
 
@@ -66,7 +66,7 @@ def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
 @pytest.mark.parametrize(("start", "stop"), [(0, 48), (48, 80), (40, 57), (3, 3)])
 def test_the_history_is_what_was_given(start: int, stop: int, buffer: Buffer) -> None:
     """In the colours of the sessions under each frame, and nowhere else."""
-    picture = history_picture(buffer, start, stop)
+    picture = history_picture(buffer, range(start, stop))
     colors = [bytes.fromhex(color[1:]) for color in session_colors(buffer.sessions)]
     found = []
     for place in range(64):
