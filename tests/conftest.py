@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -14,6 +15,9 @@ import hypothesis
 import pytest
 
 ROOT = Path(__file__).parent.parent
+
+# What a shell runs in its background begins with Ctrl-C ignored; tests press it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The libraries read these when they are imported, so they are set before any test module is.
 _SCRATCH = Path(tempfile.mkdtemp(prefix="robomme-interference-tests-"))

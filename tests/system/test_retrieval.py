@@ -57,7 +57,7 @@ def test_the_lesson_is_chosen_among_eight_sessions(episodes: Features) -> None:
         lesson, units = rows[:-1], units[:7]
         history = np.concatenate([lesson, *units])
         rule = Rule("max", Rule("max").threshold(typical))
-        start, stop = choose(embedded(history, rows[-1]), rule).span
+        ((start, stop),) = choose(embedded(history, rows[-1]), rule).spans
         shared = max(0, min(stop, len(lesson)) - start)
         purities.append(shared / (stop - start))
         coverages.append(shared / len(lesson))
