@@ -26,7 +26,7 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 

@@ -36,7 +36,7 @@ from robomme_interference_data.bootstrap import _drawn
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.evaluate.score.scoring import score
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.rows import arrow_schema
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")

@@ -33,11 +33,7 @@ from robomme_interference_data.files import (
 from robomme_interference_data.hub import HubFiles
 from robomme_interference_data.parquet import writing
 from robomme_interference_data.query import Query
-from robomme_interference_data.records import (
-    BufferManifest,
-    ManifestDataset,
-    ManifestHeader,
-)
+from robomme_interference_data.records import BufferManifest, ManifestDataset, ManifestHeader
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 _BATCH = 1024

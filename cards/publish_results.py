@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.score import Grid, Settings
 from robomme_interference_data.evaluate.score.scoring import Score, score, write_score
 from robomme_interference_data.files import canonical_json
 from robomme_interference_data.hub import HubFiles
-from robomme_interference_data.records import TIMING_COLUMNS
+from robomme_interference_data.rollouts import TIMING_COLUMNS
 from robomme_interference_data.rows import to_dict
 
 _SCORE = "score"

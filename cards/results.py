@@ -25,7 +25,7 @@ from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.files import sha256_file
-from robomme_interference_data.records import FINAL, Rollout
+from robomme_interference_data.rollouts import FINAL, Rollout
 from robomme_interference_data.tables import Table
 
 _GRIDS = {

@@ -19,7 +19,7 @@ from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.files import atomic_path
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.sampling import spread
 from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.strip import session_colors

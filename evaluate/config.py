@@ -7,7 +7,7 @@ from typing import Any
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.settings import setting
 from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP
 

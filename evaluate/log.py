@@ -30,7 +30,7 @@ from robomme_interference_data.files import (
     write_json,
 )
 from robomme_interference_data.parquet import writing
-from robomme_interference_data.records import FINAL, Rollout, Status
+from robomme_interference_data.rollouts import FINAL, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, from_dict, read_header, to_dict, to_table
 
 ERRORS_LOG = "errors.log"

@@ -15,7 +15,7 @@ from robomme_interference_data.evaluate.log import (
 )
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.files import LocalFiles
-from robomme_interference_data.records import TIMING_COLUMNS, Rollout
+from robomme_interference_data.rollouts import TIMING_COLUMNS, Rollout
 from robomme_interference_data.rows import to_dict
 
 _OWN = frozenset({*TIMING_COLUMNS, "attempt", "video"})

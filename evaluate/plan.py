@@ -9,7 +9,7 @@ from typing import Self
 from robomme_interference_data.conditions import in_order, parse_condition
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, count_numbers, format_numbers, parse_numbers
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 
 _SHARD = re.compile(r"(\d{1,6})/(\d{1,6})")
 

@@ -13,7 +13,7 @@ from rich.text import Text
 from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.evaluate.log import count_statuses, is_done
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.tables import Table
 
 

@@ -21,7 +21,7 @@ from robomme_interference_data.evaluate.policies.policy import Policy, RolloutIn
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.evidence import among
 from robomme_interference_data.execution import Worker
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.sampling import (
     MEMORIES,
     even_sample,

@@ -36,7 +36,7 @@ from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import Executor, Outcome, Processes, end_if_starting
 from robomme_interference_data.loading import load_split
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.split import Split
 

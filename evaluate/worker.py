@@ -23,7 +23,7 @@ from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.loading import load_split
-from robomme_interference_data.records import Rollout, Status
+from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.simulators.base import CAMERAS, Simulator
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.split import Split

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from robomme_interference_data.records import (
         BufferManifest,
         EpisodeRecord,
-        Rollout,
         Session,
         SessionEntry,
     )
+    from robomme_interference_data.rollouts import Rollout
     from robomme_interference_data.split import Split
 
 __all__ = [
@@ -54,6 +54,6 @@ __all__ = [
 
 __getattr__ = lazily(
     __name__,
-    *(".loading", ".split", ".buffer", ".cache", ".query", ".records", ".ids"),
-    *(".conditions", ".dataset", ".errors"),
+    *(".loading", ".split", ".buffer", ".cache", ".query", ".records", ".rollouts"),
+    *(".ids", ".conditions", ".dataset", ".errors"),
 )

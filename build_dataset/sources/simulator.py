@@ -12,7 +12,7 @@ from robomme_interference_data.build_dataset.sources.base import (
     Source,
     SourceEpisode,
 )
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.shifts import SHIFTS
 from robomme_interference_data.simulators.base import (
     Demonstration,

@@ -14,7 +14,7 @@ from robomme_interference_data.evaluate.score.cube import STATUSES, Cube, Flags,
 from robomme_interference_data.evaluate.score.ranks import cannot_be_told, to_best
 from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table, percent
 

@@ -12,7 +12,7 @@ from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.rows import Rows
 from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, name_system
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.stats import effective
 
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)

@@ -7,7 +7,7 @@ from pathlib import Path
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.rows import RELEASED_SIMULATOR, Rows
 from robomme_interference_data.files import atomic_path
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 
 RELEASED_COLUMNS = (
     *("family", "condition", "episode", "seed", "difficulty", "status", "success", "steps"),

@@ -22,7 +22,7 @@ from robomme_interference_data.evaluate.score.sources import (
 )
 from robomme_interference_data.evaluate.score.values import parsed, shifted, shown
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.shifts import NO_SHIFT
 
 RELEASED_SIMULATOR = "robomme"

@@ -30,7 +30,7 @@ from robomme_interference_data.evaluate.log import (
 )
 from robomme_interference_data.files import read_bytes
 from robomme_interference_data.parquet import open_parquet, read_table, reading
-from robomme_interference_data.records import KEY_COLUMNS, Rollout, Status
+from robomme_interference_data.rollouts import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.rows import arrow_schema, read_header
 
 Codes = NDArray[np.int64]

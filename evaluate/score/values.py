@@ -15,7 +15,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.score.sources import COLUMNS
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.records import FINAL, Status
+from robomme_interference_data.rollouts import FINAL, Status
 from robomme_interference_data.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import SIMULATORS
 

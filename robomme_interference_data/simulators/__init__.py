@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
-    from robomme_interference_data.records import Status
+    from robomme_interference_data.rollouts import Status
     from robomme_interference_data.simulators.base import (
         Demonstration,
         EpisodeInfo,

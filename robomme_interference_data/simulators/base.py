@@ -14,7 +14,8 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EvidenceSpan, Status
+from robomme_interference_data.records import EvidenceSpan
+from robomme_interference_data.rollouts import Status
 
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""

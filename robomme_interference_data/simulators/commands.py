@@ -57,7 +57,7 @@ def simulate(
     from robomme_interference_data.encode import CLIP, VideoEncoder
     from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId
-    from robomme_interference_data.records import Status
+    from robomme_interference_data.rollouts import Status
     from robomme_interference_data.simulators.registry import check_shift, make_simulator
 
     check_shift(simulator, shift)

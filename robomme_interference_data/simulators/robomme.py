@@ -22,7 +22,7 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators import robomme_worker
 from robomme_interference_data.simulators.base import (
     ACTION_SIZE,

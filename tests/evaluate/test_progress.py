@@ -12,7 +12,7 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.progress import RunProgress, rate_table
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 
 PLAN = [
     WorkItem(condition, EpisodeId(family, "test", index))

@@ -10,7 +10,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.compare import Comparison, compare
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.stats import newcombe_paired, wilson
 
 

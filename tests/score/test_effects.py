@@ -9,7 +9,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.stats import fieller, newcombe_paired, wilson
 
 

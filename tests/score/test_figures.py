@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.score.curves import Data, spread
 from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure
 from robomme_interference_data.evaluate.score.looks import Look, looks_of
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 
 
 def data(path: Path, rows: list[Rollout], paper: bool = False) -> Data:

@@ -9,7 +9,7 @@ from support import scoring as made
 from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.evaluate.score.paper import published
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 
 EPISODES = 50
 

@@ -13,7 +13,7 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.execution import Executor, Serial
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import TIMING_COLUMNS, Rollout
+from robomme_interference_data.rollouts import TIMING_COLUMNS, Rollout
 from robomme_interference_data.rows import to_dict
 
 CHEAT = "python:support.worlds:make_cheat"

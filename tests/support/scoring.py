@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.log import RunHeader
 from robomme_interference_data.evaluate.score import Against, Grid, Settings, commands
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.scoring import score as compute
-from robomme_interference_data.records import Rollout
+from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 BASE, RETRIEVAL, OWN = "perceptual-framesamp-modul", "retrieval-framesamp-modul", "my-memory"

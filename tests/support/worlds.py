@@ -17,7 +17,7 @@ from robomme_interference_data.constants import STATE
 from robomme_interference_data.errors import SimulatorCrashError
 from robomme_interference_data.evaluate.policies.policy import Frames, RolloutInfo
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 
 SPLIT = "WORLDS_SPLIT"

@@ -19,7 +19,7 @@ from support.worker_calls import wait_until_gone
 from robomme_interference_data.errors import WorkerRetiredError
 from robomme_interference_data.evaluate.log import read_record
 from robomme_interference_data.execution import Processes
-from robomme_interference_data.records import TIMING_COLUMNS
+from robomme_interference_data.rollouts import TIMING_COLUMNS
 from robomme_interference_data.rows import to_dict
 
 TESTS = Path(__file__).parent.parent

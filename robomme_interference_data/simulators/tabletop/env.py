@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, FPS
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evidence import spans_of_parts
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.shifts import Shift
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon

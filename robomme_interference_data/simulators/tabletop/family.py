@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.kit import Colour, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 

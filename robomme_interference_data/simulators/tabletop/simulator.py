@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.simulators.base import (
     CAMERAS,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.records import Status
+from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.families.pattern_lock import StickFamily
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
