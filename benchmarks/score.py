@@ -32,7 +32,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
-from robomme_interference_data.bootstrap import _drawn
+from robomme_interference_data.bootstrap import drawn_counts
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.evaluate.score.scoring import score
@@ -205,7 +205,7 @@ def write_rows(path: Path, repeats: int) -> Path:
 
 def ours(rows: Path, out: Path, draws: int) -> None:
     """Score with the package, the draws made anew: it keeps them from one call to the next."""
-    _drawn.cache_clear()
+    drawn_counts.cache_clear()
     out.mkdir(exist_ok=True)
     for name, found in score(Settings((rows,)), draws).tables.items():
         (out / f"{name}.csv").write_text(found.csv())

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.bootstrap import bootstrap, mean
+from robomme_interference_data.bootstrap import bootstrap
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.select import Measured, Rule, choose
@@ -170,7 +170,7 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     means = [(g.purity, g.coverage, g.evidence_kept, g.false_sessions) for g in grades]
     values = np.array(means, float)  # NaN for None
     # One key: equal values have equal intervals, whatever the rule, family and condition.
-    drawn = bootstrap(values, [mean(column) for column in range(4)], "retrieval")
+    drawn = bootstrap(values, "retrieval")
     bounds = (None if math.isnan(number) else number for one in drawn for number in one)
     cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
     passed = min(one.value for one in drawn[:2]) >= PASS_MARK

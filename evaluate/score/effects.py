@@ -16,7 +16,7 @@ from robomme_interference_data.bootstrap import (
     Interval,
     bootstrap,
     enough,
-    slope,
+    slope_weights,
 )
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.contrasts import START, Contrast, asked
@@ -82,13 +82,13 @@ def effects_of(
         )
         for (c, there), table in compared.items()
     ]
-    falling = [at[system, c] for c in ks] if len(ks) > 1 else []
-    line = [slope(falling, [parse_condition(c).k for c in ks])] if falling else []
-    drawn = bootstrap(values, line, cube.simulator, draws)
     decays = []
-    for one, fall in zip(line, drawn, strict=True):
-        changing = _together(values, one.columns)
-        known = fall if enough(one.combine(changing)) else Interval(fall.value)
+    if len(ks) > 1:
+        falling = [at[system, c] for c in ks]
+        each = values[:, falling] @ slope_weights([parse_condition(c).k for c in ks])
+        [fall] = bootstrap(each[:, None], cube.simulator, draws)
+        changing = each[~np.isnan(each)]
+        known = fall if enough(changing) else Interval(fall.value)
         whole = all(complete[place] for place in falling)
         decays.append((cube.simulator, system, " ".join(ks), len(changing), *known, whole))
     return contrasts, decays

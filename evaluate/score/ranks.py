@@ -116,9 +116,8 @@ def rank_table(cubes: Iterable[Cube], draws: int = DRAWS) -> Table:
                 [success(cube.status[cube.cell(s, condition)])[cube.expected] for s in systems],
                 axis=1,
             )
-            # Rounded: means of repeats that are equal may differ in the last bit.
-            means = drawn_means(values, cube.simulator, draws).round(12)
-            rates = values.mean(axis=0).round(12)
+            means = drawn_means(values, cube.simulator, draws)
+            rates = values.mean(axis=0).round(12)  # as those are: equal ones share a rank
             bounds = np.quantile(_ranks(means), (0.025, 0.975), axis=0, method="nearest").T
             rows += [
                 (cube.simulator, condition, system, float(rate), int(rank), int(low), int(high))
