@@ -67,14 +67,14 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
     """Return the ceiling of a memory on a split, by family and condition, and of all families.
 
     Raises:
-        UnknownNameError: There is no such memory, condition, encoder or method.
+        UnknownNameError: There is no such memory, condition, encoder, method or camera.
         InvalidOptionError: No lesson of the split has evidence, a setting of a retrieval step is
             given without one, or one is to choose under `no-history`.
         MissingFileError: The split has no views under the shift.
         MissingIndexError, StaleIndexError: See `measure`.
     """
     if config.memory not in MEMORIES:
-        raise UnknownNameError.none("memory", config.memory, MEMORIES)
+        raise UnknownNameError.among("memory", config.memory, "ceiling", MEMORIES)
     unusual_retrieval(config)
     if config.shift != NO_SHIFT and config.retrieval is None:
         raise InvalidOptionError(
@@ -144,7 +144,7 @@ def _given(split: Split, buffer: Buffer, config: CeilingConfig) -> Sequence[int]
     name = encoder_name(config.retrieval)
     rule = Rule.parse(config.retrieval_rule, published_threshold(name))
     under, camera = parse_shift(config.shift), config.retrieval_camera
-    seen = live_embedding(split, buffer.episode_id, under, name, camera)
+    seen = live_embedding(split, buffer, under, name, camera)
     return choose(measure(buffer, name, camera, seen), rule).frames.tolist()
 
 

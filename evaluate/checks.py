@@ -7,12 +7,11 @@ from functools import partial
 from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.constants import SPLITS
+from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
     SimulatorCrashError,
-    UnknownNameError,
 )
 from robomme_interference_data.evaluate.clips import check_drawing
 from robomme_interference_data.evaluate.config import RunConfig, unusual_retrieval
@@ -89,12 +88,12 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
         )
     Rule.parse(config.retrieval_rule)
     unusual_retrieval(config)
+    step = [] if config.retrieval is None else [config.retrieval_camera]
+    for camera in (*policy.history_cameras, *step):
+        split.datasets[DEMONSTRATIONS].shape(camera)  # refuses one that is not there
     _check_name(config, name_system(system))
     if config.videos:
         check_drawing()
-    for camera in policy.history_cameras:
-        if camera not in split.cameras:
-            raise UnknownNameError.among("camera", camera, split.location, split.cameras)
 
 
 def _check_name(config: RunConfig, system: System) -> None:

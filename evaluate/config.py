@@ -1,6 +1,6 @@
 """The settings of a run, each declared once: what Python gives, and the options of `evaluate`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,19 @@ from robomme_interference_data.settings import setting
 from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP
 
 
+@dataclass(frozen=True, kw_only=True)
+class RetrievalConfig:
+    """The retrieval step in front of a policy, or of a memory."""
+
+    retrieval: str | None = setting(None, help="Put a retrieval step with this encoder in front.")
+    retrieval_rule: str = setting("max", help="METHOD or METHOD/CUT, as for retrieval-score.")
+    retrieval_camera: str = setting(
+        "front", help="Camera whose frames the retrieval step compares."
+    )
+
+
 @dataclass(frozen=True)
-class RunConfig:
+class RunConfig(RetrievalConfig):
     """What to roll out, and how."""
 
     policy: str = setting(
@@ -41,13 +52,6 @@ class RunConfig:
         help="Options of the policy, such as device=cpu or response_s=60.",
     )
     model_seed: int = setting(0, help="Seed for the policy.")
-    retrieval: str | None = setting(
-        None, help="Put a retrieval step with this encoder in front of the policy."
-    )
-    retrieval_rule: str = setting("max", help="METHOD or METHOD/CUT, as for retrieval-score.")
-    retrieval_camera: str = setting(
-        "front", help="Camera whose frames the retrieval step compares."
-    )
     robomme_python: str | None = setting(
         None, help="Interpreter that has RoboMME.", env="ROBOMME_PYTHON"
     )
@@ -69,29 +73,22 @@ class RunConfig:
 
 
 @dataclass(frozen=True)
-class CeilingConfig:
+class CeilingConfig(RetrievalConfig):
     """Of which memory a ceiling is, and of which buffers."""
 
     memory: str = setting("framesamp", help="full, framesamp or window.")
     conditions: tuple[str, ...] = setting((), help="Conditions; by default all that are planned.")
-    retrieval: str | None = setting(
-        None, help="Put a retrieval step with this encoder in front of the memory."
-    )
-    retrieval_rule: str = setting("max", help="METHOD or METHOD/CUT, as for retrieval-score.")
-    retrieval_camera: str = setting(
-        "front", help="Camera whose frames the retrieval step compares."
-    )
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
 
 
-def unusual_retrieval(config: RunConfig | CeilingConfig) -> dict[str, str]:
+def unusual_retrieval(config: RetrievalConfig) -> dict[str, str]:
     """Return in what the retrieval step is not the paper's: setting to value.
 
     Raises:
         InvalidOptionError: Something is, and there is no retrieval step.
     """
-    step = {name: getattr(config, name) for name in ("retrieval_rule", "retrieval_camera")}
-    found = {name: value for name, value in step.items() if value != getattr(RunConfig, name)}
+    usual = {one.name: one.default for one in fields(RetrievalConfig) if one.name != "retrieval"}
+    found = {name: value for name in usual if (value := getattr(config, name)) != usual[name]}
     for name in found if config.retrieval is None else ():
         raise InvalidOptionError(
             f"--{name.replace('_', '-')} says nothing without a retrieval step",

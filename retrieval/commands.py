@@ -141,12 +141,12 @@ def retrieve(
     parsed = select.Rule.parse(rule, encoders.published_threshold(name))
     under, opened = parse_shift(shift), load_split(split)
     buffer = opened.load(episode, condition)
-    query = live_embedding(opened, buffer.episode_id, under, name, camera)
+    query = live_embedding(opened, buffer, under, name, camera)
     measured = select.measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
     found = reasons.reasons(buffer, measured, choice, parsed, name, camera)
     if out is not None:
-        live = live_frame(opened, buffer.episode_id, under, camera)
+        live = live_frame(opened, buffer, under, camera)
         drawing.draw_retrieval(buffer, measured, choice, found, live, out)
         say(f"{out} written")
     if as_json:
@@ -268,7 +268,7 @@ def _measured(
         progress.start(encoder, len(opened))
         for buffer in opened.buffers():
             if buffer.manifest.lesson_frames:
-                query = live_embedding(opened, buffer.episode_id, under, encoder, camera)
+                query = live_embedding(opened, buffer, under, encoder, camera)
                 measured.append(measure(buffer, encoder, camera, query))
             progress.advance(1)
     left_out = len(opened) - len(measured)

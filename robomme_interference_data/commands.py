@@ -125,7 +125,7 @@ def show(
     if out is not None:
         from robomme_interference_data.strip import draw_strip
 
-        live = live_frame(opened, buffer.episode_id, under, camera)
+        live = live_frame(opened, buffer, under, camera)
         draw_strip(buffer, out, camera=camera, live=live)
         say(f"{out} written")
     manifest, evidence = buffer.manifest, buffer.evidence

@@ -189,13 +189,14 @@ class Dataset:
             camera: Name of the camera, with or without `observation.images.`.
 
         Raises:
+            UnknownNameError: There is no such camera.
             MissingIndexError: The dataset has no embeddings of this encoder and camera.
             StaleIndexError: They were made of other data, or with another encoder.
             FormatError: They are of an unknown version, or damaged.
         """
         if not isinstance(encoder, str):
             raise InvalidOptionError.expected("encoder", encoder, "its name, such as 'thumbnail'")
-        key = encoder, camera_feature(camera)
+        key = encoder, self._camera(camera)
         if key not in self._indexes:
             self._indexes[key] = EmbeddingIndex(self.files, self.revision, encoder, camera)
         return self._indexes[key]

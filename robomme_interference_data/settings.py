@@ -107,11 +107,11 @@ def spread_values(arguments: Sequence[str], several: Sequence[str]) -> list[str]
 
 
 def _declared(config: Any) -> list[tuple[str, Any, dict[str, Any], Any]]:
-    """Return name, type, what was told, and default of each setting."""
+    """Return name, type, what was told, and default of each setting, keyword-only ones last."""
     hints = get_type_hints(config)
     return [
         (field.name, hints[field.name], field.metadata[_SETTING], field.default)
-        for field in dataclasses.fields(config)
+        for field in sorted(dataclasses.fields(config), key=lambda field: field.kw_only)
         if _SETTING in field.metadata
     ]
 

@@ -3,47 +3,49 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, SHIFTED
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.files import LocalFiles
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.shifts import SHIFTS, Shift
 from robomme_interference_data.split import Split
 from robomme_interference_data.split_index import SplitIndex
 
 
 def live_frame(
-    split: Split, episode_id: EpisodeId, shift: Shift | None, camera: str = "front"
+    split: Split, buffer: Buffer, shift: Shift | None, camera: str = "front"
 ) -> NDArray[np.uint8]:
-    """Decode a query's stored first live view, `(H, W, 3) uint8` RGB.
+    """Decode the stored first live view of a buffer's query, `(H, W, 3) uint8` RGB.
 
     Args:
         split: The split.
-        episode_id: The query.
+        buffer: A buffer of it.
         shift: How the scene differs from the lesson's; None if it does not.
         camera: Name of the camera.
 
     Raises:
-        UnknownNameError: There is no such camera or query.
+        UnknownNameError: There is no such camera, or no view of the query.
         MissingFileError: The split has no views under shifts, or a file is missing.
         FormatError, TruncatedVideoError: Its video cannot be read.
     """
-    dataset, episode, place = _stored(split, episode_id, shift)
-    [frame] = split.datasets[dataset].iter_frames(episode, camera, place, place + 1)
+    if shift is None:
+        return buffer.query.frame(camera)
+    views, place = _views(split), SHIFTS.index(shift)
+    [frame] = views.iter_frames(views.index_of(buffer.episode_id), camera, place, place + 1)
     return frame
 
 
 def live_embedding(
-    split: Split, episode_id: EpisodeId, shift: Shift | None, encoder: str, camera: str = "front"
+    split: Split, buffer: Buffer, shift: Shift | None, encoder: str, camera: str = "front"
 ) -> NDArray[np.float32]:
-    """Look up the embedding of a query's stored first live view, `(D,) float32`.
+    """Look up the embedding of the stored first live view of a buffer's query, `(D,) float32`.
 
     For grading without a simulator: in a rollout, what the robot sees is embedded then.
 
     Args:
         split: The split.
-        episode_id: The query.
+        buffer: A buffer of it.
         shift: As for `live_frame`.
         encoder: Name of the encoder.
         camera: Name of the camera.
@@ -52,17 +54,11 @@ def live_embedding(
         UnknownNameError, MissingFileError: As for `live_frame`.
         MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
     """
-    dataset, episode, place = _stored(split, episode_id, shift)
-    needed = {name: split.datasets[name] for name in (DISTRACTORS, dataset)}
-    return SplitIndex(needed, encoder, camera).span(dataset, episode, place, place + 1)[0]
-
-
-def _stored(split: Split, episode_id: EpisodeId, shift: Shift | None) -> tuple[str, int, int]:
-    """Return where a view is stored: dataset, episode index and frame."""
     if shift is None:
-        place = split.query(episode_id).place
-        return place.dataset, place.episode_index, place.frame
-    return SHIFTED, _views(split).index_of(episode_id), SHIFTS.index(shift)
+        return buffer.query_embedding(encoder, camera)
+    views, place = _views(split), SHIFTS.index(shift)
+    index = SplitIndex({DISTRACTORS: split.datasets[DISTRACTORS], SHIFTED: views}, encoder, camera)
+    return index.span(SHIFTED, views.index_of(buffer.episode_id), place, place + 1)[0]
 
 
 def _views(split: Split) -> Dataset:

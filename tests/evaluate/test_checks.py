@@ -78,6 +78,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"system": "perceptual-framesamp-modull"}, UnknownNameError, "reads like the system"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "--retrieval-rule says nothing"),
         ({"retrieval_camera": "wrist"}, InvalidOptionError, "--retrieval-camera says nothing"),
+        ({"retrieval": "thumbnail", "retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
         ({"retrieval": "thumbnail", "retrieval_rule": "best!"}, UnknownNameError, "best!"),
         ({"retrieval": "thumbnail"}, MissingIndexError, "'thumbnail'"),
         (SAYS | {"policy_options": ("what=text",)}, PolicyError, "returned a str"),

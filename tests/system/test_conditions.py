@@ -15,7 +15,7 @@ from support.runs import run as evaluate
 from support.shifted import add_shifted
 from support.splits import QUERIES
 
-from robomme_interference_data import EpisodeId, load_split
+from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import SHIFTED
 from robomme_interference_data.query import Query
@@ -179,11 +179,10 @@ def test_first_views_go_to_the_hub_and_back(
     assert code == 0, err
     assert len([*(part / SHIFTED).rglob("*.mp4")]) == 1  # of the one query
     for split, queries in ((there, QUERIES), (load_split(part), (QUERY,))):
-        for query, shift in product(map(EpisodeId.parse, queries), SHIFTS):
-            seen = live_frame(split, query, shift)
-            assert (seen == here.query(query).frame() >> SHIFTS.index(shift)).all()
-            found, expected = (
-                live_embedding(one, query, shift, "thumbnail") for one in (split, here)
-            )
-            assert (found == expected).all()
+        for query, shift in product(queries, SHIFTS):
+            seen, own = (one.load(query, "k0", cameras=["front"]) for one in (split, here))
+            view = live_frame(split, seen, shift)
+            assert (view == own.query.frame() >> SHIFTS.index(shift)).all()
+            found = live_embedding(split, seen, shift, "thumbnail")
+            assert (found == live_embedding(here, own, shift, "thumbnail")).all()
     assert list(verify_split(there)) == []
