@@ -165,6 +165,7 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
     """Return the paper's main table of each simulator: a row per system, a column per condition.
 
     Bold (between `**`) is what cannot be told from the best of its condition (see `Cell.best`).
+    The n that all rates have is told once, in the note; else each has its own.
     """
     grids = []
     whole = [cell for cell in cells if not cell.part]
@@ -172,13 +173,15 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         found = list(group)
         conditions = [one.name for one in in_order({cell.condition for cell in found})]
         at = {(cell.system, cell.condition): cell for cell in found}
+        episodes = {cell.n for cell in found if cell.n}
+        several = len(episodes) > 1
         rows = (
-            (display_name(system), *(_shown(at.get((system, c))) for c in conditions))
+            (display_name(system), *(_shown(at.get((system, c)), several) for c in conditions))
             for system in dict.fromkeys(cell.system for cell in found)
         )
         errors = sum(cell.errors for cell in found)
         bounds = dict.fromkeys(display_name(c.system) for c in found if is_bound(c.system))
-        note = _NOTE
+        note = _NOTE if several or not episodes else f"n = {episodes.pop()} in each cell. {_NOTE}"
         note += _BEST * any(cell.best for cell in found)
         note += f" Not ranked either, as they only show bounds: {', '.join(bounds)}." * bool(bounds)
         note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
@@ -187,7 +190,7 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
     return grids
 
 
-def _shown(cell: Cell | None) -> str:
+def _shown(cell: Cell | None, with_n: bool) -> str:
     if cell is None:
         return "–"
     errors = f", errors: {cell.errors}" if cell.errors else ""
@@ -196,7 +199,8 @@ def _shown(cell: Cell | None) -> str:
     low, high = cell.interval
     rate = f"**{percent(cell.rate)}**" if cell.best else percent(cell.rate)
     mark = "" if cell.complete else "†"
-    return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}] n={cell.n}{errors}"
+    n = f" n={cell.n}" if with_n else ""
+    return f"{rate}{mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
 
 
 def coverage_table(cells: Iterable[Cell]) -> Table:

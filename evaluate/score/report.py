@@ -6,7 +6,6 @@ import os
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from html import escape
 from importlib import metadata
 from itertools import pairwise
@@ -29,22 +28,15 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.files import sha256_file, write_text
 from robomme_interference_data.rows import to_dict
-from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import fill
 
 _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 
-_N = re.compile(r" n=([0-9]+)")
-
 _SHOWN_IN = {
-    **{
-        "effects": ("lift", "effects"),
-        "success": ("main", "paper"),
-        "families": ("family", "paper_family"),
-    },
-    **{"difficulty": ("difficulty",), "heatmap": ("family",)},
-    **{"families": ("family", "paper_family")},
+    **{"effects": ("lift", "effects"), "success": ("main", "paper")},
+    **{"families": ("family", "paper_family"), "heatmap": ("family",)},
+    **{"difficulty": ("difficulty",), "retention": ("lift",)},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
     **{"access": ("access",), "ceiling": ("ceiling",), "matrix": ("matrix", "systems", "ranks")},
 }
@@ -74,7 +66,7 @@ def write_report(
     conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
     values = {
         "headlines": {simulator: headline(score, simulator) for simulator in score.cubes},
-        "grids": [with_one_n(grid) for grid in score.grids],
+        "grids": score.grids,
         "tables": score.tables.values(),
         "systems": _names(score),
         "known": {name: system.display for name, system in SYSTEMS.items()},
@@ -90,15 +82,6 @@ def write_report(
     }
     html = fill(__package__, "report.html.j2", values, what="the report", autoescape=True)
     write_text(out, html)
-
-
-def with_one_n(grid: Table) -> Table:
-    """Return a grid of which each cell has the same n with that in the note alone."""
-    found = {match[1] for row in grid.rows for text in row[1:] if (match := _N.search(text))}
-    if len(found) != 1:
-        return grid
-    rows = [(row[0], *(_N.sub("", text) for text in row[1:])) for row in grid.rows]
-    return replace(grid, rows=tuple(rows), note=f"n = {found.pop()} in each cell. {grid.note}")
 
 
 def _number(text: str) -> str:

@@ -202,7 +202,7 @@ def write_score(
     texts |= {f"{name}.md": table.markdown() for name, table in score.tables.items()}
     texts |= {f"{name}.tex": table.latex() for name, table in score.tables.items()}
     texts["main.md"] = "\n".join(grid.markdown() for grid in score.grids)
-    texts["main.tex"] = "\n".join(report.with_one_n(grid).latex() for grid in score.grids)
+    texts["main.tex"] = "\n".join(grid.latex() for grid in score.grids)
     for name, text in texts.items():
         write_text(out / "tables" / name, text)
     for suffix, text in zip((".md", ".bib"), methods.methods(score), strict=True):

@@ -100,7 +100,7 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert f"left out: {path}, line 3: family 'MoveCub'" in done.stderr
     assert "1 bad rows left out" in done.stderr
-    assert "my-memory  100.0% [20.7, 100.0] n=1" in done.stdout
+    assert "my-memory  100.0% [20.7, 100.0]\n" in done.stdout
     assert "family &#39;MoveCub&#39;" in (tmp_path / "out" / "report.html").read_text()
     assert isinstance(run("compare", path, path).exception, BadRowsError)
     done = run("compare", path, path, "--lenient", "--json")
