@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from robomme_interference_data.evaluate.score import families
 from robomme_interference_data.evaluate.score.cube import Cube
 from robomme_interference_data.evaluate.score.report import versions
 from robomme_interference_data.evaluate.score.scoring import Score
@@ -38,6 +39,7 @@ def methods(score: Score) -> tuple[str, str]:
         "retention": any(one["retention"] is not None for one in lifts),
         "margin": score.settings.margin,
         "draws": score.draws,
+        "family_draws": families.DRAWS,
         "versions": versions(),
         "notes": " ".join(score.notes),
     }

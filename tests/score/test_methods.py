@@ -38,6 +38,7 @@ def test_methods_are_those_of_the_rows(tmp_path: Path) -> None:
         assert told in text
     names = cited(found)
     assert {"wilson1927", "mcnemar1947", "holm1979", "fieller1954", "newcombe1998"} <= names
+    assert "davison1997" in names  # of several families
     assert not {"fisher1935", "schuirmann1987"} & names  # no repeats, no margin
 
 

@@ -129,6 +129,10 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
             "[...document.querySelectorAll('[data-system]:not(.dim)')].map(e => e.dataset.system)"
         )
         assert set(page.run(apart)) == {OWN}
+        # The others' names can still be read: #222 of 62% on white has a contrast of 4.5.
+        names = "[...document.querySelectorAll('.dim:has(text)')]"
+        strengths = page.run(f"{names}.map(e => Number(getComputedStyle(e).opacity))")
+        assert strengths and min(strengths) > 0.62
 
         # Every episode; then only those that flip; then of one system.
         rows = "#table-episodes tbody tr"
