@@ -111,7 +111,7 @@ def _declared(config: Any) -> list[tuple[str, Any, dict[str, Any], Any]]:
     hints = get_type_hints(config)
     return [
         (field.name, hints[field.name], field.metadata[_SETTING], field.default)
-        for field in sorted(dataclasses.fields(config), key=lambda field: field.kw_only)
+        for field in sorted(dataclasses.fields(config), key=lambda field: field.kw_only is True)
         if _SETTING in field.metadata
     ]
 
