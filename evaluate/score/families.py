@@ -1,7 +1,7 @@
 """Comparisons family by family, whether families differ, and what is said beyond these nine."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.bootstrap import LEAST, Floats, enough, generator_of
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.contrasts import Contrast
-from robomme_interference_data.evaluate.score.cube import Cube, Flags, success
+from robomme_interference_data.evaluate.score.cube import Cube, success
 from robomme_interference_data.evaluate.score.pairs import (
     COLUMNS,
     corrected,
@@ -21,6 +21,8 @@ from robomme_interference_data.tables import Provisional, Table
 
 DRAWS = 2000
 """Permutations, and draws of families and episodes."""
+
+_CHUNK = 2**18  # numbers that are dealt out at a time
 
 _TABLES = ("lift", "effects", "interference")
 
@@ -108,7 +110,8 @@ def over_families(
 
     The permutation test: with the sum Sᶠ of a family's nᶠ differences, Σ Sᶠ² / nᶠ is the larger the
     more families differ; p is the share of the draws that deal the episodes out to the families
-    anew and reach the observed value, itself counted as one of them.
+    anew and reach the observed value, itself counted as one of them. Families and episodes that are
+    not known take no part in any draw.
 
     Source: Davison and Hinkley (1997), Bootstrap Methods and their Application, sections 3.8 (draws
     of clusters, then within them) and 4.3 (permutations).
@@ -123,57 +126,62 @@ def over_families(
         Of each comparison: the mean of the families' means; its 95% interval for these families,
         and for a sample of such families, NaN where fewer than ten episodes differ; p.
     """
+    masks, place = np.unique(~np.isnan(values), axis=1, return_inverse=True)
+    found: list[tuple[float, ...]] = [()] * values.shape[1]
+    # Most comparisons lack the same episodes, mostly none: each set of them is drawn from once.
+    for at, known in enumerate(masks.T):
+        mine = np.flatnonzero(place == at)
+        told = _over(values[np.ix_(known, mine)], labels[known], key, draws)
+        for column, one in zip(mine.tolist(), told, strict=True):
+            found[column] = one
+    return found
+
+
+def _over(
+    values: Floats, labels: NDArray[np.int64], key: str, draws: int
+) -> Iterator[tuple[float, ...]]:
+    """Yield what `over_families` returns, of values without a hole."""
     order = np.argsort(labels, kind="stable")
     labels, values = labels[order], values[order]
     starts = np.flatnonzero(np.diff(labels, prepend=-1))
-    known: Flags = ~np.isnan(values)
-    # Most comparisons lack the same episodes, mostly none: each mask is summed once.
-    masks, place = np.unique(known, axis=1, return_inverse=True)
-    both = np.concatenate([np.where(known, values, 0.0), masks], axis=1)
+    sizes = np.diff(starts, append=len(labels))[:, None]
     generator = generator_of(f"{key}, families")
 
-    def apart(at: Floats) -> tuple[Floats, Floats]:
-        return at[..., : len(place)], at[..., len(place) :][..., place]
+    def spread(deals: NDArray[np.int64]) -> Floats:
+        sums = np.add.reduceat(values[deals], starts, axis=1)
+        return np.asarray((sums * sums / sizes).sum(axis=1).round(9))
 
-    def spread(rows: Floats) -> Floats:
-        sums, counts = apart(np.add.reduceat(rows, starts, axis=0))
-        return np.asarray((sums * sums / np.maximum(counts, 1)).sum(axis=0).round(9))
-
-    observed = spread(both)
-    reached = sum(spread(generator.permutation(both)) >= observed for _ in range(draws))
+    every = np.arange(len(values))[None]
+    observed, step = spread(every), max(1, _CHUNK // values.size)
+    reached = sum(
+        (spread(generator.permuted(every.repeat(size, 0), axis=1)) >= observed).sum(axis=0)
+        for size in (min(step, draws - at) for at in range(0, draws, step))
+    )
     p = (1 + np.asarray(reached)) / (1 + draws)
 
-    sums, counts = apart(np.add.reduceat(both, starts, axis=0))
-    alike = _mean(sums[None], counts[None], np.ones((1, len(starts))))[0]
+    alike = (np.add.reduceat(values, starts, axis=0) / sizes).mean(axis=0)
     taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
-    intervals = []
+    parts, intervals = np.split(values, starts[1:]), []
     for often in (np.ones_like(taken), taken):
-        drawn = [
-            generator.multinomial(often[:, n] * len(part), np.full(len(part), 1 / len(part))) @ part
-            for n, part in enumerate(np.split(both, starts[1:]))
-        ]
-        means = _mean(*apart(np.stack(drawn, axis=1)), often.astype(float))
-        intervals.append(np.nanquantile(means, (0.025, 0.975), axis=0))
-    return [
-        (
+        drawn = sum(_resampled(part, often[:, n], generator) for n, part in enumerate(parts))
+        intervals.append(np.quantile(drawn / len(starts), (0.025, 0.975), axis=0))
+    for n, column in enumerate(values.T):
+        bounds = np.concatenate(intervals)[:, n].tolist()
+        yield (
             float(alike[n]),
-            *(
-                float(bound[n]) if enough(values[known[:, n], n]) else math.nan
-                for bounds in intervals
-                for bound in bounds
-            ),
+            *(bounds if enough(column) else [math.nan] * len(bounds)),
             float(p[n]),
         )
-        for n in range(values.shape[1])
-    ]
 
 
-def _mean(sums: Floats, counts: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean of the families' means, `(D, K)`, of `(D, F, K)` and `(D, F)`.
+def _resampled(values: Floats, often: NDArray[np.int64], generator: np.random.Generator) -> Floats:
+    """Return the sums of so many resampled means of a family's episodes, `(D, K)`.
 
-    A family without an episode has no weight; NaN where none has any.
+    Args:
+        values: Of the family, `(N, K) float64`; equal rows are drawn together.
+        often: How many means each draw adds up, `(D,) int64`.
+        generator: Random numbers.
     """
-    means = sums / np.maximum(counts, 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        total = np.einsum("dfk,df->dk", means, weights)
-        return np.asarray(total / np.einsum("dfk,df->dk", counts > 0, weights))
+    rows, counts = np.unique(values, axis=0, return_counts=True)
+    drawn = generator.multinomial(often * len(values), counts / len(values))
+    return np.asarray(drawn @ rows / len(values))

@@ -74,6 +74,17 @@ def test_missing_episodes_do_not_count_in_families() -> None:
     assert alike == 0.5 and all(map(math.isnan, bounds))
 
 
+def test_families_that_never_ran_take_no_part_in_draws() -> None:
+    numbers = np.random.default_rng(0)
+    three = np.sign(numbers.normal([[-0.6], [0.0], [0.5]], size=(3, 50))).reshape(-1, 1)
+    nine = np.concatenate([three, np.full((300, 1), np.nan)])
+    labels = np.repeat(np.arange(9), 50)
+    assert over_families(nine, labels, "key") == over_families(three, labels[:150], "key")
+    # Beside a comparison of all nine, too.
+    both = np.concatenate([nine, np.ones((450, 1))], axis=1)
+    assert over_families(both, labels, "key")[0] == over_families(three, labels[:150], "key")[0]
+
+
 def test_one_family_has_nothing_to_be_compared_with(tmp_path: Path) -> None:
     given = {(BASE, "k0"): "sss", (BASE, "k7"): "sff"}
     found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
