@@ -145,7 +145,7 @@ def power(
         "noise floor: two equal systems differ by up to": f"±{100 * found.noise:.1f} points (95%)",
         "smallest difference that is found with 80% power": least,
         f"power to find {margin:g} points": f"{found.power:.0%}",
-        f"episodes that find {margin:g} points with 80% power": f"about {found.needed:,}",
+        f"episodes that find {margin:g} points with 80% power": f"{found.needed:,}",
         "smallest margin of an equivalence, with 80% power": f"±{100 * found.equal:.1f} points",
     }
     typer.echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by themselves\n")

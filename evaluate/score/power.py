@@ -38,7 +38,7 @@ class Plan:
         noise: How far apart two equal systems come out in 95% of comparisons: z √(f / n).
         power: Probability that McNemar's exact test finds a difference of `margin` at 5%.
         smallest: Smallest difference that it finds with 80% power; None if it finds none.
-        needed: About how many episodes a difference of `margin` needs for 80% power.
+        needed: How many episodes find a difference of `margin` with 80% power (see `needed`).
         equal: Smallest margin within which two equal systems are shown to be so, by two one-sided
             tests at 5%, with 80% power: (z(95%) + z(90%)) √(f / n), one-sided quantiles.
     """
@@ -77,12 +77,10 @@ def plan(margin: float, episodes: int, flips: float) -> Plan:
             "A difference adds its own flips to those: their sum is 1 at most.",
         )
     noise = math.sqrt(flips / episodes)
-    both, spread = flips + margin, math.sqrt(flips + margin - margin**2)
-    found = z_of(1 - SURE) * math.sqrt(both) + z_of(2 * POWER - 1) * spread
     return Plan(
         *(episodes, flips, margin, z_of(0.95) * noise, power(margin, episodes, flips)),
         smallest=smallest(episodes, flips),
-        needed=math.ceil((found / margin) ** 2),
+        needed=needed(margin, flips),
         equal=(z_of(1 - 2 * SURE) + z_of(POWER)) * noise,
     )
 
@@ -92,9 +90,6 @@ def power(margin: float, episodes: int, flips: float) -> float:
 
     Flips are d of n with Binomial(n, f + δ), and of these Binomial(d, (f / 2) / (f + δ)) go
     against the difference; the test finds it where p is at most 0.05. Summed over all d that occur.
-
-    Source of the approximation that `Plan.needed` is: Connor (1987), Sample size for testing
-    differences in proportions for the paired-sample design, Biometrics 43, 207–211.
     """
     both = flips + margin
     reach = 8 * math.sqrt(episodes * both) + 8
@@ -113,6 +108,28 @@ def power(margin: float, episodes: int, flips: float) -> float:
     flipping = logs[episodes] - logs[d] - logs[episodes - d]
     flipping = flipping + _powers(both, d) + _powers(1 - both, episodes - d)
     return float(np.exp(flipping) @ found.sum(axis=1))
+
+
+def needed(margin: float, flips: float) -> int:
+    """Return how many episodes find a difference with 80% power; one fewer would not.
+
+    Where they are more than `MOST` it is the normal approximation with a continuity correction,
+    the n of n δ − 1 = (z √(f + δ) + z' √(f + δ − δ²)) √n, whose power is 80% or somewhat more.
+
+    Source: Connor (1987), Sample size for testing differences in proportions for the paired-sample
+    design, Biometrics 43, 207–211; the correction: Edwards (1948), Psychometrika 13, 185–187.
+
+    Args:
+        margin: The difference, a fraction.
+        flips: Share of the episodes that flips by itself.
+    """
+    both = flips + margin
+    wide = z_of(1 - SURE) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
+    low, high = 0, math.ceil(((wide + math.sqrt(wide**2 + 4 * margin)) / 2 / margin) ** 2)
+    while high <= MOST and high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if power(margin, middle, flips) >= POWER else (middle, high)
+    return high
 
 
 def _powers(base: float, exponents: NDArray[np.int64]) -> NDArray[np.float64]:

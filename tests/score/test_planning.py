@@ -13,7 +13,7 @@ from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score import Grid, Settings
 from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.power import plan, power, smallest
+from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
 from robomme_interference_data.stats import newcombe, newcombe_paired
 
 # --- equivalence -------------------------------------------------------------------------------
@@ -82,8 +82,14 @@ def test_a_plan_by_hand() -> None:
     # 1.959964 · √(0.06/450), and (1.644854 + 1.281552) · √(0.06/450)
     assert found.noise == pytest.approx(0.0226317, abs=1e-7)
     assert found.equal == pytest.approx(0.0337912, abs=1e-7)
-    # (1.959964 · √0.11 + 0.841621 · √(0.11 − 0.0025))² / 0.05² = 0.8580… / 0.0025
-    assert found.needed == 343
+    # The normal approximation, (1.959964 · √0.11 + 0.841621 · √(0.11 − 0.0025))² / 0.05² = 343,
+    # has a power of 77% only.
+    assert power(0.05, 343, 0.06) < 0.78
+    assert power(0.05, found.needed, 0.06) >= 0.8 > power(0.05, found.needed - 1, 0.06)
+    # All of six are the fewest that can be found at all.
+    assert needed(1.0, 0.0) == 6
+    # More than are summed over, by the approximation.
+    assert needed(0.005, 0.06) == 20_803
     assert found.smallest is not None and found.smallest < 0.05 and found.power > 0.8
     assert power(found.smallest, 450, 0.06) == pytest.approx(0.8, abs=0.002)
 
@@ -114,9 +120,9 @@ def test_power_on_the_command_line() -> None:
     words = ("power", "--margin", "5", "--episodes", "450", "--flips", "0.06")
     done = run(*words)
     assert done.exit_code == 0
-    assert "±2.3 points (95%)" in done.stdout and "about 343" in done.stdout
+    assert "±2.3 points (95%)" in done.stdout and "with 80% power         367" in done.stdout
     value = json.loads(run(*words, "--json").stdout)
-    assert value["needed"] == 343 and value["margin"] == 0.05
+    assert value["needed"] == 367 and value["margin"] == 0.05
 
 
 def test_tables_tell_what_they_could_show(tmp_path: Path) -> None:
