@@ -91,6 +91,8 @@ def read_chunks(path: Path) -> list[list[Chunk]]:
         end = file.seek(0, 2)
         file.seek(max(0, end - 8))
         size = int.from_bytes(file.read(4), "little")
+        if file.read(4) != b"PAR1":
+            raise ValueError("it does not end as a parquet file does")
         if not 0 < size <= min(MOST_FOOTER, end - 12):
             raise ValueError(f"{size:,} bytes of metadata; at most {MOST_FOOTER:,} are read")
         file.seek(end - 8 - size)

@@ -62,11 +62,17 @@ def compare(
     """
     if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
         raise InvalidOptionError(
-            f"conditions to compare: {' '.join(conditions) or 'none'}; expected two, or two runs",
+            f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
+            "ones, or two runs",
             f"To set k7 against k0 of one run: compare {first} --conditions k0 k7",
         )
     for name in conditions:
         parse_condition(name)
+    if second is not None and first.exists() and second.exists() and first.samefile(second):
+        raise InvalidOptionError(
+            f"{first} is given twice",
+            f"To set two conditions of it against each other: compare {first} --conditions k0 k7",
+        )
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
     _check_scenes(one, other)
@@ -85,10 +91,15 @@ def compare(
         if a.repeats(b, one, other) and not conditions:
             notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in common})
     if not found:
+        runs = " and ".join(str(path) for path in (first, second) if path)
+        under = " and ".join(conditions) or "a common condition"
+        there = [
+            "; ".join(f"{b.system}: {', '.join(b.conditions)}" for b in one.values())
+            for one in sides
+        ]
         raise InvalidOptionError(
-            f"{' and '.join(str(path) for path in (first, second) if path)} have no episode under "
-            f"{' and '.join(conditions) or 'a common condition'} that counts on both sides",
-            "Compare runs over the same episodes.",
+            f"no episode of {runs} counts on both sides under {under}",
+            f"There are {' and '.join(dict.fromkeys(there))}. Compare the same episodes.",
         )
     notes += _left_out("a", sides[0].values(), dict(met), conditions)
     notes += _left_out("b", sides[1].values(), {b: a for a, b in met}, conditions[::-1])

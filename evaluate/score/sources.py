@@ -129,7 +129,7 @@ def _match(path: Path, names: Sequence[str], with_system: bool) -> dict[str, str
     needed = dict.fromkeys((*KEY_COLUMNS, *_NEEDED) if ran else _NEEDED)
     if missing := [name for name in needed if name not in ours]:
         raise FormatError(
-            f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(names)}",
+            f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(names) or 'none'}",
             "Expected the rows of a run, or of the released CSVs (docs/score.md).",
         )
     if "system" not in ours and not with_system:

@@ -107,8 +107,11 @@ def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:
     assert len(found.runs) == 1 and "noise" not in " ".join(found.notes)
     with pytest.raises(InvalidOptionError, match="conditions to compare: none"):
         compare(tmp_path / "a.csv")
-    with pytest.raises(InvalidOptionError, match="no episode under k0 and k3"):
+    with pytest.raises(InvalidOptionError, match=r"no episode of .* under k0 and k3") as none:
         compare(tmp_path / "a.csv", conditions=("k0", "k3"))
+    assert f"{BASE}: k0; {OWN}: k0, k7" in str(none.value)
+    with pytest.raises(InvalidOptionError, match="given twice"):
+        compare(tmp_path / "a.csv", tmp_path / "a.csv")
 
 
 def test_what_a_shift_costs_is_measured(tmp_path: Path) -> None:
@@ -124,8 +127,8 @@ def test_what_a_shift_costs_is_measured(tmp_path: Path) -> None:
     [
         ({"simulator": "robomme"}, "the rows are of different simulators: tabletop and robomme"),
         ({"seed": 77}, "has the seed 0 in one run and 77 in the other"),
-        ({"episode_split": "val"}, "no episode under a common condition"),
-        ({"condition": "k9"}, "no episode under a common condition"),
+        ({"episode_split": "val"}, "counts on both sides under a common condition"),
+        ({"condition": "k9"}, "counts on both sides under a common condition"),
         ({"system": "other"}, ""),
     ],
 )
