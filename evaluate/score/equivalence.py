@@ -9,7 +9,7 @@ from robomme_interference_data.evaluate.score.pairs import Pairs, apart
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.tables import Table
 
-EQUIVALENT, OPEN = "equivalent", "not shown"
+EQUIVALENT, BEYOND, OPEN = "equivalent", "beyond", "not shown"
 
 
 def equivalence_table(
@@ -50,7 +50,7 @@ def equivalence_table(
         rows,
         f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference lies "
         "within the margin, which is to be stated before the rows are looked at; "
-        f"{OPEN} means neither equal nor different. The intervals are of the kinds that the other "
+        f"{BEYOND} if it lies outside it; {OPEN} means neither. The intervals are of the kinds that the other "
         "tables have; against published rates nothing is paired. Not corrected for their number. "
         "†: provisional, as a cell is not complete.",
     )
@@ -67,6 +67,8 @@ def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterato
 
 
 def verdict(pairs: Pairs, margin: float) -> str:
-    """Return whether a difference is shown to be within ± a margin, in points."""
+    """Return whether a difference is shown to be within ± a margin, in points, or beyond it."""
     low, high = (100 * bound for bound in pairs.within[1:])
-    return EQUIVALENT if -margin < low and high < margin else OPEN
+    if -margin < low and high < margin:
+        return EQUIVALENT
+    return BEYOND if high < -margin or margin < low else OPEN

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from robomme_interference_data.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.evaluate.score.cells import Cell
 from robomme_interference_data.evaluate.score.contrasts import START, Contrast
-from robomme_interference_data.evaluate.score.equivalence import EQUIVALENT, OPEN
+from robomme_interference_data.evaluate.score.equivalence import BEYOND, EQUIVALENT, OPEN
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of, display_name, is_bound
 from robomme_interference_data.significance import holm
@@ -159,6 +159,7 @@ def _equal(score: Score, fall: Contrast) -> list[str]:
             whose += " published" * (one["against_rows"] == "published")
             shown = {
                 EQUIVALENT: f"is equivalent to {whose} {START} within ±{margin} points",
+                BEYOND: f"is more than {margin} points from {whose} {START}",
                 OPEN: f"is not shown to be within ±{margin} points of {whose} {START}",
             }[one["verdict"].rstrip("†")]
             early = ", provisional" * one["verdict"].endswith("†")
