@@ -50,8 +50,9 @@ def equivalence_table(
         rows,
         f"Two one-sided tests at 5%: {EQUIVALENT} if the 90% interval of the difference lies "
         "within the margin, which is to be stated before the rows are looked at; "
-        f"{BEYOND} if it lies outside it; {OPEN} means neither. The intervals are of the kinds that the other "
-        "tables have; against published rates nothing is paired. Not corrected for their number. "
+        f"{BEYOND} if it lies outside it; {OPEN} means neither. The intervals are of the kinds "
+        "that the other tables have; against published rates nothing is paired. Not corrected for "
+        "their number. "
         "†: provisional, as a cell is not complete.",
     )
 
