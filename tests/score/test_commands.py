@@ -5,6 +5,7 @@ import html
 import json
 import re
 import shlex
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,11 @@ from robomme_interference_data.evaluate.score.scoring import TABLES, write_score
 
 def files(folder: Path) -> set[str]:
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+
+
+def again(path: Path) -> Path:
+    """Another file of the same rows."""
+    return Path(shutil.copyfile(path, path.with_name(f"again-{path.name}")))
 
 
 @pytest.fixture
@@ -80,9 +86,9 @@ def test_what_is_printed(tmp_path: Path) -> None:
     assert lines[2].split() == ["system", "no-history", "k0", "k1", "k3", "k7"]
     assert "**58.3%** [32.0, 80.7] n=12" in lines[4]
     assert "Rows of tabletop are not set against the paper's RoboMME." in done.stderr
-    done = run("compare", path, path)
+    done = run("compare", path, again(path))
     assert done.stdout.startswith("Two runs compared\n\nsimulator")
-    value = json.loads(run("compare", path, path, "--json").stdout)
+    value = json.loads(run("compare", path, again(path), "--json").stdout)
     assert value["bad_rows"] == [0, 0] and len(value["rows"]) == 27
     for command in ("score", "compare"):
         help_text = run(command, "--help").stdout
@@ -102,8 +108,8 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     assert "1 bad rows left out" in done.stderr
     assert "my-memory  100.0% [20.7, 100.0]\n" in done.stdout
     assert "family &#39;MoveCub&#39;" in (tmp_path / "out" / "report.html").read_text()
-    assert isinstance(run("compare", path, path).exception, BadRowsError)
-    done = run("compare", path, path, "--lenient", "--json")
+    assert isinstance(run("compare", path, again(path)).exception, BadRowsError)
+    done = run("compare", path, again(path), "--lenient", "--json")
     assert json.loads(done.stdout)["bad_rows"] == [1, 1]
     assert done.stderr.count("family 'MoveCub'") == 2
 
@@ -118,11 +124,11 @@ def test_a_name_that_is_none_is_a_bad_option_not_bad_rows(
     path = made.write_csv(tmp_path / "a.csv", made.rows())
     for given in (
         ("score", path, "--system", name, "--out", tmp_path / "out", "--lenient"),
-        ("compare", path, path, "--system-b", name),
+        ("compare", path, again(path), "--system-b", name),
     ):
         done = run(*given)
         assert isinstance(done.exception, error) and repr(name) in str(done.exception)
-    assert files(tmp_path) == {"a.csv"}
+    assert files(tmp_path) == {"a.csv", "again-a.csv"}
 
 
 # --- the folder of a score ---------------------------------------------------------------------

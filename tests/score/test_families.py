@@ -62,6 +62,10 @@ def test_whether_families_differ_by_hand() -> None:
     values = np.array([1.0, 1.0, 0.0, 0.0])[:, None]
     ((*_, p),) = over_families(values, np.array([0, 0, 1, 1]), "key")
     assert p == pytest.approx(1 / 3, abs=0.04)
+    # One of ten that count is gained, in the family of four: it falls there in 4 of 10 draws.
+    gained = np.array([0.0, 1.0, np.nan, 0.0, 0.0, np.nan] + [0.0] * 6)[:, None]
+    ((*_, p),) = over_families(gained, np.repeat([0, 1], 6), "key")
+    assert p == pytest.approx(0.4, abs=0.04)
     # Where families are alike, every draw is as far apart.
     ((*_, p),) = over_families(np.ones((4, 1)), np.array([0, 1, 0, 1]), "key")
     assert p == 1.0

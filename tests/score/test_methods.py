@@ -47,7 +47,7 @@ def test_methods_of_part_of_a_grid_with_repeats(tmp_path: Path) -> None:
     both = made.write_parquet(tmp_path / "a.parquet", [*rows, *made.changed(rows, model_seed=1)])
     found = made.score(both, margin=5.0)
     text, _ = methods(found)
-    for told in ("with 2 model seeds", "6 of 10 cells", "2 rollouts that broke", "of 5.0 points"):
+    for told in ("with 2 model seeds", "6 of 10 cells", "2 rollouts that broke", "of 5 points"):
         assert told in text
     assert {"fisher1935", "kish1965", "schuirmann1987"} <= cited(found)
 
