@@ -15,7 +15,7 @@ SURE = 0.05
 """Below this p something is taken as found."""
 
 _LATTICE = 27720  # divided by every number up to 12: means of so many repeats lie on it exactly
-_STEPS = 12
+_STEPS = 20  # of five repeats and of four of them, where one broke
 
 
 def mcnemar(gained: int, lost: int) -> tuple[float, float]:
@@ -47,8 +47,8 @@ def sign_flip(differences: NDArray[np.float64]) -> tuple[float, float]:
     observed one, or farther; the mid-p counts those that are as far by half, and is 1 where the
     observed sum is 0. Of differences of single rollouts, −1, 0 and 1, it is McNemar's exact test.
 
-    The differences are whole numbers of some common step. Where the largest is more than twelve
-    such steps, as of more than twelve repeats, they are rounded to twelfths: as exact a test, of
+    The differences are whole numbers of some common step. Where the largest is more than twenty
+    such steps, as of many repeats, they are rounded to twentieths: as exact a test, of
     slightly other numbers.
 
     Source: Fisher (1935), The Design of Experiments, section 21; Edgington and Onghena (2007),

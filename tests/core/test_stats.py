@@ -145,10 +145,18 @@ def test_sign_flips_are_counted(differences: list[float]) -> None:
     assert mid == pytest.approx((above + equal / 2) / len(sums) if observed > 1e-9 else 1)
 
 
-def test_sign_flips_of_many_repeats_are_of_twelfths() -> None:
-    # Thirteenths of 3, 6 and −1 are 2.8, 5.5 and −0.9 twelfths, hence 3, 6 and −1.
+def test_sign_flips_of_many_repeats_are_of_twentieths() -> None:
+    # Thirteenths of 3, 6 and −1 are 4.6, 9.2 and −1.5 twentieths, hence 5, 9 and −2.
     found = sign_flip(np.array([3, 6, -1]) / 13)
-    assert found == sign_flip(np.array([3, 6, -1]) / 12) == (0.5, 0.375)
+    assert found == sign_flip(np.array([5, 9, -2]) / 20) == (0.5, 0.375)
+
+
+def test_sign_flips_of_five_repeats_are_exact_where_one_broke() -> None:
+    # In twentieths 16, −12, −4 and 15, with the sum 15. Of the sums ±16 ± 12 ± 4, ±32 are as far
+    # from 0 with either sign of the 15, ±24 and ±8 with one, and 0, twice, with either: 12 of 16,
+    # of which the four of 0 are as far exactly.
+    found = sign_flip(np.array([4 / 5, -3 / 5, -1 / 5, 3 / 4]))
+    assert found == pytest.approx((12 / 16, 10 / 16))
 
 
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(0, 50))
