@@ -77,6 +77,7 @@ ELSEWHERE = (
     "--source ",  # recordings, or a renderer
     "--shift ",  # a renderer
     " k31 ",  # more units than the golden split has
+    " stale-k7 ",  # contradicting lessons, which a renderer plays
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
 )
@@ -85,8 +86,11 @@ ELSEWHERE = (
 BEFORE = {
     "evaluate.md": ["evaluate --policy replay --split my-split --out runs/shard-1 --shard 1/8"],
     "score.md": [
-        f"evaluate --policy replay:{name} --split my-split --out runs/{name}"
-        for name in ("window", "framesamp")
+        f"evaluate --policy replay:{memory} --split my-split --out runs/{name}"
+        for name, memory in (
+            *(("window", "window"), ("framesamp", "framesamp")),
+            *(("retrieval", "framesamp"), ("window-light-2", "window")),
+        )
     ],
     "publish.md": ["evaluate --policy replay --split my-split --out my-run --episodes 0"],
 }
