@@ -56,7 +56,9 @@ def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path, to: bool) 
     assert run(*words)[0] == 0
     asked = hub.asked[before:]
     downloads = asked_for(one for one in asked if one.method == "GET")
-    assert len(downloads) == len({*downloads}) == missing
+    # Of those that were under way, some may be whole without having their names.
+    assert len(downloads) == len({*downloads})
+    assert missing - AT_ONCE <= len(downloads) <= missing
     assert {*asked_for(asked)} == {*downloads} and not came & {*downloads}
     hub.down = True
     split, here = load_split(out if to else SPLIT_AT), load_split(GOLDEN)
