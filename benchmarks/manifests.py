@@ -41,7 +41,8 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import BufferManifest, EpisodeRecord, SpanDigests
+from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.records import EpisodeRecord, SpanDigests
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 _SPANS = ("first", "second", "last", "query")

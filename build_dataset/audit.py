@@ -16,7 +16,8 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import BufferManifest, EpisodeRecord, SessionEntry
+from robomme_interference_data.manifest import BufferManifest, SessionEntry
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
 

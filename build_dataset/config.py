@@ -21,7 +21,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError, SourceError
 from robomme_interference_data.ids import EpisodeId, parse_numbers
-from robomme_interference_data.records import SessionEntry
+from robomme_interference_data.manifest import SessionEntry
 from robomme_interference_data.settings import setting
 
 if TYPE_CHECKING:

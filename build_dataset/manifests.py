@@ -31,9 +31,9 @@ from robomme_interference_data.files import (
     write_json,
 )
 from robomme_interference_data.hub import HubFiles
+from robomme_interference_data.manifest import BufferManifest, ManifestDataset, ManifestHeader
 from robomme_interference_data.parquet import writing
 from robomme_interference_data.query import Query
-from robomme_interference_data.records import BufferManifest, ManifestDataset, ManifestHeader
 from robomme_interference_data.rows import arrow_schema, to_dict, to_table
 
 _BATCH = 1024

@@ -27,7 +27,8 @@ from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import FormatError, InvalidOptionError, SourceError
 from robomme_interference_data.files import Files, LocalFiles
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord, SessionEntry
+from robomme_interference_data.manifest import SessionEntry
+from robomme_interference_data.records import EpisodeRecord
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,8 @@ from robomme_interference_data.embeddings import IndexHeader, index_folder
 from robomme_interference_data.encode import CODECS
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file
-from robomme_interference_data.records import EpisodeRecord, ManifestHeader
+from robomme_interference_data.manifest import ManifestHeader
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.shifts import SHIFTS
 from robomme_interference_data.split import Split

@@ -9,7 +9,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import pyarrow as pa
 
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import ROLES
+from robomme_interference_data.manifest import ROLES
 from robomme_interference_data.rows import arrow_schema
 
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.+?)(?=^    \w|^\S|\Z)", re.MULTILINE | re.DOTALL)

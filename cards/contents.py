@@ -18,7 +18,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import HashMismatchError
 from robomme_interference_data.files import canonical_json, indented_json
-from robomme_interference_data.records import BufferManifest, ManifestHeader
+from robomme_interference_data.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import to_dict
 from robomme_interference_data.split import Split
 

@@ -21,7 +21,8 @@ from robomme_interference_data.cards.results import ResultsFacts
 from robomme_interference_data.constants import RECORDS_PATH, SUMS_PATH
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.files import sha256_file
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.records import EpisodeRecord
 
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0")
 

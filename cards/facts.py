@@ -22,7 +22,8 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.files import read_json, sha256_file
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
 

@@ -47,7 +47,8 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import fill

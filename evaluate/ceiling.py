@@ -11,14 +11,14 @@ from functools import lru_cache
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.conditions import NO_HISTORY, in_order
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.config import CeilingConfig, unusual_retrieval
 from robomme_interference_data.evidence import known_parts
 from robomme_interference_data.query import Query
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.sampling import MEMORIES, evidence_kept
+from robomme_interference_data.sampling import MEMORIES, check_memory, evidence_kept
 from robomme_interference_data.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.family import Family
@@ -73,8 +73,7 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
         MissingFileError: The split has no views under the shift.
         MissingIndexError, StaleIndexError: See `measure`.
     """
-    if config.memory not in MEMORIES:
-        raise UnknownNameError.among("memory", config.memory, "ceiling", MEMORIES)
+    check_memory(config.memory, "ceiling")
     unusual_retrieval(config)
     if config.shift != NO_SHIFT and config.retrieval is None:
         raise InvalidOptionError(

@@ -17,7 +17,7 @@ from robomme_interference_data.constants import SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import Session
+from robomme_interference_data.manifest import Session
 from robomme_interference_data.retrieval.segment import (
     Span,
     adjacent_cosines,

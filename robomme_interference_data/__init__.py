@@ -20,13 +20,9 @@ if TYPE_CHECKING:
     from robomme_interference_data.errors import InterferenceError
     from robomme_interference_data.ids import EpisodeId
     from robomme_interference_data.loading import load_buffer, load_split
+    from robomme_interference_data.manifest import BufferManifest, Session, SessionEntry
     from robomme_interference_data.query import Query
-    from robomme_interference_data.records import (
-        BufferManifest,
-        EpisodeRecord,
-        Session,
-        SessionEntry,
-    )
+    from robomme_interference_data.records import EpisodeRecord
     from robomme_interference_data.rollouts import Rollout
     from robomme_interference_data.split import Split
 
@@ -54,6 +50,7 @@ __all__ = [
 
 __getattr__ = lazily(
     __name__,
-    *(".loading", ".split", ".buffer", ".cache", ".query", ".records", ".rollouts"),
+    *(".loading", ".split", ".buffer", ".cache", ".query"),
+    *(".records", ".manifest", ".rollouts"),
     *(".ids", ".conditions", ".dataset", ".errors"),
 )

@@ -26,13 +26,8 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evidence import Evidence, place_evidence
 from robomme_interference_data.ids import EpisodeId, whole_number
+from robomme_interference_data.manifest import BufferManifest, Session, SessionEntry, place_sessions
 from robomme_interference_data.query import Query
-from robomme_interference_data.records import (
-    BufferManifest,
-    Session,
-    SessionEntry,
-    place_sessions,
-)
 from robomme_interference_data.sampling import runs
 from robomme_interference_data.split_index import SplitIndex
 

@@ -20,7 +20,7 @@ from robomme_interference_data.constants import (
     RAW_DISTRACTORS,
 )
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
-from robomme_interference_data.records import SessionEntry
+from robomme_interference_data.manifest import SessionEntry
 
 NO_HISTORY = "no-history"
 """The condition with an empty buffer (paper)."""

@@ -33,7 +33,8 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import Files, read_sums, sha256_file
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lerobot_files import LeRobotFiles
-from robomme_interference_data.records import DatasetIdentity, EpisodeRecord, SessionEntry
+from robomme_interference_data.manifest import SessionEntry
+from robomme_interference_data.records import DatasetIdentity, EpisodeRecord
 from robomme_interference_data.rows import from_dict, read_header
 
 

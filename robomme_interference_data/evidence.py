@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
-from robomme_interference_data.records import EvidenceSpan, Session, SessionEntry
+from robomme_interference_data.manifest import Session, SessionEntry
+from robomme_interference_data.records import EvidenceSpan
 
 _TEACHING = ("lesson", "contradiction")
 """Roles of sessions that are a lesson: of such a one evidence is known, or it is not."""

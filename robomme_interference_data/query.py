@@ -10,13 +10,13 @@ from robomme_interference_data.constants import STATE
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import (
+from robomme_interference_data.manifest import (
     BufferManifest,
-    EpisodeRecord,
     QueryFrame,
     SessionEntry,
     place_sessions,
 )
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.sampling import lesson_frames, lesson_share
 
 

@@ -5,8 +5,9 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import groupby
 
 from robomme_interference_data.constants import SAMPLE_FRAMES
+from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.evidence import Evidence
-from robomme_interference_data.records import Session
+from robomme_interference_data.manifest import Session
 
 
 def even_sample(history_frames: int) -> list[int]:
@@ -38,6 +39,20 @@ MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
 `full` keeps all; `framesamp` all while they are fewer than 32 with the live one, else those of
 the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last 32.
 """
+
+
+def check_memory(name: str, of: str) -> None:
+    """Check that there is a memory rule.
+
+    Args:
+        name: Its name.
+        of: Who is asked for it, for the message.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+    """
+    if name not in MEMORIES:
+        raise UnknownNameError.among("memory", name, of, MEMORIES)
 
 
 def spread(start: int, stop: int, count: int) -> list[int]:

@@ -32,9 +32,9 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.files import LocalFiles, canonical_json
 from robomme_interference_data.hub import HubFiles
 from robomme_interference_data.ids import EpisodeId, whole_number
+from robomme_interference_data.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.parquet import RowSpan
 from robomme_interference_data.query import Query
-from robomme_interference_data.records import BufferManifest, ManifestHeader
 from robomme_interference_data.rows import from_table, read_header, to_dict
 from robomme_interference_data.tables import Table
 

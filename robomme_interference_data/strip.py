@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
 from robomme_interference_data.drawing import INK, Hue, Page, ink_on, open_page, tint
-from robomme_interference_data.records import Session
+from robomme_interference_data.manifest import Session
 from robomme_interference_data.sampling import even_sample, spread
 
 LESSON_COLOR = Hue.VERMILION

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK
-from robomme_interference_data.errors import PolicyError, UnknownNameError
+from robomme_interference_data.errors import PolicyError
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.evidence import known_parts
-from robomme_interference_data.sampling import MEMORIES
+from robomme_interference_data.sampling import MEMORIES, check_memory
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 THUMBNAIL = 16
@@ -44,7 +44,8 @@ class ReplayPolicy(Policy):
     history_cameras = ("front",)
 
     def __init__(self, memory: str = "full"):
-        self.memory = _memory(memory, "replay")
+        check_memory(memory, "replay")
+        self.memory = memory
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget everything."""
@@ -81,12 +82,6 @@ class ReplayPolicy(Policy):
         nearest_view = int(np.argmin(((views - view) ** 2).mean(axis=(1, 2, 3))))
         kept = kept[nearest_view:]
         return follow(observation.state, kept, np.concatenate(self._states)[kept])
-
-
-def _memory(name: str, policy: str) -> str:
-    if name not in MEMORIES:
-        raise UnknownNameError.among("memory", name, policy, MEMORIES)
-    return name
 
 
 def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -191,7 +186,8 @@ class Recall(Privileged):
 
     def __init__(self, memory: str = "full"):
         super().__init__("recall")
-        self.memory = _memory(memory, self.name)
+        check_memory(memory, self.name)
+        self.memory = memory
 
     def reset(self, info: RolloutInfo) -> None:
         """See what the memory keeps.

@@ -13,7 +13,8 @@ from robomme_interference_data.cards.croissant import as_bytes
 from robomme_interference_data.cards.render import CROISSANT
 from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.files import sha256_file
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.rows import arrow_schema
 

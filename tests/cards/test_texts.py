@@ -28,7 +28,8 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.evaluate.score.scoring import score
 from robomme_interference_data.files import read_json, write_json
-from robomme_interference_data.records import BufferManifest, EpisodeRecord
+from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.split import Split
 
 COMMIT = "0123456789" * 4

@@ -19,7 +19,7 @@ from robomme_interference_data.conditions import (
 )
 from robomme_interference_data.constants import DATASETS, DISTRACTORS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
-from robomme_interference_data.records import SessionEntry
+from robomme_interference_data.manifest import SessionEntry
 
 
 def entry(role: str, number: int) -> SessionEntry:

@@ -21,7 +21,8 @@ from robomme_interference_data.evidence import (
     spans_of_parts,
     spans_of_texts,
 )
-from robomme_interference_data.records import EvidenceSpan, place_sessions
+from robomme_interference_data.manifest import place_sessions
+from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.rows import from_dict, to_dict
 from robomme_interference_data.sampling import evidence_kept
 

@@ -26,7 +26,7 @@ from support.splits import (
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.records import BufferManifest, SessionEntry
+from robomme_interference_data.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.rows import from_dict, to_dict
 
 MEGABYTES = 700

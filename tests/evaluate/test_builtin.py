@@ -17,7 +17,8 @@ from robomme_interference_data.evaluate.policies.builtin import (
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evidence import place_evidence
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EvidenceSpan, SessionEntry, place_sessions
+from robomme_interference_data.manifest import SessionEntry, place_sessions
+from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation
 

@@ -16,7 +16,7 @@ from support.hub_server import HubServer
 
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
 from robomme_interference_data.files import write_json
-from robomme_interference_data.records import ManifestHeader
+from robomme_interference_data.manifest import ManifestHeader
 from robomme_interference_data.rows import read_header, to_dict
 
 SPLIT, BASE = "someone/units", "someone/demonstrations"

@@ -14,7 +14,7 @@ from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, 
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.embeddings import IndexHeader
 from robomme_interference_data.files import write_json
-from robomme_interference_data.records import place_sessions
+from robomme_interference_data.manifest import place_sessions
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import (
