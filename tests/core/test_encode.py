@@ -86,6 +86,23 @@ def test_the_same_frames_give_the_same_bytes_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(("height", "width"), [(98, 50), (64, 66), (34, 36)])
+def test_clips_are_the_same_whatever_memory_held_before(
+    tmp_path: Path, height: int, width: int
+) -> None:
+    random = np.random.default_rng(0)
+    found = set()
+    for _ in range(20):
+        encoder = VideoEncoder(tmp_path / "clip.mp4", CLIP, 10, height, width)
+        for image in noise(2, 10, height, width):
+            for size in random.integers(1000, 60000, 40):
+                random.bytes(int(size))  # memory that is given back, with other bytes in it
+            encoder.add(image)
+        encoder.close()
+        found.add((tmp_path / "clip.mp4").read_bytes())
+    assert len(found) == 1
+
+
 def test_a_container_can_be_named(tmp_path: Path) -> None:
     encoder = VideoEncoder(tmp_path / "clip.partial", CLIP, 10, 16, 16, container="mp4")
     encoder.add(noise(0, 16, 16))
