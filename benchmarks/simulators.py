@@ -32,7 +32,7 @@ def _pick_cube() -> Callable[[], None]:
     import mani_skill.envs  # noqa: F401, registers the environment
     from mani_skill.utils.sapien_utils import look_at
 
-    from robomme_interference_data.simulators.tabletop.env import (
+    from robomme_interference_data.simulators.tabletop.camera import (
         FRONT_EYE,
         FRONT_TARGET,
         FRONT_VIEW,

@@ -169,6 +169,10 @@ class ServerKeepaliveError(PolicyServerError):
     """A policy server that closed its own connection, over a call that kept it for too long."""
 
 
+class ModelError(InterferenceError, ConnectionError):
+    """A vision-language model that cannot be reached, is not there, or gives no usable answer."""
+
+
 class WireError(InterferenceError, ValueError):
     """A message that the protocol of the policy servers cannot carry."""
 

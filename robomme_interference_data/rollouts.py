@@ -40,7 +40,10 @@ KEY_COLUMNS = (
 )
 """What makes a rollout the one that it is: no two rows of a run agree in all of them."""
 
-TIMING_COLUMNS = ("reset_s", "history_s", "policy_s", "simulator_s", "wall_s", "finished_at")
+TIMING_COLUMNS = (
+    *("reset_s", "history_s", "policy_s", "simulator_s", "model_s", "wall_s"),
+    "finished_at",
+)
 """Columns that differ from one run to the next; all others do not."""
 
 
@@ -80,6 +83,14 @@ class Rollout:
             what was retrieved and the first live observation, as the released CSV has it.
         retrieval_selected_filler_fraction: The same for frames of other sessions.
         retrieval_selected_query_fraction: The same for the first live observation.
+        answer: Letter of the option that was chosen, of a question about the past; None for a
+            rollout, and where no option was named.
+        chance: Share of right answers that drawing at random would have, of a question; None for
+            a rollout.
+        model_calls: How often a vision-language model was asked, repetitions after faults among
+            them; None without one.
+        model_tokens: Tokens of all questions and answers; None if it does not say.
+        model_faults: Its answers that could not be used.
         error: What broke, in one line; None unless the status is `error`.
         attempt: How often the rollout was started, this time included.
         video: Path of its video inside the run's folder, or None.
@@ -87,6 +98,7 @@ class Rollout:
         history_s: Seconds to hand the history over, and to wait for what is not decoded yet.
         policy_s: Seconds that the policy took for actions and observations.
         simulator_s: Seconds of stepping.
+        model_s: Seconds that the vision-language model took.
         wall_s: Seconds in all.
         finished_at: When it ended, UTC, `2026-01-31T12:00:00Z`.
     """
@@ -118,6 +130,11 @@ class Rollout:
     retrieval_selected_lesson_fraction: float | None = None
     retrieval_selected_filler_fraction: float | None = None
     retrieval_selected_query_fraction: float | None = None
+    answer: str | None = None
+    chance: float | None = None
+    model_calls: int | None = None
+    model_tokens: int | None = None
+    model_faults: int | None = None
     error: str | None = None
     attempt: int = 1
     video: str | None = None
@@ -125,6 +142,7 @@ class Rollout:
     history_s: float | None = None
     policy_s: float | None = None
     simulator_s: float | None = None
+    model_s: float | None = None
     wall_s: float | None = None
     finished_at: str | None = None
 

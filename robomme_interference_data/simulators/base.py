@@ -12,10 +12,12 @@ from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.errors import (
     InvalidOptionError,
     SimulatorCrashError,
+    UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.rollouts import Status
+from robomme_interference_data.subgoal import Subgoal
 
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""
@@ -33,10 +35,12 @@ class Observation:
             cameras that the simulator was asked to draw, and empty where no images were wanted.
         state: `(8,) float32`: 7 joint positions in rad, then the gripper's opening, which is the
             way of one finger, 0 closed to 0.04 m open.
+        subgoal: What a policy is told to do next, where something in front of it says so.
     """
 
     images: dict[str, NDArray[np.uint8]]
     state: NDArray[np.float32]
+    subgoal: Subgoal | None = None
 
 
 @dataclass(frozen=True)
@@ -171,6 +175,32 @@ class Simulator(ABC):
             UnknownNameError: The simulator has no such policy.
             SimulatorCrashError: There is no episode to act in, or the simulator is closed.
         """
+
+    def subgoal(self) -> Subgoal:
+        """Return what is to be done next, as the scene stands: it knows the hidden answer.
+
+        Raises:
+            UnknownNameError: The simulator does not tell.
+            SimulatorCrashError: There is no episode, or the simulator is closed.
+        """
+        raise UnknownNameError(
+            f"the simulator {type(self).__name__} tells no subgoals", "Use tabletop or robomme."
+        )
+
+    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        """Return the next action, `(8,) float32`, of a script that does what a subgoal says.
+
+        It finds what words and points name among all that the scene allows; where they leave it
+        open, and without a subgoal, it draws from the episode's seed. Keep to it throughout an
+        episode.
+
+        Raises:
+            UnknownNameError: The simulator has no such script.
+            SimulatorCrashError: There is no episode to act in, or the simulator is closed.
+        """
+        raise UnknownNameError(
+            f"the simulator {type(self).__name__} has no script that obeys", "Use tabletop."
+        )
 
     def close(self) -> None:
         """Release everything; further calls but `close` are errors."""

@@ -19,7 +19,11 @@ from robomme_interference_data.ids import EpisodeId
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
-from robomme_interference_data.simulators.tabletop.env import FRONT_EYE, FRONT_TARGET, FRONT_VIEW
+from robomme_interference_data.simulators.tabletop.camera import (
+    FRONT_EYE,
+    FRONT_TARGET,
+    FRONT_VIEW,
+)
 from robomme_interference_data.simulators.tabletop.episodes import (
     difficulty_of,
     episode_ids,

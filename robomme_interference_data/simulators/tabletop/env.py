@@ -1,6 +1,5 @@
 """The ManiSkill environment behind all nine families."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,15 +18,19 @@ from robomme_interference_data.evidence import spans_of_parts
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.shifts import Shift
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
+from robomme_interference_data.simulators.tabletop.camera import (
+    FRONT_EYE,
+    FRONT_TARGET,
+    FRONT_VIEW,
+    SIZE,
+)
 from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, turn_of
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.kit import Kit
-from robomme_interference_data.simulators.tabletop.look import FRONT_EYE, FRONT_TARGET, Look
+from robomme_interference_data.simulators.tabletop.look import Look
 from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
 from robomme_interference_data.simulators.tabletop.renderer import make_renderer
-
-FRONT_VIEW = math.radians(46)
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "num_envs": (1,),
@@ -91,7 +94,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def _default_sensor_configs(self) -> list[CameraConfig]:
         pose = sapien_utils.look_at(eye=FRONT_EYE, target=FRONT_TARGET)
         view = {"fov": FRONT_VIEW, "near": 0.01, "far": 10, "shader_config": SHADER}
-        return [CameraConfig("front", pose, 256, 256, **view)]
+        return [CameraConfig("front", pose, SIZE, SIZE, **view)]
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE))

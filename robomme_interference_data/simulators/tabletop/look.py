@@ -16,15 +16,9 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.shifts import KINDS, Shift
+from robomme_interference_data.simulators.tabletop.camera import FRONT_EYE, FRONT_TARGET
 from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, material
 from robomme_interference_data.simulators.tabletop.kit import Colour
-
-FRONT_EYE = (0.80, 0.0, 0.64)
-"""Where the front camera stands, in m: the table up to x = 0.14 m, and at its home pose the whole
-arm but for the top of its shoulder."""
-
-FRONT_TARGET = (-0.30, 0.0, 0.21)
-"""Where it looks, in m."""
 
 DIMMER, BRIGHTER, TINT = 0.20, 0.12, 0.12  # parts of the light, of a colour
 MOVED, TURNED = 0.045, math.radians(1.5)  # m, rad

@@ -1,0 +1,79 @@
+"""Subgoals: what a policy is to do next, in words, and where in the front image: pure."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from robomme_interference_data.errors import InvalidOptionError
+
+POINT = "<point>"
+"""What stands for each of its points in a subgoal's text."""
+
+Pixel = tuple[int, int]
+"""A point of an image: row and column, (y, x), from 0."""
+
+_NAMED_AT = re.compile(rf"\s*(?:\bat\s+)?{POINT}")
+
+
+@dataclass(frozen=True)
+class Subgoal:
+    """What to do next.
+
+    Attributes:
+        text: In words; each thing's place is written `<point>`, as in `pick up the cube at
+            <point>`.
+        points: Where these places are in the front image, (y, x) in pixels, in order.
+
+    Raises:
+        InvalidOptionError: Text and points do not go together.
+    """
+
+    text: str
+    points: tuple[Pixel, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.text.count(POINT) != len(self.points) or not self.simple:
+            raise InvalidOptionError.expected(
+                f"subgoal {self.text!r}: its points",
+                list(self.points),
+                f"words, and as many points as the text has {POINT}",
+            )
+
+    @property
+    def simple(self) -> str:
+        """The text without places: what released servers take as `simple_subgoal`."""
+        return _NAMED_AT.sub("", self.text).strip()
+
+    @property
+    def grounded(self) -> str:
+        """The text with places as `<y, x>`: what released servers take as `grounded_subgoal`."""
+        return write_points(self.text, [f"<{y}, {x}>" for y, x in self.points])
+
+
+def write_points(text: str, written: Sequence[str]) -> str:
+    """Return a subgoal's text with each `<point>` as it is to be written, in order."""
+    first, *rest = text.split(POINT)
+    return first + "".join(point + words for point, words in zip(written, rest, strict=True))
+
+
+def read_points(text: str, pattern: "re.Pattern[str]") -> tuple[str, list[tuple[int, ...]]]:
+    """Take numbers out of a text: each match of a pattern becomes `<point>`.
+
+    Returns:
+        The text, and the numbers of each match's groups, in order.
+    """
+    numbers = [tuple(map(int, match.groups())) for match in pattern.finditer(text)]
+    return pattern.sub(POINT, text.replace(POINT, "")), numbers
+
+
+_PIXELS = re.compile(r"<\s*(\d{1,4})\s*,\s*(\d{1,4})\s*>")
+
+
+def read_grounded(text: str) -> Subgoal:
+    """Read a subgoal that has its places as `<y, x>` in pixels, as RoboMME writes them.
+
+    Raises:
+        InvalidOptionError: There are no words in it.
+    """
+    words, numbers = read_points(text, _PIXELS)
+    return Subgoal(words.strip(), tuple((y, x) for y, x in numbers))
