@@ -18,6 +18,8 @@ from robomme_interference_data.evaluate.config import RunConfig, unusual_retriev
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
+from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
+from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import (
     System,
     base_of,
@@ -36,27 +38,32 @@ from robomme_interference_data.simulators.registry import (
 )
 from robomme_interference_data.split import Split
 
+READS_SUBGOALS = ("websocket", "python", "obey")
+"""Kinds of policies that may read subgoals."""
+
 
 def default_system(config: RunConfig) -> str:
     """Return the name under which rows stand if none is given.
 
     That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
-    step behind it, such as `retrieval-replay-window-oracle`.
+    step behind it, such as `retrieval-replay-window-oracle`; with the simulator's subgoals
+    `…-oracle`.
 
     Raises:
-        InvalidOptionError: The policy does not say which system it is.
+        InvalidOptionError: It does not follow from the policy, or from what writes its subgoals.
     """
     spec = parse_policy(config.policy)
-    if spec.kind in ("websocket", "lerobot"):  # folders are called alike, and so are revisions
+    # Folders are called alike, and so are revisions; and served models.
+    learned = config.policy if spec.kind in ("websocket", "lerobot") else config.subgoals
+    if learned not in (None, ORACLE):
         raise InvalidOptionError(
-            f"the rows of {config.policy} need a name: it does not tell one checkpoint from "
-            "another",
+            f"the rows of {learned} need a name: it does not tell one checkpoint from another",
             "Give --system, such as perceptual-framesamp-modul, or a name of your own: see "
             "docs/systems.md.",
         )
-    name = "-".join(filter(None, (spec.kind, spec.target)))
+    name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
     if spec.kind == "python":
-        name = re.sub(r"[^A-Za-z0-9._-]+", "-", spec.target).strip("-")
+        name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     if config.retrieval is None:
         return name
     return "-".join(("retrieval", name, *unusual_retrieval(config).values())).replace("/", "-")
@@ -92,6 +99,7 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
     for camera in (*policy.history_cameras, *step):
         split.datasets[DEMONSTRATIONS].shape(camera)  # refuses one that is not there
     _check_name(config, name_system(system))
+    _check_subgoals(config, name_system(system))
     if config.videos:
         check_drawing()
 
@@ -108,11 +116,11 @@ def _check_name(config: RunConfig, system: System) -> None:
             why += " with a retrieval step in front" if step else ""
     elif kind not in ("websocket", "python"):
         why = f"the policy {config.policy} is not the paper's system {system.name}"
-    elif system.subgoals is not None and kind == "websocket":
-        why = (
-            f"{system.name} acts on subgoals that a vision-language model writes, and this package "
-            f"sends the server none: what runs would not be {system.name}"
-        )
+    elif (system.subgoals is None) is (config.subgoals is not None) and kind == "websocket":
+        needs = "no subgoals" if system.subgoals is None else "subgoals of a model (--subgoals)"
+        why = f"system {system.name} acts on {needs}, and --subgoals is {config.subgoals}"
+    elif config.subgoals == ORACLE:
+        why = f"the subgoals of {system.name} are a model's, and {ORACLE} knows the answer"
     elif system.retrieval != step:
         has, given = ("a", "none is given") if system.retrieval else ("no", "one is given")
         why = f"system {system.name} has {has} retrieval step, and {given} (--retrieval)"
@@ -120,6 +128,34 @@ def _check_name(config: RunConfig, system: System) -> None:
         why = f"the retrieval step of {system.name} chooses by max, not by {config.retrieval_rule}"
     if why is not None:
         raise InvalidOptionError(why, "Give --system a name of your own: see docs/systems.md.")
+
+
+def _check_subgoals(config: RunConfig, system: System) -> None:
+    """Refuse subgoals that nobody reads, and settings of them that say nothing."""
+    for name in ("subgoal_prompt", "subgoal_options"):
+        if getattr(config, name) and config.subgoals in (None, ORACLE):
+            option = {"subgoal_options": "--subgoal-option"}.get(name, "--subgoal-prompt")
+            raise InvalidOptionError(
+                f"{option} says nothing without a model that writes subgoals",
+                "Add --subgoals openai:URL#MODEL, or leave it out.",
+            )
+    if config.subgoals is None:
+        return
+    kind = parse_policy(config.policy).kind
+    if kind not in READS_SUBGOALS:
+        raise InvalidOptionError(
+            f"the policy {config.policy} reads no subgoals",
+            f"Take {', '.join(READS_SUBGOALS)}, or leave out --subgoals.",
+        )
+    if config.subgoals != ORACLE:
+        keeps = load_prompt(config.subgoal_prompt or system.prompt)[0].watches
+        if system.subgoals is not None and keeps is not (system.prompt == "memer"):
+            raise InvalidOptionError(
+                f"the prompt {config.subgoal_prompt} shows the model "
+                f"{'' if keeps else 'no '}recent frames; that of {system.name} "
+                f"{'does not' if keeps else 'does'}",
+                "Give that system's prompt, or --system a name of your own.",
+            )
 
 
 def applicable(system: System, split: Split, policy: Policy) -> tuple[str, ...]:

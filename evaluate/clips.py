@@ -23,6 +23,7 @@ from robomme_interference_data.rollouts import Status
 from robomme_interference_data.sampling import spread
 from robomme_interference_data.simulators.base import EpisodeInfo, Observation
 from robomme_interference_data.strip import session_colors
+from robomme_interference_data.subgoal import Subgoal
 
 _VIEW = 256  # side of a camera's picture
 _WIDTH = 4 * _VIEW  # history to the left, then front and wrist, then the facts
@@ -92,6 +93,7 @@ class Clip:
         self._goal = self._given = ""
         self._history: NDArray[np.uint8] = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
         self._images: Mapping[str, NDArray[np.uint8]] = {}
+        self._subgoal: Subgoal | None = None
         self._steps = 0
         self._file = ExitStack()
         self._encoder: VideoEncoder | None = None
@@ -112,12 +114,12 @@ class Clip:
         self._encoder.add(self._picture(Status.ONGOING))
 
     @_harmless
-    def step(self, observation: Observation, status: Status, subgoal: str | None) -> None:
-        """Take what came of a step, with the images of both cameras."""
+    def step(self, observation: Observation, status: Status, subgoal: Subgoal | None) -> None:
+        """Take what came of a step, with the images of both cameras, and the subgoal of it."""
         if self._encoder is not None:
             self._steps += 1
-            self._images = observation.images
-            self._encoder.add(self._picture(status, subgoal=subgoal))
+            self._images, self._subgoal = observation.images, subgoal
+            self._encoder.add(self._picture(status))
 
     @_harmless
     def close(self, status: Status, error: str | None = None) -> None:
@@ -132,9 +134,7 @@ class Clip:
             self._encoder.close()
             self._file.close()
 
-    def _picture(
-        self, status: Status, *, subgoal: str | None = None, error: str | None = None
-    ) -> NDArray[np.uint8]:
+    def _picture(self, status: Status, *, error: str | None = None) -> NDArray[np.uint8]:
         """Return the clip's present picture, `(280, 1024, 3) uint8`."""
         canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
         canvas[_HEAD:, :_VIEW] = self._history
@@ -143,13 +143,23 @@ class Clip:
                 view = self._images[name][:_VIEW, :_VIEW]
                 x = place * _VIEW
                 canvas[_HEAD : _HEAD + view.shape[0], x : x + view.shape[1]] = view
+        for y, x in self._subgoal.points if self._subgoal else ():
+            _cross(canvas[_HEAD:, _VIEW : 2 * _VIEW], y, x)
         lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
+        subgoal = self._subgoal and self._subgoal.simple
         for head, text in (("subgoal:", subgoal), ("what broke:", error)):
             if text:
                 lines += ["", head, *textwrap.wrap(text, _LETTERS)]
         # The last two lines always have their place, however long the words before them are.
         lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
         return _lettered(canvas, (self._given, "front", "wrist"), lines, _COLORS[status])
+
+
+def _cross(view: NDArray[np.uint8], y: int, x: int) -> None:
+    """Mark a point of a view, black on white: seen on any ground."""
+    for wide, colour in ((2, 255), (1, 0)):
+        view[max(y - 5, 0) : y + 6, max(x - wide + 1, 0) : x + wide] = colour
+        view[max(y - wide + 1, 0) : y + wide, max(x - 5, 0) : x + 6] = colour
 
 
 def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:

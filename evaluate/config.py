@@ -51,6 +51,23 @@ class RunConfig(RetrievalConfig):
         metavar="NAME=VALUE…",
         help="Options of the policy, such as device=cpu or response_s=60.",
     )
+    subgoals: str | None = setting(
+        None,
+        help="What writes subgoals for the policy: openai:URL#MODEL, transformers:ID or oracle.",
+    )
+    subgoal_prompt: str | None = setting(
+        None,
+        metavar="NAME|FILE",
+        help="How a model is asked: simple, grounded, memer or a file; see docs/subgoals.md.",
+        shown="as the system's",
+    )
+    subgoal_options: tuple[str, ...] = setting(
+        (),
+        name="--subgoal-option",
+        whole=True,
+        metavar="NAME=VALUE…",
+        help="Options of what writes subgoals, such as frames=32 or response_s=60.",
+    )
     model_seed: int = setting(0, help="Seed for the policy.")
     robomme_python: str | None = setting(
         None, help="Interpreter that has RoboMME.", env="ROBOMME_PYTHON"

@@ -42,9 +42,14 @@ _MOST_ROLLOUTS = 1 << 20
 """Rollouts that all plans of a run ask for, at most: the paper's grid has 25,200."""
 
 
+def item_name(item: WorkItem) -> str:
+    """Return what a rollout's own files are called, such as `MoveCube_test_3_k7`."""
+    return f"{str(item.episode).replace('/', '_')}_{item.condition}"
+
+
 def clip_name(item: WorkItem) -> str:
     """Return the path of a rollout's clip inside the run's folder."""
-    return f"videos/{str(item.episode).replace('/', '_')}_{item.condition}.mp4"
+    return f"videos/{item_name(item)}.mp4"
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +16,10 @@ from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RolloutError
 from robomme_interference_data.evaluate.agreement import check_episode, check_lesson
 from robomme_interference_data.evaluate.clips import Clip
-from robomme_interference_data.evaluate.config import Run
+from robomme_interference_data.evaluate.config import Run, RunConfig
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
+from robomme_interference_data.evaluate.subgoals.writer import History, SubgoalWriter
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.evidence import among
 from robomme_interference_data.execution import Worker
@@ -30,8 +32,14 @@ from robomme_interference_data.sampling import (
     lesson_share,
 )
 from robomme_interference_data.shifts import NO_SHIFT
-from robomme_interference_data.simulators.base import Observation, Simulator, action_array
+from robomme_interference_data.simulators.base import (
+    ACTION_SIZE,
+    Observation,
+    Simulator,
+    action_array,
+)
 from robomme_interference_data.split import Split
+from robomme_interference_data.subgoal import Subgoal
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
@@ -60,6 +68,7 @@ def run_rollout(
     policy: Policy,
     split: Split,
     selector: "Selector | None" = None,
+    writer: SubgoalWriter | None = None,
     clip: Clip | None = None,
     worker: Worker | None = None,
 ) -> Rollout:
@@ -104,10 +113,15 @@ def run_rollout(
             own: tuple[Any, ...] = ()
             if policy.privileged:
                 own = simulator, buffer.evidence and among(buffer.evidence, given)
-            policy.reset(RolloutInfo(info.goal, len(given), config.model_seed, *own))
+            told = RolloutInfo(info.goal, len(given), config.model_seed, *own)
+            policy.reset(told)
             for chunk in history:
                 policy.add_history(chunk.frames, chunk.states, len(given))
-    status, steps = _act(run, policy, simulator, first, info.goal, clock, clip, worker)
+        if writer is not None:
+            with clock.part("model_s"):
+                writer.start(History(buffer, given), told, simulator)
+    live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
+    status, steps = live.run(first, info.goal)
     if status is Status.ERROR:
         raise RolloutError(f"the {config.simulator} simulator reported an error at step {steps}")
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
@@ -124,44 +138,69 @@ def run_rollout(
         lesson_share=lesson_share(buffer.sessions, given) if given else None,
         evidence_kept=_evidence_kept(run.system, buffer, given),
         **_retrieval_columns(selector, buffer, given),
+        **_model_columns(writer),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
     )
 
 
-def _act(
-    run: Run,
-    policy: Policy,
-    simulator: Simulator,
-    first: Observation,
-    goal: str,
-    clock: _Clock,
-    clip: Clip | None,
-    worker: Worker,
-) -> tuple[Status, int]:
-    """Run the live loop; return how it ended and the number of executed steps."""
-    seen, steps = [first], 0
-    while True:
-        with clock.part("policy_s"):
-            frames = {name: np.stack([one.images[name] for one in seen]) for name in policy.cameras}
-            policy.observe(frames, np.stack([one.state for one in seen]))
-            actions = _checked(policy.act(seen[-1], goal))[: MAX_STEPS - steps]
-        seen = []
-        with worker.limit(run.config.simulator_timeout, "the simulator's steps"):
-            for number, action in enumerate(actions, 1):
-                decides = number == len(actions)
-                wanted = policy.every_frame or decides
-                with clock.part("simulator_s"):
-                    observed, status = simulator.step(action, observe=wanted or clip is not None)
-                steps += 1
-                if clip is not None:
-                    clip.step(observed, status, getattr(policy, "subgoal", None))
-                if status is not Status.ONGOING:
-                    return status, steps
-                if steps >= MAX_STEPS:
-                    return Status.TIMEOUT, steps
-                if wanted:
-                    seen.append(observed)
+@dataclass(frozen=True)
+class _Live:
+    """The live loop of one rollout."""
+
+    config: RunConfig
+    policy: Policy
+    simulator: Simulator
+    writer: SubgoalWriter | None
+    clock: _Clock
+    clip: Clip | None
+    worker: Worker
+
+    def run(self, first: Observation, goal: str) -> tuple[Status, int]:
+        """Return how the rollout ended, and the number of executed steps."""
+        seen, steps = [first], 0
+        told: int | None = None  # steps before the subgoal that stands
+        subgoal: Subgoal | None = None
+        watches = self.writer is not None and self.writer.every_frame
+        every_frame = self.policy.every_frame or watches
+        actions = np.empty((0, ACTION_SIZE), np.float32)
+        while True:
+            # A policy that gives single actions is told as often as one that gives whole chunks.
+            due = told is None or len(actions) > 1 or steps - told >= ACTION_CHUNK
+            if self.writer is not None:
+                with self.clock.part("model_s"):
+                    self.writer.watch(seen)
+                    if due:
+                        subgoal, told = self.writer.next(seen[-1], steps), steps
+                seen[-1] = replace(seen[-1], subgoal=subgoal)
+            actions = self._decide(seen, goal)[: MAX_STEPS - steps]
+            seen = []
+            with self.worker.limit(self.config.simulator_timeout, "the simulator's steps"):
+                for number, action in enumerate(actions, 1):
+                    wanted = every_frame or number == len(actions)
+                    drawn = wanted or self.clip is not None
+                    with self.clock.part("simulator_s"):
+                        observed, status = self.simulator.step(action, observe=drawn)
+                    steps += 1
+                    if self.clip is not None:
+                        self.clip.step(observed, status, subgoal)
+                    if status is not Status.ONGOING:
+                        return status, steps
+                    if steps >= MAX_STEPS:
+                        return Status.TIMEOUT, steps
+                    if wanted:
+                        seen.append(observed)
+
+    def _decide(self, seen: Sequence[Observation], goal: str) -> NDArray[np.float32]:
+        """Hand over what was seen, and return the next actions."""
+        policy = self.policy
+        watched = seen if policy.every_frame else seen[-1:]
+        with self.clock.part("policy_s"):
+            frames = {
+                name: np.stack([one.images[name] for one in watched]) for name in policy.cameras
+            }
+            policy.observe(frames, np.stack([one.state for one in watched]))
+            return _checked(policy.act(seen[-1], goal))
 
 
 def _checked(actions: Any) -> NDArray[np.float32]:
@@ -183,6 +222,17 @@ def _retrieval_columns(
         for part, fraction in {"lesson": share, "filler": filler, "query": 1 / frames}.items():
             columns[f"retrieval_selected_{part}_fraction"] = fraction
     return columns
+
+
+def _model_columns(writer: SubgoalWriter | None) -> dict[str, Any]:
+    if writer is None:
+        return {}
+    tokens = [turn.tokens for turn in writer.turns if turn.tokens is not None]
+    return {
+        "model_calls": sum(turn.calls for turn in writer.turns),
+        "model_tokens": sum(tokens) if tokens else None,
+        "model_faults": sum(turn.fault is not None for turn in writer.turns),
+    }
 
 
 def _evidence_kept(system: str, buffer: Buffer, given: Sequence[int]) -> float | None:

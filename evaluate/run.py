@@ -32,6 +32,7 @@ from robomme_interference_data.evaluate.policies.identity import describe_policy
 from robomme_interference_data.evaluate.policies.registry import pin_policy
 from robomme_interference_data.evaluate.policies.servers import check_kind, hold_servers
 from robomme_interference_data.evaluate.start import now, run_identity, start_of
+from robomme_interference_data.evaluate.subgoals.registry import describe_subgoals, pin_subgoals
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import Executor, Outcome, Processes, end_if_starting
@@ -107,12 +108,18 @@ def run_evaluation(
     end_if_starting()
     split, folder = load_split(config.split), Path(config.out)
     name = config.system or default_system(config)
-    pinned = pin_policy(config.policy)  # and the split, if it is on the Hub: one commit for all
-    config = dataclasses.replace(config, policy=pinned, split=Path(split.location))
+    # One commit for all workers: of the split, if it is on the Hub, and of models.
+    config = dataclasses.replace(
+        config,
+        policy=pin_policy(config.policy),
+        subgoals=pin_subgoals(config.subgoals),
+        split=Path(split.location),
+    )
     with hold_servers(config.policy, folder):
         policy, said = describe_policy(config.policy, config.policy_options, workers=config.workers)
         check_settings(config, name, split, policy)
         system = name_system(name)
+        config, written = describe_subgoals(config, system)
         plan = plan_work(
             split.episode_ids,
             conditions=config.conditions or applicable(system, split, policy),
@@ -128,11 +135,11 @@ def run_evaluation(
             check_simulator(config, policy.cameras, executor)
             check_kind(config.policy, config.policy_options, system)
         versions = simulator_versions(config.simulator, config.robomme_python)
-        identity = run_identity(config, name, split, plan, said, versions)
+        identity = run_identity(config, name, split, plan, said, written, versions)
         with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
             # The same split may be in another folder by now: rows keep one label for it.
             run = Run(config, name, log.header.split, split.revision)
-            log.begin(start_of(config, plan, said, versions, command))
+            log.begin(start_of(config, plan, said | written, versions, command))
             return _roll_out(run, items, split, log, executor, listener)
 
 

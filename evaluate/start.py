@@ -14,6 +14,7 @@ from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.log import Start
 from robomme_interference_data.evaluate.plan import Plan
 from robomme_interference_data.evaluate.policies.identity import plain, policy_identity
+from robomme_interference_data.evaluate.subgoals.registry import subgoals_identity
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.split import Split
 
@@ -26,9 +27,20 @@ def run_identity(
     split: Split,
     plan: Plan,
     said: Mapping[str, Any],
+    written: Mapping[str, Any],
     versions: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return what makes the run the one that it is, as plain values."""
+    """Return what makes the run the one that it is, as plain values.
+
+    Args:
+        config: Its settings.
+        system: Name under which its rows stand.
+        split: The split.
+        plan: What is asked for.
+        said: What the policy says of itself.
+        written: What writes its subgoals says of itself; empty if nothing does.
+        versions: Of the simulator.
+    """
     return {
         "system": system,
         "simulator": config.simulator,
@@ -38,6 +50,7 @@ def run_identity(
         "shift": config.shift,
         "model_seed": config.model_seed,
         "retrieval_index": _retrieval_index(config, split, plan),
+        "subgoals": subgoals_identity(config, written),
         "protocol_version": PROTOCOL_VERSION,
         **policy_identity(config.policy, config.policy_options, said),
     }

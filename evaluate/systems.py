@@ -60,6 +60,13 @@ class System:
         """Whether its released server keeps frames; None where none was released under the name."""
         return self.position_limit is not None if self.paper else None
 
+    @property
+    def prompt(self) -> str:
+        """How the model in front of it is asked, unless another prompt is given."""
+        if self.subgoals == "simple_subgoal":
+            return "simple"
+        return "memer" if self.name == "memer" else "grounded"
+
     def applies(self, condition: str) -> bool:
         """Whether a condition says anything: retrieval needs a history, a memory-free one none."""
         return not self.retrieval if condition == NO_HISTORY else self.with_history

@@ -21,6 +21,9 @@ from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout import run_rollout
+from robomme_interference_data.evaluate.subgoals.record import write_turns
+from robomme_interference_data.evaluate.subgoals.registry import make_writer
+from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.rollouts import Rollout, Status
@@ -43,11 +46,12 @@ class RolloutTask:
         self._run, self._folder = run, folder
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
+        self._writer: SubgoalWriter | None = None
         self._split: Split | None = None
         self._selector: Selector | None = None
 
     def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
-        """Run a rollout; return its row, and the traceback of a clip that failed, or None.
+        """Run a rollout; return its row, and what befell its clip or its subgoals' file, or None.
 
         Raises:
             WorkerRetiredError: The policy's server is gone.
@@ -58,7 +62,9 @@ class RolloutTask:
             clip = Clip(self._folder, task, self._run.system)
         try:
             row = self._roll(task, worker, clip)
+            problem = self._record(task)
         except Exception as error:
+            self._record(task)
             if clip is not None:
                 clip.close(Status.ERROR, f"{type(error).__name__}: {first_line(error)}")
             self.close()
@@ -67,11 +73,12 @@ class RolloutTask:
             if isinstance(error, PolicyServerError):
                 self._check_server(worker)
             raise
-        if clip is None:
-            return row, None
-        clip.close(Status(row.status))
-        # Whatever became of the clip, the rollout ended as it did.
-        return replace(row, video=None if clip.problem else clip_name(task)), clip.problem
+        # Whatever became of what is to be looked at, the rollout ended as it did.
+        if clip is not None:
+            clip.close(Status(row.status))
+            row = replace(row, video=None if clip.problem else clip_name(task))
+            problem = "\n".join(filter(None, (problem, clip.problem)))
+        return row, problem or None
 
     def _roll(self, item: WorkItem, worker: Worker, clip: Clip | None) -> Rollout:
         config = self._run.config
@@ -80,6 +87,8 @@ class RolloutTask:
             self._selector = make_selector(config)
         if self._policy is None:
             self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
+        if self._writer is None:
+            self._writer = make_writer(config)
         if self._simulator is None:
             options = simulator_options(config, self._policy.cameras)
             with worker.limit(config.simulator_timeout, "the simulator's start"):
@@ -91,18 +100,28 @@ class RolloutTask:
             policy=self._policy,
             split=self._split,
             selector=self._selector,
+            writer=self._writer,
             clip=clip,
             worker=worker,
         )
 
     def close(self) -> None:
-        """Release simulator and policy."""
-        for thing in (self._policy, self._simulator):
+        """Release simulator, policy and what writes subgoals."""
+        for thing in (self._policy, self._simulator, self._writer):
             # It may be broken already, and the first error is the one to tell.
             with suppress(Exception):
                 if thing is not None:
                     thing.close()
-        self._policy = self._simulator = None
+        self._policy = self._simulator = self._writer = None
+
+    def _record(self, item: WorkItem) -> str | None:
+        """Write the subgoals of a rollout; return what went wrong with that, or None."""
+        try:
+            if self._writer is not None:
+                write_turns(self._folder, item, self._writer.turns)
+        except OSError as error:
+            return f"the subgoals could not be written: {error}"
+        return None
 
     def _check_server(self, worker: Worker) -> None:
         """Retire the worker unless the policy's server is still there."""
@@ -131,6 +150,8 @@ def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, An
     `watched` has the cameras that the policy wants.
     """
     wanted = {*watched}
+    if config.subgoals not in (None, ORACLE):
+        wanted.add(CAMERA)
     if config.retrieval is not None:
         wanted.add(config.retrieval_camera.removeprefix(CAMERA_PREFIX))
     if config.videos or config.check_lesson:

@@ -56,17 +56,21 @@ def write_points(text: str, written: Sequence[str]) -> str:
     return first + "".join(point + words for point, words in zip(written, rest, strict=True))
 
 
-def read_points(text: str, pattern: "re.Pattern[str]") -> tuple[str, list[tuple[int, ...]]]:
+def read_points(text: str, pattern: "re.Pattern[str]") -> tuple[str, list[dict[str, int]]]:
     """Take numbers out of a text: each match of a pattern becomes `<point>`.
 
     Returns:
-        The text, and the numbers of each match's groups, in order.
+        The text, and of each match the numbers of its named groups, in order.
     """
-    numbers = [tuple(map(int, match.groups())) for match in pattern.finditer(text)]
-    return pattern.sub(POINT, text.replace(POINT, "")), numbers
+    text = text.replace(POINT, "")
+    numbers = [
+        {name: int(value) for name, value in match.groupdict().items() if value is not None}
+        for match in pattern.finditer(text)
+    ]
+    return pattern.sub(POINT, text), numbers
 
 
-_PIXELS = re.compile(r"<\s*(\d{1,4})\s*,\s*(\d{1,4})\s*>")
+_PIXELS = re.compile(r"<\s*(?P<y>\d{1,4})\s*,\s*(?P<x>\d{1,4})\s*>")
 
 
 def read_grounded(text: str) -> Subgoal:
@@ -76,4 +80,4 @@ def read_grounded(text: str) -> Subgoal:
         InvalidOptionError: There are no words in it.
     """
     words, numbers = read_points(text, _PIXELS)
-    return Subgoal(words.strip(), tuple((y, x) for y, x in numbers))
+    return Subgoal(words.strip(), tuple((one["y"], one["x"]) for one in numbers))

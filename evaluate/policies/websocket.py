@@ -123,13 +123,20 @@ class WebsocketPolicy(Policy):
         return actions
 
     def message(self, observation: Observation, goal: str) -> dict[str, Any]:
-        """Return what the server is asked for actions with; a subclass may send more."""
-        return {
+        """Return what the server is asked for actions with; a subclass may send more.
+
+        A subgoal goes both ways, with places and without: a server reads that of its kind.
+        """
+        message = {
             "observation/image": observation.images["front"],
             "observation/wrist_image": observation.images["wrist"],
             "observation/state": np.asarray(observation.state, np.float32),
             "prompt": goal,
         }
+        if (subgoal := observation.subgoal) is not None:
+            message["simple_subgoal"] = subgoal.simple
+            message["grounded_subgoal"] = subgoal.grounded
+        return message
 
     def keeps_frames(self) -> bool:
         """Return whether the server keeps frames: one that does refuses to act when it has none.

@@ -250,7 +250,7 @@ def check_name(tiny_split: Path, system: str, **changes: Any) -> None:
         (CHEAT, "oracle", "is not the control oracle"),
         ("replay", "retrieval-replay-full", "replay is not the control"),
         (CHEAT, "retrieval-replay-full-mean", "is not the control"),
-        ("websocket://h:1", "memer", "sends the server none"),
+        ("websocket://h:1", "memer", "acts on subgoals of a model"),
         ("oracle", "oracle", None),
         ("oracle", "my-upper-end", None),
         ("replay", "replay-full", None),

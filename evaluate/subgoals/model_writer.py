@@ -1,0 +1,155 @@
+"""Subgoals that a vision-language model writes: it reads the history and what is seen now."""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.evaluate.subgoals.prompt import Answer, load_prompt, merge_near
+from robomme_interference_data.evaluate.subgoals.writer import (
+    CAMERA,
+    History,
+    SubgoalWriter,
+    Turn,
+)
+from robomme_interference_data.sampling import spread
+from robomme_interference_data.simulators.base import Observation, Simulator
+from robomme_interference_data.subgoal import Subgoal
+
+
+class ModelWriter(SubgoalWriter):
+    """A vision-language model in front of a policy.
+
+    With a prompt that shows recent frames, the model may keep some of them: of those that lie
+    near each other their median is kept (`MemER`), and all come before later questions. An answer
+    that cannot be used leaves the subgoal what it was, the goal itself at first.
+
+    Args:
+        model: The model.
+        prompt: How it is asked: see `load_prompt`.
+        frames: Frames of the history that it is shown, evenly spread.
+        recent: Live frames that it is shown, where the prompt does.
+        stride: From one of them to the next.
+        near: Frames at most so far apart are near each other.
+
+    Raises:
+        InvalidOptionError: A number is below 1.
+        UnknownNameError, FormatError: See `load_prompt`.
+    """
+
+    looks = True
+
+    def __init__(
+        self,
+        model: ChatModel,
+        prompt: str = "grounded",
+        *,
+        frames: int = 32,
+        recent: int = 8,
+        stride: int = 2,
+        near: int = 8,
+    ):
+        super().__init__()
+        for name, value in (("frames", frames), ("recent", recent), ("stride", stride)):
+            if value < 1:
+                raise InvalidOptionError.expected(f"--subgoal-option {name}", value, "1 or more")
+        self._model, self._frames, self._near = model, frames, near
+        self.prompt, self._sha256 = load_prompt(prompt)
+        self.every_frame = self.prompt.watches
+        self._recent, self._stride = recent, stride
+        self._seen: deque[NDArray[np.uint8]] = deque(maxlen=(recent - 1) * stride + 1)
+
+    def start(self, history: History, info: RolloutInfo, simulator: Simulator) -> None:
+        """Decode what the model is shown of the history."""
+        super().start(history, info, simulator)
+        places = spread(0, len(history), self._frames)
+        self._history: list[Part] = [history.video(places)] if places else []
+        self._goal = info.goal
+        self._earlier: list[Subgoal] = []
+        self._kept: dict[int, NDArray[np.uint8]] = {}
+        self._seen.clear()
+        self._count = 0  # live frames that were seen
+
+    def watch(self, observations: Sequence[Observation]) -> None:
+        """Keep the last live frames, where the model is shown them."""
+        for one in observations:
+            self._seen.append(one.images[CAMERA])
+            self._count += 1
+
+    def next(self, observation: Observation, step: int) -> Subgoal:
+        """Ask the model; what it does not say is left as it was."""
+        image = observation.images[CAMERA]
+        size = (image.shape[0], image.shape[1])
+        recent = self._recent_frames()
+        images = {number: self._seen[number - self._count] for number in recent}
+        views: dict[str, Sequence[Part]] = {
+            "<history>": self._history,
+            "<keyframes>": [self._kept[number] for number in sorted(self._kept)],
+            "<recent>": list(images.values()),
+            "<image>": [image],
+        }
+        asked = self.prompt.fill(self._goal, self._earlier, size, views)
+        reply = self._model.reply(
+            [Message("system", (self.prompt.system,)), Message("user", asked)]
+        )
+        answer, fault = self._read(reply, size, len(recent))
+        if answer is not None:
+            if answer.subgoal != (self._earlier or [None])[-1]:
+                self._earlier.append(answer.subgoal)
+            self._keep(images, [recent[place] for place in answer.keyframes])
+        subgoal = self._earlier[-1] if self._earlier else Subgoal(self._goal)
+        self.turns.append(
+            Turn(
+                step,
+                subgoal.grounded,
+                prompt="".join(map(_told, asked)),
+                answer=reply.text,
+                fault=fault,
+                keyframes=tuple(sorted(self._kept)),
+                tokens=reply.tokens,
+                calls=reply.calls,
+                seconds=round(reply.seconds, 4),
+            )
+        )
+        return subgoal
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what the model says of itself, and the SHA-256 of the prompt's file."""
+        return {"model": self._model.metadata(), "prompt_sha256": self._sha256}
+
+    def close(self) -> None:
+        """Close the model."""
+        self._model.close()
+
+    def _read(
+        self, reply: Reply, size: tuple[int, int], shown: int
+    ) -> tuple[Answer | None, str | None]:
+        if not reply.text.strip():
+            return None, "it refused, or said nothing"
+        try:
+            return self.prompt.read(reply.text, size, shown), None
+        except InvalidOptionError as error:
+            return None, error.message
+
+    def _recent_frames(self) -> list[int]:
+        """Return the numbers of the live frames that the model is shown, the last one of now."""
+        if not self.prompt.watches:
+            return []
+        first = self._count - len(self._seen)
+        return list(range(self._count - 1, first - 1, -self._stride))[: self._recent][::-1]
+
+    def _keep(self, images: dict[int, NDArray[np.uint8]], chosen: Sequence[int]) -> None:
+        there = self._kept | {number: images[number] for number in chosen}
+        self._kept = {number: there[number] for number in merge_near([*there], self._near)}
+
+
+def _told(part: Part) -> str:
+    """Return a part of a question as the record has it."""
+    if isinstance(part, Video):
+        return f"[video of {len(part.frames)} frames]"
+    return part if isinstance(part, str) else "[image]"

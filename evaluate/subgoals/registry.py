@@ -1,0 +1,89 @@
+"""Writers of subgoals by what is written on the command line."""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.models.registry import (
+    make_model,
+    model_identity,
+    pin_model,
+)
+from robomme_interference_data.evaluate.policies.options import bind_options
+from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
+from robomme_interference_data.evaluate.subgoals.writer import ORACLE, OracleWriter, SubgoalWriter
+from robomme_interference_data.evaluate.systems import System
+
+
+def pin_subgoals(text: str | None) -> str | None:
+    """Return the one text of a writer: a model on the Hub has its commit; None stays None.
+
+    Raises:
+        UnknownNameError, InvalidOptionError, HubError: See `pin_model`.
+    """
+    return text if text in (None, ORACLE) else pin_model(str(text))
+
+
+def make_writer(config: RunConfig) -> SubgoalWriter | None:
+    """Make what writes the subgoals of a run, in this process; None if nothing does.
+
+    Raises:
+        UnknownNameError, InvalidOptionError, MissingExtraError, FormatError, HubError: It is not
+            written as it should be, or cannot be made: see `make_model` and `load_prompt`.
+    """
+    if config.subgoals in (None, ORACLE):
+        return None if config.subgoals is None else OracleWriter()
+    own, others = _parted(config.subgoal_options)
+    model = make_model(str(config.subgoals), others)
+    return ModelWriter(model, str(config.subgoal_prompt), **_bound(config.subgoals, own))
+
+
+def describe_subgoals(config: RunConfig, system: System) -> tuple[RunConfig, dict[str, Any]]:
+    """Make what writes subgoals once, ask what it is, and release it.
+
+    Returns:
+        The settings, the prompt among them; and what it says of itself, empty if nothing does.
+
+    Raises:
+        InterferenceError: It cannot be made, or its model cannot be reached, or is not there.
+    """
+    if config.subgoals not in (None, ORACLE):
+        config = replace(config, subgoal_prompt=config.subgoal_prompt or system.prompt)
+    writer = make_writer(config)
+    if writer is None:
+        return config, {}
+    try:
+        return config, {"subgoals": writer.metadata()}
+    finally:
+        writer.close()
+
+
+def subgoals_identity(config: RunConfig, said: Mapping[str, Any]) -> Any:
+    """Return what of the subgoals can change a result, as plain values; None without any.
+
+    Args:
+        config: The settings.
+        said: What their writer says of itself: see `describe_subgoals`.
+    """
+    if config.subgoals in (None, ORACLE):
+        return config.subgoals
+    own, others = _parted(config.subgoal_options)
+    told = said["subgoals"]
+    model = model_identity(str(config.subgoals), others, told["model"])
+    prompt = {"prompt_sha256": told["prompt_sha256"]}
+    return model | prompt | _bound(config.subgoals, own)
+
+
+def _parted(options: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the options of `ModelWriter`, and those of the model."""
+    kinds = inspect.signature(ModelWriter).parameters.values()
+    names = {one.name for one in kinds if one.kind is inspect.Parameter.KEYWORD_ONLY}
+    own = [one for one in options if one.partition("=")[0] in names]
+    return own, [one for one in options if one not in own]
+
+
+def _bound(text: Any, options: Sequence[str]) -> dict[str, Any]:
+    fixed = {"model": None, "prompt": ""}
+    return bind_options(str(text), ModelWriter, fixed, options)
