@@ -158,9 +158,15 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
             )
 
 
-def applicable(system: System, split: Split, policy: Policy) -> tuple[str, ...]:
+def applicable(config: RunConfig, system: System, split: Split, policy: Policy) -> tuple[str, ...]:
     """Return the conditions that the split has and that apply to system and policy."""
-    return tuple(name for name in split.conditions if _refusal(system, policy, name) is None)
+    reads = _reads_history(config, policy)
+    return tuple(name for name in split.conditions if _refusal(system, reads, name) is None)
+
+
+def _reads_history(config: RunConfig, policy: Policy) -> bool:
+    """Whether the policy, or a model that writes its subgoals, does anything with a history."""
+    return policy.wants_history or config.subgoals is not None
 
 
 def check_plan(
@@ -175,7 +181,7 @@ def check_plan(
     """
     items = plan.items()
     for name in plan.conditions:
-        if (refusal := _refusal(system, policy, name)) is not None:
+        if (refusal := _refusal(system, _reads_history(config, policy), name)) is not None:
             raise refusal
         split.manifest(split.episode_ids[0], name)  # is refused with what there is
     recalls = parse_policy(config.policy).kind == "recall"
@@ -235,9 +241,9 @@ def _make_once(name: str, options: dict[str, Any], worker: Worker) -> None:
     make_simulator(name, **options).close()
 
 
-def _refusal(system: System, policy: Policy, condition: str) -> InterferenceError | None:
+def _refusal(system: System, reads_history: bool, condition: str) -> InterferenceError | None:
     """Return why a condition does not apply, or None."""
-    if condition != NO_HISTORY and not (system.with_history and policy.wants_history):
+    if condition != NO_HISTORY and not (system.with_history and reads_history):
         who = "the policy" if system.with_history else system.name
         return InvalidOptionError(
             f"{who} takes no history, so {condition} says nothing of it",

@@ -163,7 +163,7 @@ class _Live:
         subgoal: Subgoal | None = None
         watches = self.writer is not None and self.writer.every_frame
         every_frame = self.policy.every_frame or watches
-        actions = np.empty((0, ACTION_SIZE), np.float32)
+        actions: NDArray[np.float32] = np.empty((0, ACTION_SIZE), np.float32)
         while True:
             # A policy that gives single actions is told as often as one that gives whole chunks.
             due = told is None or len(actions) > 1 or steps - told >= ACTION_CHUNK

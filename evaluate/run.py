@@ -122,7 +122,7 @@ def run_evaluation(
         config, written = describe_subgoals(config, system)
         plan = plan_work(
             split.episode_ids,
-            conditions=config.conditions or applicable(system, split, policy),
+            conditions=config.conditions or applicable(config, system, split, policy),
             families=config.families,
             episodes=config.episodes,
             episode_split=config.episode_split,

@@ -286,6 +286,13 @@ def format_sums(root: Path, paths: Iterable[str]) -> str:
     return "".join(f"{sha256_file(root / path)}  {path}\n" for path in sorted(paths))
 
 
+def digest_folder(folder: Path, patterns: Iterable[str]) -> str:
+    """Return the SHA-256 over names and bytes of a folder's files that fit one of the patterns."""
+    found = {path for pattern in patterns for path in folder.rglob(pattern) if path.is_file()}
+    names = (path.relative_to(folder).as_posix() for path in found)
+    return hashlib.sha256(format_sums(folder, names).encode()).hexdigest()
+
+
 def read_sums(path: Path) -> dict[str, str]:
     """Read a file of what `format_sums` returns: SHA-256 by path.
 

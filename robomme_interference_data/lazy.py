@@ -1,4 +1,4 @@
-"""Public names of a package, imported when they are asked for.
+"""What is imported when it is asked for: public names of packages, and what needs an extra.
 
 The command line and workers import packages first, and need few of their names.
 """
@@ -6,6 +6,8 @@ The command line and workers import packages first, and need few of their names.
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
+
+from robomme_interference_data.errors import MissingExtraError
 
 
 def lazily(package: str, *modules: str) -> Callable[[str], Any]:
@@ -24,3 +26,25 @@ def lazily(package: str, *modules: str) -> Callable[[str], Any]:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return find
+
+
+def load_extra(module: str, name: str, what: str, extra: str) -> Callable[..., Any]:
+    """Import a module of ours that needs libraries of an extra, and return a name of it.
+
+    Args:
+        module: Its full name.
+        name: The name.
+        what: What needs it, for the message.
+        extra: The extra, such as `evaluate`.
+
+    Raises:
+        MissingExtraError: A library is not installed.
+    """
+    try:
+        loaded = import_module(module)
+    except ImportError as error:
+        missing = error.name or ""
+        if missing.startswith(module.partition(".")[0]) or isinstance(error, MissingExtraError):
+            raise
+        raise MissingExtraError.needs(what, missing or "a library", extra) from error
+    return getattr(loaded, name)  # type: ignore[no-any-return]

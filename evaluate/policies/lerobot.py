@@ -4,7 +4,6 @@ What can be seen from the configuration is checked when the policy is made; the 
 loaded at the first rollout.
 """
 
-import hashlib
 import sys
 from collections import deque
 from collections.abc import Iterator
@@ -33,7 +32,7 @@ from robomme_interference_data.errors import (
     PolicyError,
 )
 from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
-from robomme_interference_data.files import format_sums
+from robomme_interference_data.files import digest_folder
 from robomme_interference_data.hub import locate
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
 
@@ -178,7 +177,7 @@ class LeRobotPolicy(Policy):
         return {
             "policy": "lerobot",
             "source": self._source,
-            "sha256": _digest_files(self._folder),
+            "sha256": digest_folder(self._folder, _FILES),
             "type": self._config.type,
             "n_obs_steps": self._steps,
             "device": self._device,
@@ -215,13 +214,6 @@ def find_policy(path: str) -> tuple[Path, str]:
             "Expected what LeRobot 0.6 saves, such as …/checkpoints/last/pretrained_model.",
         )
     return folder, name
-
-
-def _digest_files(folder: Path) -> str:
-    """Return the SHA-256 over the names and bytes of a policy's weights and configuration."""
-    found = {path for pattern in _FILES for path in folder.rglob(pattern) if path.is_file()}
-    names = (path.relative_to(folder).as_posix() for path in found)
-    return hashlib.sha256(format_sums(folder, names).encode()).hexdigest()
 
 
 @contextmanager

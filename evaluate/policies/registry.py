@@ -9,13 +9,13 @@ from typing import Any, get_type_hints
 
 from robomme_interference_data.errors import (
     InvalidOptionError,
-    MissingExtraError,
     PolicyError,
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.evaluate.policies.options import bind_options, signature_of
+from robomme_interference_data.evaluate.options import bind_options, signature_of
 from robomme_interference_data.evaluate.policies.policy import Policy
+from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.simulators.base import CAMERAS
 
 BUILTINS = ("replay", "recall", "oracle", "guess", "hold")
@@ -163,14 +163,7 @@ def _factory(text: str, worker: int) -> tuple[Callable[..., Policy], dict[str, A
 
 
 def _load(module: str, name: str, extra: str = "evaluate") -> Callable[..., Any]:
-    try:
-        loaded = import_module(f"{__package__}.{module}")
-    except ImportError as error:
-        missing = error.name or ""
-        if missing.startswith(__package__ or "") or isinstance(error, MissingExtraError):
-            raise
-        raise MissingExtraError.needs("this policy", missing or "a library", extra) from error
-    return getattr(loaded, name)  # type: ignore[no-any-return]
+    return load_extra(f"{__package__}.{module}", name, "this policy", extra)
 
 
 def _own_factory(target: str) -> Callable[..., Policy]:

@@ -99,7 +99,7 @@ class ModelWriter(SubgoalWriter):
         )
         answer, fault = self._read(reply, size, len(recent))
         if answer is not None:
-            if answer.subgoal != (self._earlier or [None])[-1]:
+            if answer.subgoal not in self._earlier[-1:]:
                 self._earlier.append(answer.subgoal)
             self._keep(images, [recent[place] for place in answer.keyframes])
         subgoal = self._earlier[-1] if self._earlier else Subgoal(self._goal)

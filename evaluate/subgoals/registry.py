@@ -11,10 +11,12 @@ from robomme_interference_data.evaluate.models.registry import (
     model_identity,
     pin_model,
 )
-from robomme_interference_data.evaluate.policies.options import bind_options
+from robomme_interference_data.evaluate.options import bind_options
 from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
 from robomme_interference_data.evaluate.subgoals.writer import ORACLE, OracleWriter, SubgoalWriter
 from robomme_interference_data.evaluate.systems import System
+
+_WHAT = "subgoal"  # has options: --subgoal-option
 
 
 def pin_subgoals(text: str | None) -> str | None:
@@ -36,7 +38,7 @@ def make_writer(config: RunConfig) -> SubgoalWriter | None:
     if config.subgoals in (None, ORACLE):
         return None if config.subgoals is None else OracleWriter()
     own, others = _parted(config.subgoal_options)
-    model = make_model(str(config.subgoals), others)
+    model = make_model(str(config.subgoals), others, _WHAT)
     return ModelWriter(model, str(config.subgoal_prompt), **_bound(config.subgoals, own))
 
 
@@ -71,7 +73,7 @@ def subgoals_identity(config: RunConfig, said: Mapping[str, Any]) -> Any:
         return config.subgoals
     own, others = _parted(config.subgoal_options)
     told = said["subgoals"]
-    model = model_identity(str(config.subgoals), others, told["model"])
+    model = model_identity(str(config.subgoals), others, told["model"], _WHAT)
     prompt = {"prompt_sha256": told["prompt_sha256"]}
     return model | prompt | _bound(config.subgoals, own)
 
@@ -86,4 +88,4 @@ def _parted(options: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def _bound(text: Any, options: Sequence[str]) -> dict[str, Any]:
     fixed = {"model": None, "prompt": ""}
-    return bind_options(str(text), ModelWriter, fixed, options)
+    return bind_options(str(text), ModelWriter, fixed, options, _WHAT)

@@ -14,7 +14,7 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.policies.options import bind_options
+from robomme_interference_data.evaluate.options import bind_options
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     PolicySpec,

@@ -39,6 +39,22 @@ class Still:
     def close(self) -> None: ...
 
 
+class Told(Still):
+    """Keeps the subgoals that it was told."""
+
+    def __init__(self, single: bool = False):
+        super().__init__()
+        self.action = np.repeat(self.action, 1 if single else 16, 0)
+        self.told: list[Any] = []
+
+    def reset(self, info: Any) -> None:
+        self.told = []
+
+    def act(self, observation: Any, goal: str) -> Any:
+        self.told.append(observation.subgoal)
+        return self.action
+
+
 def still(gripper: float) -> Still:
     return Still(gripper)
 

@@ -132,6 +132,9 @@ class Memoryless(Memory):
         return self.answer(message)
 
 
+_WORDS = ("prompt", "simple_subgoal", "grounded_subgoal")
+
+
 class PolicyServer:
     """Serves one memory.
 
@@ -243,5 +246,7 @@ class PolicyServer:
             self.memory.calls.append(call)
             self.memory.add_buffer(message)
             return {"add_buffer_finished": True, "add_buffer_time_ms": np.float64(0.5)}
-        self.memory.calls.append({"call": "infer", "prompt": message.get("prompt")})
+        self.memory.calls.append(
+            {"call": "infer"} | {name: message[name] for name in _WORDS if name in message}
+        )
         return self.memory.infer(message)

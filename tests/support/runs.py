@@ -56,7 +56,7 @@ def header(folder: Path) -> dict[str, Any]:
 
 def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) -> Rollout:
     """One rollout, outside of a run."""
-    parts = {name: changes.pop(name) for name in ("selector", "clip") if name in changes}
+    parts = {name: changes.pop(name) for name in ("selector", "clip", "writer") if name in changes}
     system = changes.pop("system", "mine")
     split = worlds.split_here()
     return run_rollout(

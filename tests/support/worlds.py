@@ -19,6 +19,7 @@ from robomme_interference_data.evaluate.policies.policy import Frames, RolloutIn
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
+from robomme_interference_data.subgoal import Subgoal
 
 SPLIT = "WORLDS_SPLIT"
 TROUBLE = "WORLDS_TROUBLE"
@@ -95,6 +96,9 @@ class World:
 
     def act(self, policy: str) -> NDArray[np.float32]:
         return np.append(self.answer[:7], np.float32(1.0))
+
+    def subgoal(self) -> Subgoal:
+        return Subgoal(f"go on from step {self.steps} to <point>", ((self.steps, 7),))
 
     def close(self) -> None:
         pass

@@ -1,4 +1,4 @@
-"""Options of policies: typed as `NAME=VALUE`, and checked against what the policy takes."""
+"""Options of policies and models: typed as `NAME=VALUE`, checked against what these take."""
 
 import inspect
 import json
@@ -17,22 +17,26 @@ _WORDS = {
 }
 
 
-def _split(texts: Iterable[str]) -> dict[str, str]:
+def _split(what: str, texts: Iterable[str]) -> dict[str, str]:
     options: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not name.isidentifier() or not equals:
             raise InvalidOptionError.expected(
-                "--policy-option", text, "NAME=VALUE, such as device=cpu"
+                f"--{what}-option", text, "NAME=VALUE, such as device=cpu"
             )
         if name in options:
-            raise InvalidOptionError(f"--policy-option {name} is given twice", "Give it once.")
+            raise InvalidOptionError(f"--{what}-option {name} is given twice", "Give it once.")
         options[name] = value
     return options
 
 
 def bind_options(
-    text: str, factory: Callable[..., Any], fixed: Mapping[str, Any], texts: Iterable[str]
+    text: str,
+    factory: Callable[..., Any],
+    fixed: Mapping[str, Any],
+    texts: Iterable[str],
+    what: str = "policy",
 ) -> dict[str, Any]:
     """Return all options that a factory is called with, defaults included.
 
@@ -40,10 +44,11 @@ def bind_options(
     `true`, `null`) if it is that.
 
     Args:
-        text: The policy as it is written, for the error.
+        text: The policy or model as it is written, for the error.
         factory: What makes it.
-        fixed: Arguments that the policy's text gives; they are no options.
+        fixed: Arguments that the text gives; they are no options.
         texts: Options as they are typed, `NAME=VALUE`.
+        what: What has options: `--policy-option`.
 
     Raises:
         InvalidOptionError: A text is something else, a name comes twice, or the factory takes no
@@ -51,14 +56,14 @@ def bind_options(
     """
     signature, declared = signature_of(factory), _declared(factory)
     given: dict[str, Any] = {}
-    for name, typed in _split(texts).items():
+    for name, typed in _split(what, texts).items():
         kinds = declared.get(name)
         value = typed if kinds and str in kinds else _read(typed)
         if kinds and float in kinds and type(value) is int:
             value = float(value)
         if kinds and type(value) not in kinds:  # bool is none of the numbers here
             raise InvalidOptionError.expected(
-                f"policy {text!r}: its option {name} is",
+                f"{what} {text!r}: its option {name} is",
                 value,
                 " or ".join(_WORDS[kind] for kind in kinds),
             )
@@ -68,7 +73,7 @@ def bind_options(
     except TypeError as error:
         names = [name for name in signature.parameters if name not in fixed]
         raise InvalidOptionError(
-            f"policy {text!r}: {error}", f"Its options: {', '.join(names) or 'none'}."
+            f"{what} {text!r}: {error}", f"Its options: {', '.join(names) or 'none'}."
         ) from error
     bound.apply_defaults()
     taken: dict[str, Any] = {}

@@ -1,0 +1,80 @@
+"""Images and videos as models are sent them."""
+
+import base64
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.encode import CLIP, VideoEncoder
+from robomme_interference_data.evaluate.models.model import Message, Part, Video
+from robomme_interference_data.sampling import spread
+
+
+def within(messages: Iterable[Message], images: int, mp4: bool) -> list[Message]:
+    """Return messages with at most so many images.
+
+    Videos give way first, the longer ones before others: their frames become evenly spread ones.
+
+    Args:
+        messages: The messages.
+        images: Images at most in all; single ones are never left out.
+        mp4: Whether videos stay videos; else they become images.
+    """
+    asked = list(messages)
+    if mp4:
+        return asked
+    parts = [part for message in asked for part in message.parts]
+    lengths = [len(part.frames) for part in parts if isinstance(part, Video)]
+    left = max(0, images - sum(isinstance(part, np.ndarray) for part in parts))
+    shares = iter(_shares(lengths, left))
+    return [
+        Message(
+            message.role,
+            tuple(one for part in message.parts for one in _shortened(part, shares)),
+        )
+        for message in asked
+    ]
+
+
+def _shares(lengths: Sequence[int], left: int) -> list[int]:
+    """Return how many of so many frames each video keeps, so that they are `left` at most."""
+    top = max(lengths, default=0)
+    while sum(min(length, top) for length in lengths) > left:
+        top -= 1
+    return [min(length, top) for length in lengths]
+
+
+def _shortened(part: Part, shares: Iterable[int]) -> tuple[Part, ...]:
+    if not isinstance(part, Video):
+        return (part,)
+    return tuple(part.frames[place] for place in spread(0, len(part.frames), next(iter(shares))))
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Return an image, `(H, W, 3) uint8` RGB, as PNG: nothing of it is lost."""
+    height, width, _ = image.shape
+    encoder = av.CodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
+    packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
+    return b"".join(map(bytes, packets))
+
+
+def mp4(video: Video) -> bytes:
+    """Return a video as H.264 in MP4; a row or column too many for it is left out."""
+    height, width = (side // 2 * 2 for side in video.frames.shape[1:3])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "video.mp4"
+        encoder = VideoEncoder(path, CLIP, max(1, round(video.fps)), height, width)
+        for frame in video.frames:
+            encoder.add(np.ascontiguousarray(frame[:height, :width]))
+        encoder.close()
+        return path.read_bytes()
+
+
+def data_url(kind: str, data: bytes) -> str:
+    """Return bytes as a `data:` address; `kind` is such as `image/png`."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

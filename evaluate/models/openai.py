@@ -1,0 +1,172 @@
+"""Models behind a chat endpoint as OpenAI has it: the only file that imports openai.
+
+vLLM, SGLang and ms-swift serve open models, with adapters too, in the same way.
+"""
+
+import os
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import openai
+from openai import OpenAI
+
+from robomme_interference_data.errors import InvalidOptionError, ModelError, first_line
+from robomme_interference_data.evaluate.models.images import data_url, mp4, png, within
+from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
+
+_WAITS = "The same command goes on where it stopped."
+
+
+class OpenAIModel(ChatModel):
+    """A chat endpoint that takes images.
+
+    What fails for the moment (no connection, no answer in time, 429, 5xx, an answer that is none)
+    is asked again up to `repeats` times, later each time, or when the server says so
+    (`Retry-After`, up to two minutes). A refusal is an answer without words. The key is
+    `OPENAI_API_KEY`; servers of one's own mostly want none.
+
+    Args:
+        url: Its base, such as `http://localhost:8000/v1`.
+        model: Name of the model there.
+        max_tokens: Tokens of an answer at most.
+        temperature: 0 for the likeliest words, as far as the server is deterministic.
+        images: Images in a question at most; videos are thinned out.
+        video: How frames that follow each other are sent: `images`, or `mp4`, one address of a
+            video (`video_url`, as vLLM and SGLang take it).
+        repeats: Further times that a question is asked.
+        connect_s: Most seconds until there is a connection.
+        response_s: Most seconds until there is an answer.
+
+    Raises:
+        InvalidOptionError: A number or `video` is not what it may be.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        model: str,
+        *,
+        max_tokens: int = 256,
+        temperature: float = 0.0,
+        images: int = 48,
+        video: str = "images",
+        repeats: int = 5,
+        connect_s: float = 20.0,
+        response_s: float = 300.0,
+    ):
+        if video not in ("images", "mp4"):
+            raise InvalidOptionError.one_of("video", video, ("images", "mp4"))
+        if min(max_tokens, images) < 1 or min(temperature, repeats) < 0:
+            raise InvalidOptionError(
+                f"max_tokens {max_tokens}, images {images}, temperature {temperature}, repeats "
+                f"{repeats}; expected at least 1, 1, 0 and 0"
+            )
+        if not min(connect_s, response_s) > 0:
+            raise InvalidOptionError(
+                f"connect_s {connect_s}, response_s {response_s}; expected positive numbers"
+            )
+        self._url, self._model = url, model
+        self._settings: dict[str, Any] = {"max_tokens": max_tokens, "temperature": temperature}
+        self._images, self._mp4, self._repeats = images, video == "mp4", repeats
+        self._client = OpenAI(
+            base_url=url,
+            api_key=os.environ.get("OPENAI_API_KEY") or "none",
+            timeout=openai.Timeout(response_s, connect=connect_s),
+            max_retries=repeats,
+        )
+
+    def reply(self, messages: Sequence[Message]) -> Reply:
+        """Ask, and ask again what fails for the moment; see `ChatModel.reply`."""
+        asked: Any = [
+            {"role": message.role, "content": _content(message.parts)}
+            for message in within(messages, self._images, self._mp4)
+        ]
+        began, calls, why = time.perf_counter(), 0, ""
+        while calls <= self._repeats:
+            try:
+                client = self._client.with_options(max_retries=self._repeats - calls)
+                response = client.chat.completions.with_raw_response.create(
+                    model=self._model, messages=asked, **self._settings
+                )
+            except openai.APIError as error:
+                raise self._error(error) from error
+            calls += response.retries_taken + 1
+            try:
+                return _read(response.parse(), calls, time.perf_counter() - began)
+            except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+                why = f"{type(error).__name__}: {first_line(error)}"
+        raise ModelError(
+            f"{self._url} answers what is no chat completion ({why}), asked {calls} times",
+            f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
+        )
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the model's name; the endpoint is asked whether it serves it."""
+        try:
+            known = [one.id for one in self._client.models.list()]
+        except openai.APIError as error:
+            raise self._error(error) from error
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ModelError(
+                f"{self._url} does not list its models: {first_line(error)}",
+                "Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1?",
+            ) from error
+        if self._model not in known:
+            raise ModelError(
+                f"{self._url} serves no model {self._model!r}",
+                f"It serves {', '.join(known) or 'none'}.",
+            )
+        return {"model": self._model}
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._client.close()
+
+    def _error(self, error: openai.APIError) -> ModelError:
+        status = getattr(error, "status_code", None)
+        if isinstance(error, openai.APITimeoutError):
+            return ModelError(
+                f"{self._url} gave no answer in time", f"Raise response_s, or ask less. {_WAITS}"
+            )
+        if isinstance(error, openai.APIConnectionError):
+            cause = first_line(error.__cause__ or error)
+            return ModelError(
+                f"{self._url} cannot be reached: {cause}", f"Is the server running? {_WAITS}"
+            )
+        hints = {
+            401: "Give its key: export OPENAI_API_KEY=…",
+            404: f"Does it serve the model {self._model!r}? Is the base right, mostly …/v1?",
+            429: f"It has too much to do, or a limit was reached. {_WAITS}",
+        }
+        told = first_line(error)[:500]
+        return ModelError(
+            f"{self._url} answers {status or 'an error'}: {told}", hints.get(status or 0)
+        )
+
+
+def _content(parts: Sequence[Part]) -> Any:
+    if len(parts) == 1 and isinstance(parts[0], str):
+        return parts[0]  # some chat templates take no lists for a system message
+    content: list[dict[str, Any]] = []
+    for part in parts:
+        if isinstance(part, str):
+            content.append({"type": "text", "text": part})
+        elif isinstance(part, Video):
+            url = {"url": data_url("video/mp4", mp4(part))}
+            content.append({"type": "video_url", "video_url": url})
+        else:
+            url = {"url": data_url("image/png", png(part))}
+            content.append({"type": "image_url", "image_url": url})
+    return content
+
+
+def _read(answer: Any, calls: int, seconds: float) -> Reply:
+    """Read a completion; what is none raises one of the errors of looking into it."""
+    message = answer.choices[0].message
+    text = message.content
+    if text is not None and not isinstance(text, str):
+        raise TypeError(f"content is {text!r}")
+    usage = answer.usage
+    tokens = None if usage is None else int(usage.total_tokens)
+    return Reply(text or "", tokens, calls, seconds)

@@ -1,0 +1,134 @@
+"""Models in this process, through transformers: the only file here that imports it."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import transformers
+from PIL import Image
+
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    MissingExtraError,
+    ModelError,
+    first_line,
+)
+from robomme_interference_data.evaluate.models.images import within
+from robomme_interference_data.evaluate.models.model import ChatModel, Message, Reply
+from robomme_interference_data.files import digest_folder
+from robomme_interference_data.hub import HubFiles, locate
+
+_FILES = ("*.json", "*.safetensors", "*.jinja", "*.txt", "*.model")
+
+
+class TransformersModel(ChatModel):
+    """A vision-language model and its processor, as `save_pretrained` leaves them.
+
+    It answers with the likeliest words, so that the same question has the same answer on one
+    machine. Frames of videos are shown as images.
+
+    Args:
+        path: A folder, or a model on the Hub, `namespace/name` or `namespace/name@revision`.
+        adapter: A PEFT adapter for it, by folder or as on the Hub.
+        device: `cpu`, `cuda` or `cuda:1`; None for the first GPU, if there is one.
+        max_tokens: Tokens of an answer at most.
+        images: Images in a question at most; videos are thinned out.
+
+    Raises:
+        MissingExtraError: peft is not installed, and there is an adapter.
+        InvalidOptionError: There is no such folder or device, or a number is below 1.
+        HubError: The Hub does not know the model, or cannot be reached.
+        ModelError: It cannot be loaded.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        *,
+        adapter: str | None = None,
+        device: str | None = None,
+        max_tokens: int = 256,
+        images: int = 48,
+    ):
+        if min(max_tokens, images) < 1:
+            raise InvalidOptionError(
+                f"max_tokens {max_tokens}, images {images}; expected at least 1"
+            )
+        self._max_tokens, self._images = max_tokens, images
+        try:
+            self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+            torch.empty(0, device=self._device)
+        except (RuntimeError, AssertionError) as error:
+            what = f"device {device!r} cannot be used: {first_line(error)}"
+            raise InvalidOptionError(what, "Give device=cpu.") from None
+        files = locate(path, "model")
+        folder = files.snapshot(*_FILES)
+        self._said: dict[str, Any] = {"sha256": digest_folder(folder, _FILES)}
+        if isinstance(files, HubFiles):
+            self._said |= {"model": files.repo_id, "revision": files.commit}
+        try:
+            processors: Any = transformers.AutoProcessor
+            self._processor = processors.from_pretrained(folder)
+            model: Any = transformers.AutoModelForImageTextToText.from_pretrained(
+                folder, dtype="auto"
+            )
+            if adapter is not None:
+                model = self._adapted(model, adapter)
+        except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+            raise ModelError(
+                f"transformers cannot load the model {path}: {first_line(error)}",
+                "Expected an image-text-to-text model with its processor, as save_pretrained "
+                "leaves both.",
+            ) from error
+        self._model = model.to(self._device).eval()
+
+    def _adapted(self, model: Any, adapter: str) -> Any:
+        try:
+            from peft import PeftModel
+        except ImportError as error:
+            raise MissingExtraError.needs("an adapter", "peft", "vlm") from error
+        folder = locate(adapter, "model").snapshot(*_FILES)
+        self._said["adapter_sha256"] = digest_folder(folder, _FILES)
+        return PeftModel.from_pretrained(model, folder)
+
+    def reply(self, messages: Sequence[Message]) -> Reply:
+        """Answer; see `ChatModel.reply`."""
+        began = time.perf_counter()
+        asked = [
+            {
+                "role": message.role,
+                "content": [
+                    {"type": "text", "text": part}
+                    if isinstance(part, str)
+                    else {"type": "image", "image": Image.fromarray(np.asarray(part))}
+                    for part in message.parts
+                ],
+            }
+            for message in within(messages, self._images, mp4=False)
+        ]
+        try:
+            inputs = self._processor.apply_chat_template(
+                asked,
+                add_generation_prompt=True,
+                tokenize=True,
+                return_dict=True,
+                return_tensors="pt",
+            ).to(self._device)
+            with torch.inference_mode():
+                tokens = self._model.generate(
+                    **inputs, max_new_tokens=self._max_tokens, do_sample=False
+                )[0]
+        except (RuntimeError, ValueError, TypeError, IndexError) as error:
+            raise ModelError(
+                f"the model broke: {type(error).__name__}: {first_line(error)}",
+                "With too little memory, give fewer images (images=16) or another device.",
+            ) from error
+        answer = tokens[inputs["input_ids"].shape[1] :]
+        text = self._processor.batch_decode(answer[None], skip_special_tokens=True)[0]
+        return Reply(text.strip(), len(tokens), 1, time.perf_counter() - began)
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the SHA-256 over its files, and those of its adapter; on the Hub its commit."""
+        return dict(self._said)

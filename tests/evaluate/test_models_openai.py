@@ -1,0 +1,220 @@
+"""Chat endpoints: what they are sent, what they answer, and what is done about their faults."""
+
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import av
+import numpy as np
+import openai
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.chat_server import (
+    BROKEN,
+    BUSY,
+    CLOSED,
+    EMPTY,
+    GARBAGE,
+    GONE,
+    REFUSED,
+    SLOW,
+    ChatServer,
+)
+
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    ModelError,
+    UnknownNameError,
+)
+from robomme_interference_data.evaluate.models.images import png, within
+from robomme_interference_data.evaluate.models.model import Message, Video
+from robomme_interference_data.evaluate.models.registry import (
+    make_model,
+    model_identity,
+    parse_model,
+)
+
+NOISE = np.random.default_rng(0).integers(0, 256, (20, 33, 21, 3), dtype=np.uint8)
+ASKED = [Message("system", ("be brief",)), Message("user", ("what is it? ", NOISE[0]))]
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the client repeat without waiting, unless the server says for how long."""
+    monkeypatch.setattr(openai._base_client, "INITIAL_RETRY_DELAY", 0.001)
+
+
+@pytest.fixture
+def server() -> Iterator[ChatServer]:
+    with ChatServer(answer=lambda seen: f"{len(seen.images)} images") as running:
+        yield running
+
+
+def model_of(server: ChatServer, *options: str, name: str = "tiny") -> Any:
+    return make_model(f"openai:{server.url}#{name}", options)
+
+
+# --- what is sent --------------------------------------------------------------------------------
+
+
+def test_words_and_images_arrive_as_they_are(server: ChatServer) -> None:
+    reply = model_of(server, "max_tokens=7").reply(ASKED)
+    assert (reply.text, reply.tokens, reply.calls) == ("1 images", 105, 1)
+    [seen] = server.seen
+    assert seen.text == "be briefwhat is it? "
+    assert np.array_equal(seen.images[0], NOISE[0])
+    assert (seen.body["max_tokens"], seen.body["temperature"]) == (7, 0.0)
+
+
+def test_one_connection_is_kept(server: ChatServer) -> None:
+    model = model_of(server)
+    model.metadata()
+    for _ in range(3):
+        model.reply(ASKED)
+    assert server.connections == 1
+
+
+def test_a_video_becomes_evenly_spread_images_within_the_budget(server: ChatServer) -> None:
+    asked = [Message("user", (Video(NOISE, 10.0), NOISE[7]))]
+    model_of(server, "images=5").reply(asked)
+    # One image is single; 4 of 20 frames: 0, 19/3 = 6.3, 12.7, 19.
+    for found, number in zip(server.seen[0].images, (0, 6, 12, 19, 7), strict=True):
+        assert np.array_equal(found, NOISE[number])
+
+
+def test_a_video_as_mp4(server: ChatServer) -> None:
+    model_of(server, "video=mp4").reply([Message("user", ("look", Video(NOISE, 5.0)))])
+    [data] = server.seen[0].videos
+    with av.open(io.BytesIO(data)) as container:
+        stream = container.streams.video[0]
+        assert (stream.height, stream.width, stream.average_rate) == (32, 20, 5)
+        assert sum(1 for _ in container.decode(video=0)) == 20
+
+
+@given(st.lists(st.integers(1, 30), max_size=4), st.integers(0, 3), st.integers(1, 40))
+def test_budgets(lengths: list[int], single: int, images: int) -> None:
+    frame = np.zeros((2, 2, 3), np.uint8)
+    videos = [Video(np.repeat(frame[None], length, 0), 10.0) for length in lengths]
+    [message] = within([Message("user", (*videos, *[frame] * single))], images, mp4=False)
+    assert all(isinstance(part, np.ndarray) for part in message.parts)
+    whole = sum(lengths) + single
+    assert len(message.parts) <= max(images, single)
+    assert (
+        len(message.parts) == whole or len(message.parts) > max(images, single) - len(lengths) - 1
+    )
+
+
+# --- faults --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", [BUSY, BROKEN, GARBAGE, EMPTY, CLOSED])
+def test_what_fails_for_the_moment_is_asked_again(server: ChatServer, fault: str) -> None:
+    server.faults = [fault, fault]
+    reply = model_of(server).reply(ASKED)
+    assert (reply.text, reply.calls) == ("1 images", 3)
+    assert len(server.seen) == 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (BUSY, "answers 429"),
+        (BROKEN, "answers 500"),
+        (GARBAGE, "no chat completion"),
+        (EMPTY, "no chat completion"),
+        (CLOSED, "cannot be reached"),
+    ],
+)
+def test_what_goes_on_failing_is_one_error(server: ChatServer, fault: str, words: str) -> None:
+    server.faults = [fault] * 9
+    with pytest.raises(ModelError, match=words):
+        model_of(server, "repeats=2").reply(ASKED)
+    assert len(server.seen) == 3
+
+
+def test_several_faults_in_one_question(server: ChatServer) -> None:
+    server.faults = [BUSY, GARBAGE, BROKEN, EMPTY, CLOSED]
+    reply = model_of(server).reply(ASKED)
+    assert (reply.calls, len(server.seen)) == (6, 6)
+
+
+def test_no_answer_in_time(server: ChatServer) -> None:
+    server.faults = [SLOW] * 2
+    with pytest.raises(ModelError, match="no answer in time"):
+        model_of(server, "repeats=1", "response_s=0.05").reply(ASKED)
+
+
+def test_a_refusal_is_an_answer_without_words(server: ChatServer) -> None:
+    server.faults = [REFUSED]
+    reply = model_of(server).reply(ASKED)
+    assert (reply.text, reply.calls) == ("", 1)
+
+
+def test_a_model_that_is_gone_is_not_asked_again(server: ChatServer) -> None:
+    server.faults = [GONE]
+    with pytest.raises(ModelError, match="answers 404"):
+        model_of(server).reply(ASKED)
+    assert len(server.seen) == 1
+
+
+def test_a_wrong_model_is_told_before_the_first_question(server: ChatServer) -> None:
+    with pytest.raises(ModelError, match="serves no model 'small'") as raised:
+        model_of(server, name="small").metadata()
+    assert "tiny" in str(raised.value.hint)
+    assert model_of(server).metadata() == {"model": "tiny"}
+
+
+def test_nobody_there() -> None:
+    with ChatServer() as server:
+        url = server.url
+    for call in ("metadata", "reply"):
+        model = make_model(f"openai:{url}#tiny", ["repeats=1"])
+        with pytest.raises(ModelError, match="cannot be reached"):
+            getattr(model, call)(*([ASKED] if call == "reply" else []))
+
+
+def test_another_page_is_no_endpoint(server: ChatServer) -> None:
+    model = make_model(f"openai:{server.url.removesuffix('/v1')}#tiny")
+    with pytest.raises(ModelError, match="answers 404") as raised:
+        model.metadata()
+    assert "/v1" in str(raised.value.hint)
+
+
+# --- how models are written ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text", ["openai:localhost:8000#m", "openai:http://h:1/v1", "openai:http://h#", "transformers:"]
+)
+def test_what_is_not_written_as_a_model(text: str) -> None:
+    with pytest.raises(InvalidOptionError, match="expected"):
+        parse_model(text)
+
+
+def test_an_unknown_kind_and_the_nearest_one() -> None:
+    with pytest.raises(UnknownNameError, match="no model") as raised:
+        parse_model("opneai:http://h#m")
+    assert "openai" in str(raised.value.hint)
+
+
+@pytest.mark.parametrize(
+    "option", ["max_tokens=0", "images=0", "video=gif", "repeats=-1", "response_s=0", "colour=red"]
+)
+def test_options_out_of_range(server: ChatServer, option: str) -> None:
+    with pytest.raises(InvalidOptionError, match=option.partition("=")[0]):
+        model_of(server, option)
+
+
+def test_what_makes_a_model_the_one_that_it_is() -> None:
+    said = {"model": "m"}
+    here = model_identity("openai:http://h/v1#m", ["images=9", "response_s=3"], said)
+    assert here == model_identity("openai:http://other/v1#m", ["images=9", "repeats=1"], said)
+    assert here != model_identity("openai:http://h/v1#m", ["images=8"], said)
+    assert (here["kind"], here["model"], here["options"]["images"]) == ("openai", "m", 9)
+
+
+def test_png_keeps_every_pixel() -> None:
+    with av.open(io.BytesIO(png(NOISE[3]))) as container:
+        [frame] = container.decode(video=0)
+    assert np.array_equal(frame.to_ndarray(format="rgb24"), NOISE[3])

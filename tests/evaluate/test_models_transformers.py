@@ -1,0 +1,71 @@
+"""Models in this process: a tiny one with random weights, saved and loaded as real ones are."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.vision_language import save_tiny_adapter, save_tiny_model
+
+from robomme_interference_data.errors import InvalidOptionError, ModelError
+from robomme_interference_data.evaluate.models.model import Message, Video
+from robomme_interference_data.evaluate.models.registry import make_model, pin_model
+
+NOISE = np.random.default_rng(0).integers(0, 256, (6, 32, 24, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_tiny_model(tmp_path_factory.mktemp("models") / "tiny")
+
+
+def asked(number: int) -> list[Message]:
+    return [Message("system", ("be brief",)), Message("user", (NOISE[number], "what is it?"))]
+
+
+def test_the_same_question_has_the_same_answer_and_another_image_another(tiny: Path) -> None:
+    model = make_model(f"transformers:{tiny}", ["max_tokens=12", "device=cpu"])
+    first, again, other = (model.reply(asked(number)) for number in (0, 0, 1))
+    assert first.text and first.text == again.text != other.text
+    assert first.calls == 1 and first.seconds > 0
+    # One image is four patches and the class; the words are single letters.
+    words = "system: be brief user: what is it? assistant: "
+    assert first.tokens is not None and len(words) + 5 < first.tokens <= len(words) + 5 + 12
+
+
+def test_a_video_is_thinned_out(tiny: Path) -> None:
+    model = make_model(f"transformers:{tiny}", ["max_tokens=1", "images=3"])
+    video = model.reply([Message("user", (Video(NOISE, 10.0),))])
+    images = model.reply([Message("user", (NOISE[0], NOISE[2], NOISE[5]))])
+    assert (video.text, video.tokens) == (images.text, images.tokens)
+
+
+def test_an_adapter_is_another_model(tiny: Path, tmp_path: Path) -> None:
+    adapter = save_tiny_adapter(tiny, tmp_path / "adapter")
+    plain = make_model(f"transformers:{tiny}", ["max_tokens=12"])
+    adapted = make_model(f"transformers:{tiny}", ["max_tokens=12", f"adapter={adapter}"])
+    assert plain.reply(asked(0)).text != adapted.reply(asked(0)).text
+    assert plain.metadata() == {"sha256": plain.metadata()["sha256"]}
+    assert {*adapted.metadata()} == {"sha256", "adapter_sha256"}
+
+
+def test_where_it_lies_is_no_part_of_it(tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "moved").symlink_to(tiny)
+    other = save_tiny_model(tmp_path / "other", seed=1)
+    said = [
+        make_model(f"transformers:{path}").metadata() for path in (tiny, tmp_path / "moved", other)
+    ]
+    assert said[0] == said[1] != said[2]
+
+
+def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ModelError, match="cannot load the model"):
+        make_model(f"transformers:{tmp_path / 'empty'}")
+    with pytest.raises(InvalidOptionError, match="neither a folder"):
+        make_model("transformers:nowhere at all")
+    with pytest.raises(InvalidOptionError, match="device"):
+        make_model(f"transformers:{tiny}", ["device=cuda:77"])
+
+
+def test_a_folder_stays_what_it_is(tiny: Path) -> None:
+    assert pin_model(f"transformers:{tiny}") == f"transformers:{tiny}"
