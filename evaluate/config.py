@@ -28,7 +28,7 @@ class RunConfig(RetrievalConfig):
     """What to roll out, and how."""
 
     policy: str = setting(
-        help="replay, recall (both also with :framesamp or :window), oracle, guess, hold, "
+        help="replay, recall (both also with :framesamp or :window), oracle, guess, obey, hold, "
         "websocket://HOST:PORT (several with commas), lerobot:REPO[@REVISION], lerobot:FOLDER or "
         "python:module:factory."
     )

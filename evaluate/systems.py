@@ -125,7 +125,10 @@ def _control(kind: str, *, retrieval: bool, bound: bool = False) -> tuple[System
 
 
 _CONTROLS = (
-    *(System(name.lower(), name, "none", bound=True) for name in ("Oracle", "Guess", "Hold")),
+    *(
+        System(name.lower(), name, "none", bound=True)
+        for name in ("Oracle", "Guess", "Hold", "Obey", "Obey-Oracle")
+    ),
     *_control("Replay", retrieval=False),
     *_control("Replay", retrieval=True),
     *_control("Recall", retrieval=False, bound=True),

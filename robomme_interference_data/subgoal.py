@@ -42,12 +42,17 @@ class Subgoal:
     @property
     def simple(self) -> str:
         """The text without places: what released servers take as `simple_subgoal`."""
-        return _NAMED_AT.sub("", self.text).strip()
+        return without_points(self.text)
 
     @property
     def grounded(self) -> str:
         """The text with places as `<y, x>`: what released servers take as `grounded_subgoal`."""
         return write_points(self.text, [f"<{y}, {x}>" for y, x in self.points])
+
+
+def without_points(text: str) -> str:
+    """Return a subgoal's text without places."""
+    return _NAMED_AT.sub("", text).strip()
 
 
 def write_points(text: str, written: Sequence[str]) -> str:

@@ -169,6 +169,21 @@ class Privileged(Policy):
         return self._simulator
 
 
+class Obey(Privileged):
+    """`obey`: does what subgoals say, by the simulator's own script.
+
+    It finds what their words and points name among all that the scene allows, and knows no answer.
+    Without subgoals it does what `guess` does.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("obey")
+
+    def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
+        """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
+        return self._asked().obey(observation.subgoal)[None]
+
+
 class Recall(Privileged):
     """`recall`: the ideal observer, the ceiling of every policy with its memory rule.
 

@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.simulators.base import CAMERAS
 
-BUILTINS = ("replay", "recall", "oracle", "guess", "hold")
+BUILTINS = ("replay", "recall", "oracle", "guess", "obey", "hold")
 """Policies without learned weights."""
 
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
@@ -157,8 +157,8 @@ def _factory(text: str, worker: int) -> tuple[Callable[..., Policy], dict[str, A
     if spec.kind in ("replay", "recall"):
         name = {"replay": "ReplayPolicy", "recall": "Recall"}[spec.kind]
         return _load("builtin", name), {"memory": spec.target}
-    if spec.kind == "hold":
-        return _load("builtin", "Hold"), {}
+    if spec.kind in ("hold", "obey"):
+        return _load("builtin", spec.kind.capitalize()), {}
     return _load("builtin", "Privileged"), {"name": spec.kind}
 
 

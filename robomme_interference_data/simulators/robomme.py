@@ -34,6 +34,7 @@ from robomme_interference_data.simulators.base import (
     Simulator,
     choose_cameras,
 )
+from robomme_interference_data.subgoal import Subgoal, read_grounded
 
 PYTHON_VARIABLE = "ROBOMME_PYTHON"
 """Environment variable with the path of RoboMME's interpreter."""
@@ -105,6 +106,7 @@ class RoboMMESimulator(Simulator):
         self._cameras = choose_cameras(cameras)
         self._python, self._answer_s = find_python(python), answer_s
         self._process = _Process(self._python, answer_s)
+        self._subgoal: str | None = None
 
     @property
     def versions(self) -> dict[str, str]:
@@ -117,6 +119,16 @@ class RoboMMESimulator(Simulator):
             f"the robomme simulator has no built-in policy {policy!r}",
             "oracle, guess and recall play on the embedded suite only: --simulator tabletop.",
         )
+
+    def subgoal(self) -> Subgoal:
+        """Return RoboMME's own subgoal of now; see `Simulator.subgoal`."""
+        self._running()
+        if not (self._subgoal or "").strip():
+            raise UnknownNameError(
+                f"RoboMME in {self._python} tells no subgoal now",
+                "Run without --subgoals oracle, or with a newer RoboMME.",
+            )
+        return read_grounded(str(self._subgoal))
 
     @property
     def pid(self) -> int | None:
@@ -150,6 +162,7 @@ class RoboMMESimulator(Simulator):
             cameras=self._cameras,
             demonstration=demonstration,
         )
+        self._subgoal = about["subgoal"]
         first = self._observation(arrays, self._cameras)
         images = {camera: arrays[camera][:-1] for camera in self._cameras if demonstration}
         no_actions = np.empty((0, ACTION_SIZE), np.float32)
@@ -165,6 +178,7 @@ class RoboMMESimulator(Simulator):
         if status is Status.ERROR:
             what = f"reports an error at step {self._steps}: {answer['message']}"
             raise self._process.error(what)
+        self._subgoal = answer["subgoal"]
         return self._observation(arrays, self._cameras if observe else ()), status
 
     def _observation(self, arrays: Arrays, cameras: tuple[str, ...]) -> Observation:

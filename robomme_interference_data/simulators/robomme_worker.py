@@ -135,11 +135,12 @@ class Episodes:
             "seed": int(seed),
             "difficulty": str(difficulty),
             "goals": [goals] if isinstance(goals, str) else [str(goal) for goal in goals],
+            "subgoal": _subgoal(info),
         }
         return about, self._arrays(observations, slice(None) if demonstration else slice(-1, None))
 
     def step(self, action: list[float], observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Execute an action; return the status, and one state and, if wanted, one frame each."""
+        """Execute an action; return status and subgoal, and one state and, if wanted, one frame."""
         import numpy as np
 
         observations, _, _, _, info = self._env.step(np.array(action, np.float32))
@@ -148,7 +149,8 @@ class Episodes:
             return {"status": "error", "message": str(info.get("error_message"))}, {}
         shown = slice(-1, None) if observe else slice(0, 0)
         arrays = self._arrays(observations, shown)
-        return {"status": str(info["status"])}, {**arrays, "states": arrays["states"][-1:]}
+        told = {"status": str(info["status"]), "subgoal": _subgoal(info)}
+        return told, {**arrays, "states": arrays["states"][-1:]}
 
     def close(self) -> None:
         """Close the environment, if there is one."""
@@ -208,6 +210,14 @@ def _read(channel: Connection, requests: Any) -> None:
 
 def _builder() -> Any:
     return importlib.import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder
+
+
+def _subgoal(info: dict[str, Any]) -> str | None:
+    """Return what RoboMME says is to be done next, with places if it says them; or None."""
+    for kind in ("grounded", "simple"):
+        if told := info.get(f"{kind}_subgoal_online"):
+            return str(told)
+    return None
 
 
 def _text(error: BaseException) -> str:

@@ -26,6 +26,7 @@ from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.registry import simulator_versions
 from robomme_interference_data.simulators.robomme import EPISODES, RoboMMESimulator, find_python
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+from robomme_interference_data.subgoal import Subgoal
 
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
 
@@ -101,6 +102,18 @@ def told(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
     frames = [one.images[name].tobytes() for one in seen for name in ("front", "wrist")]
     states = [lesson.states.tobytes(), *(one.state.tobytes() for one in seen)]
     return (info, states, lesson.images["front"].tobytes(), frames)
+
+
+def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
+    simulator.reset("MoveCube/test/3")
+    assert simulator.subgoal() == Subgoal("pick up the cube at <point>, step 0", ((0, 200),))
+    for _ in range(2):
+        simulator.step(HOLD, observe=False)
+    assert simulator.subgoal().grounded == "pick up the cube at <2, 200>, step 2"
+    assert simulator.subgoal().simple == "pick up the cube, step 2"
+    simulator.reset("PatternLock/test/3")
+    with pytest.raises(UnknownNameError, match="tells no subgoal"):
+        simulator.subgoal()
 
 
 def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMESimulator) -> None:

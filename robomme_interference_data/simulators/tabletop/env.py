@@ -23,14 +23,17 @@ from robomme_interference_data.simulators.tabletop.camera import (
     FRONT_TARGET,
     FRONT_VIEW,
     SIZE,
+    to_pixels,
 )
 from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, turn_of
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.look import Look
-from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Script
+from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Point, Script
+from robomme_interference_data.simulators.tabletop.obeying import Obeying
 from robomme_interference_data.simulators.tabletop.renderer import make_renderer
+from robomme_interference_data.subgoal import Pixel, Subgoal
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "num_envs": (1,),
@@ -115,6 +118,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.arm = Arm(self.agent.robot._objs[0], self.episode.pace, self.episode.stick)
         self.status = Status.ONGOING
         self._scripts: dict[str, Script] = {}
+        self._obeying: Obeying | None = None
         self._rest()
 
     def _after_control_step(self) -> None:
@@ -182,6 +186,30 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             self._scripts[policy] = self.episode.solve(self.arm, answer)
         next(self._scripts[policy], None)  # a script that is through holds its last pose
         return self.arm.action.copy()
+
+    def subgoal(self) -> Subgoal:
+        """Return what is to be done next, as the scene stands; see `Simulator.subgoal`."""
+        last = self.episode.steps() - 1
+        step = self.episode.step(self.answer, min(self.episode.progress(), last))
+        return Subgoal(step.text, self.to_pixels(step.at))
+
+    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        """Return the next action of a script that obeys, `(8,) float32`; see `Simulator.obey`."""
+        if self._obeying is None:
+            if subgoal is None:
+                return self.act("guess")
+            self.arm.reset()
+            answers = self.episode.shuffled(self.number)
+            self._obeying = Obeying(self.episode, self.arm, answers, self.to_pixels)
+        self._obeying.act(subgoal)
+        return self.arm.action.copy()
+
+    def to_pixels(self, points: Sequence[Point]) -> tuple[Pixel, ...]:
+        """Return where points are in the front image as it is now; see `camera.to_pixels`."""
+        pose = (
+            self._camera("front").global_pose.to_transformation_matrix() if self.drawing else None
+        )
+        return to_pixels(points, pose)
 
     def observe(self, cameras: Sequence[str] = CAMERAS) -> Observation:
         """Return what a policy sees now, drawing these cameras."""

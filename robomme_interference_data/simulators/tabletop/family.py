@@ -1,7 +1,8 @@
 """What a task family is: a scene, a hidden answer, a script that shows it, and a judge."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -10,10 +11,25 @@ from numpy.random import RandomState
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.kit import Colour, Kit
-from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.motion import Arm, Point, Script
 
 _RECALLED = 2
 """Stream of random numbers; see `episodes.turn_of` for the others."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One of the steps in which an answer is carried out.
+
+    Attributes:
+        text: What is to be done, with `<point>` for the place of each thing (see `Subgoal`).
+        at: These places as the scene stands now, in m.
+        do: Does it.
+    """
+
+    text: str
+    at: tuple[Point, ...]
+    do: Callable[[Arm], Script]
 
 
 class Family(ABC):
@@ -91,9 +107,13 @@ class Family(ABC):
         It is the first of them in an order that the seed alone decides: who knows more keeps to
         the right answer, if it was drawn.
         """
-        order = RandomState([seed, _RECALLED]).permutation(len(self.answers))
         left = set(self.agreeing(known))
-        return next(self.answers[place] for place in order if self.answers[place] in left)
+        return next(answer for answer in self.shuffled(seed) if answer in left)
+
+    def shuffled(self, seed: int) -> list[Any]:
+        """Return the answers in an order that the seed alone decides."""
+        order = RandomState([seed, _RECALLED]).permutation(len(self.answers))
+        return [self.answers[place] for place in order]
 
     @cached_property
     def _told(self) -> list[tuple[Any, tuple[str, ...]]]:
@@ -106,9 +126,22 @@ class Family(ABC):
     def react(self, arm: Arm) -> None:
         """Let the scene answer to the arm after a step: lamps, the cap of a button."""
 
-    @abstractmethod
     def solve(self, arm: Arm, answer: Any) -> Script:
-        """Do the task as the answer says."""
+        """Do the task as the answer says, step by step."""
+        for number in range(self.steps()):
+            yield from self.step(answer, number).do(arm)
+
+    @abstractmethod
+    def steps(self) -> int:
+        """How many steps the task takes, whatever the answer."""
+
+    @abstractmethod
+    def step(self, answer: Any, number: int) -> Step:
+        """One of these steps, from 0."""
+
+    @abstractmethod
+    def progress(self) -> int:
+        """How many steps are done, as far as the judge has seen."""
 
     @abstractmethod
     def judge(self, arm: Arm, answer: Any) -> Status:

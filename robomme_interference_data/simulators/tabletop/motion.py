@@ -168,10 +168,14 @@ class Arm:
         yield from self.wait(SETTLE)
         yield from self.move((x, y, z + CLEARANCE))
 
+    def rise(self, height: float) -> Script:
+        """Go straight up to a height at least."""
+        x, y, z = self._goal
+        yield from self.move((x, y, max(z, height)))
+
     def go_home(self) -> Script:
         """Withdraw upwards, then go to the home pose with the gripper open."""
-        x, y, z = self._goal
-        yield from self.move((x, y, max(z, 0.18)))
+        yield from self.rise(0.18)
         yield from self.move(HOME, 0.0)
         if not self._stick and self._gripper < 0:
             yield from self.grip(close=False)

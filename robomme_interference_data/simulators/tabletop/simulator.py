@@ -19,6 +19,7 @@ from robomme_interference_data.simulators.base import (
 )
 from robomme_interference_data.simulators.tabletop.env import TabletopEnv
 from robomme_interference_data.simulators.tabletop.episodes import seed_of
+from robomme_interference_data.subgoal import Subgoal
 
 POLICIES = ("oracle", "guess", "recall")
 
@@ -54,6 +55,16 @@ class TabletopSimulator(Simulator):
         if policy not in POLICIES:
             raise UnknownNameError.among("built-in policy", policy, self.name, POLICIES)
         return self.env.act(policy, known)
+
+    def subgoal(self) -> Subgoal:
+        """Return what is to be done next, as the scene stands; see `Simulator.subgoal`."""
+        self._running()
+        return self.env.subgoal()
+
+    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        """Return the next action of the script that obeys; see `Simulator.obey`."""
+        self._running()
+        return self.env.obey(subgoal)
 
     def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
         """Yield what is seen now as under each of several shifts; the scene stays what it is.

@@ -8,7 +8,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.kit import COLOURS, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import row
@@ -18,6 +18,8 @@ HOLE, DEPTH = 0.036, 0.08  # m, of the box
 LIFTED = 0.03  # m, height of the peg's middle
 HEAD, TAIL = 1, -1
 LEFT, RIGHT = 1, -1
+_ENDS = {HEAD: "head", TAIL: "tail"}
+_SIDES = {LEFT: "left", RIGHT: "right"}
 
 
 class InsertPeg(Family):
@@ -53,8 +55,8 @@ class InsertPeg(Family):
         number, end, side = answer
         return (
             f"takes peg {number}",
-            f"holds it at its {'head' if end == HEAD else 'tail'}",
-            f"inserts it from the {'left' if side == LEFT else 'right'}",
+            f"holds it at its {_ENDS[end]}",
+            f"inserts it from the {_SIDES[side]}",
         )
 
     def demonstrate(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
@@ -63,12 +65,29 @@ class InsertPeg(Family):
         yield from arm.grip(close=False)
         yield from arm.go_home()
 
-    def solve(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
-        number, end, side = answer
+    def steps(self) -> int:
+        return 2
+
+    def step(self, answer: tuple[int, int, int], number: int) -> Step:
+        peg, end, side = answer
+        if number == 0:
+            at = self.pegs[peg].point(end * GRIP, 0, 0)
+            text = f"pick up the peg at <point> by its {_ENDS[end]}"
+            return Step(text, (at,), lambda arm: self.take(arm, peg, end))
+        mouth = self.box.point(0, side * DEPTH / 2, self.box.size)
+        text = f"insert it into the box at <point> from the {_SIDES[side]}"
+        return Step(text, (mouth,), lambda arm: self.insert(arm, end, side))
+
+    def progress(self) -> int:
+        return int(any(peg.p[2] >= LIFTED for peg in self.pegs))
+
+    def take(self, arm: Arm, number: int, end: int) -> Script:
         at = self.pegs[number].point(end * GRIP, 0, 0)
         yield from arm.go_above(at)
         self.showing = (0, 1)
         yield from arm.take(at, lift=0.15)
+
+    def insert(self, arm: Arm, end: int, side: int) -> Script:
         x, y, _ = self.box.p
         free = GRIP + LENGTH / 2  # from the grip to the end that goes in
         yaw = math.copysign(math.pi / 2, end * side)

@@ -7,7 +7,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import is_near, off_line
@@ -20,6 +20,11 @@ _WORDS = {
     "push": "pushes the cube with the closed gripper",
     "grasp": "grasps the cube",
     "hook": "hooks the cube",
+}
+_STEPS = {
+    "push": "push the cube at <point> to the target at <point> with the closed gripper",
+    "grasp": "grasp the cube at <point> and put it on the target at <point>",
+    "hook": "hook the cube at <point> with the hook at <point> to the target at <point>",
 }
 BESIDE = 0.034  # m, from the middle of the handle to the middle of the cube
 
@@ -63,11 +68,17 @@ class MoveCube(Family):
             self.showing = ()
         yield from arm.go_home()
 
-    def solve(self, arm: Arm, answer: str) -> Script:
+    def steps(self) -> int:
+        return 1
+
+    def step(self, answer: str, number: int) -> Step:
+        do = {"push": self.push, "grasp": self.grasp, "hook": self.use_hook}[answer]
         start, end = self.cube.p, self.target.p
-        return {"push": self.push, "grasp": self.grasp, "hook": self.use_hook}[answer](
-            arm, start, end
-        )
+        tool = (self.hook.point(HANDLE / 2, 0, 0),) if answer == "hook" else ()
+        return Step(_STEPS[answer], (start, *tool, end), lambda arm: do(arm, start, end))
+
+    def progress(self) -> int:
+        return 0
 
     def push(self, arm: Arm, start: Vector, end: Vector) -> Script:
         behind = start - 0.055 * self.way

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.kit import Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, Spot
@@ -81,14 +81,28 @@ class PatternLock(StickFamily):
     def told(self, answer: tuple[int, ...]) -> tuple[str, ...]:
         return tuple(f"goes to button {number}" for number in answer)
 
-    def solve(self, arm: Arm, answer: tuple[int, ...]) -> Script:
-        yield from arm.move((*self.spots[answer[0]], HIGH))
-        for part, number in enumerate(answer):
-            self.showing = (part,)
-            yield from arm.move((*self.spots[number], TALL + ABOVE), speed=0.15)
-            yield from arm.wait(8)
-        self.showing = ()
-        yield from arm.move((*self.spots[answer[-1]], HIGH))
+    def steps(self) -> int:
+        return self.length[self.level]
+
+    def step(self, answer: tuple[int, ...], number: int) -> Step:
+        at = (*self.spots[answer[number]], TALL)
+        return Step(
+            "go to the button at <point>", (at,), lambda arm: self.touch(arm, answer, number)
+        )
+
+    def progress(self) -> int:
+        return self.done
+
+    def touch(self, arm: Arm, answer: tuple[int, ...], number: int) -> Script:
+        spot = self.spots[answer[number]]
+        if number == 0:
+            yield from arm.move((*spot, HIGH))
+        self.showing = (number,)
+        yield from arm.move((*spot, TALL + ABOVE), speed=0.15)
+        yield from arm.wait(8)
+        if number == self.steps() - 1:
+            self.showing = ()
+            yield from arm.move((*spot, HIGH))
 
     def judge(self, arm: Arm, answer: tuple[int, ...]) -> Status:
         if self.now is not None and self.now != self.last:

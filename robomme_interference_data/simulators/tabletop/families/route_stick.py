@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.families.pattern_lock import StickFamily
+from robomme_interference_data.simulators.tabletop.family import Step
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line
@@ -65,20 +66,36 @@ class RouteStick(StickFamily):
             ),
         )
 
-    def solve(self, arm: Arm, answer: Route) -> Script:
+    def steps(self) -> int:
+        return self.turns[self.level] + 1
+
+    def step(self, answer: Route, number: int) -> Step:
         targets, sides = answer
-        yield from arm.move((*self.spots[targets[0]], HIGH))
-        self.showing = (0,)
-        yield from arm.move((*self.spots[targets[0]], LOW), speed=0.15)
+        to = (*self.spots[targets[number]], FLAT)
+        if number == 0:
+            return Step("go to the target at <point>", (to,), lambda arm: self.go(arm, answer, 0))
+        post = (*self.posts[min(targets[number - 1 : number + 1])], TALL / 2)
+        side = _SIDES[sides[number - 1]]
+        text = f"go round the post at <point> on the {side} side to the target at <point>"
+        return Step(text, (post, to), lambda arm: self.go(arm, answer, number))
+
+    def progress(self) -> int:
+        return len(self.reached)
+
+    def go(self, arm: Arm, answer: Route, number: int) -> Script:
+        targets, sides = answer
+        spot = self.spots[targets[number]]
+        if number == 0:
+            yield from arm.move((*spot, HIGH))
+        self.showing = (number,)
+        if number:
+            x, y = self.posts[min(targets[number - 1 : number + 1])]
+            yield from arm.move((x + sides[number - 1] * ASIDE, y, LOW), speed=0.15)
+        yield from arm.move((*spot, LOW), speed=0.15)
         yield from arm.wait(3)
-        for (one, other), side in zip(pairwise(targets), sides, strict=True):
-            x, y = self.posts[min(one, other)]
-            self.showing = (self.showing[0] + 1,)
-            yield from arm.move((x + side * ASIDE, y, LOW), speed=0.15)
-            yield from arm.move((*self.spots[other], LOW), speed=0.15)
-            yield from arm.wait(3)
-        self.showing = ()
-        yield from arm.move((*self.spots[targets[-1]], HIGH))
+        if number == self.steps() - 1:
+            self.showing = ()
+            yield from arm.move((*spot, HIGH))
 
     def judge(self, arm: Arm, answer: Route) -> Status:
         targets, sides = answer

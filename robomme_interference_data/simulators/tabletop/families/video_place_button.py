@@ -9,6 +9,7 @@ from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
+from robomme_interference_data.simulators.tabletop.family import Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import (
@@ -19,6 +20,7 @@ from robomme_interference_data.simulators.tabletop.stage import (
 )
 
 RADIUS = 0.035  # m, of a target
+OPEN = 0.03  # m, way of a finger that holds nothing
 WHEN = ("before", "after")
 
 
@@ -55,6 +57,7 @@ class PlaceFamily(ExchangeFamily):
         if self.level == 2:
             self.draw_swaps(rng)
         self.answers = list(range(count))
+        self.held = False
 
     def build(self, kit: Kit) -> None:
         self.targets = [kit.target(spot, self.paint, RADIUS) for spot in self.target_spots]
@@ -81,6 +84,10 @@ class PlaceFamily(ExchangeFamily):
         yield from arm.pick(self.cubes[cube].p)
         if cube == 0:
             self.showing = (part,)
+        yield from self.put(arm, target)
+
+    def put(self, arm: Arm, target: int) -> Script:
+        """Put the cube that is held on a target."""
         x, y, _ = self.targets[target].p
         yield from arm.put((x, y, CUBE / 2 + 0.004))
 
@@ -93,12 +100,23 @@ class PlaceFamily(ExchangeFamily):
         yield from arm.wait(15)
         yield from self.exchange(arm, [[target] for target in self.targets], len(self.times))
 
-    def solve(self, arm: Arm, answer: int) -> Script:
-        yield from self.place(arm, 0, answer)
+    def steps(self) -> int:
+        return 2
+
+    def step(self, answer: int, number: int) -> Step:
+        if number == 0:
+            text, at = f"pick up the {self.colours[0]} cube at <point>", self.cubes[0].p
+            return Step(text, (at,), lambda arm: arm.pick(self.cubes[0].p))
+        text = "put it on the target at <point>"
+        return Step(text, (self.targets[answer].p,), lambda arm: self.put(arm, answer))
+
+    def progress(self) -> int:
+        return int(self.held)
 
     def judge(self, arm: Arm, answer: int) -> Status:
         cube = self.cubes[0]
-        if cube.p[2] > CUBE or arm.opening < 0.03:
+        self.held = cube.p[2] > CUBE or (self.held and arm.opening < OPEN)
+        if cube.p[2] > CUBE or arm.opening < OPEN:
             return Status.ONGOING
         for number, target in enumerate(self.targets):
             if is_near(cube, target, RADIUS):

@@ -4,11 +4,13 @@ from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
+from robomme_interference_data.simulators.tabletop.family import Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import push_down, row
 
 LIFTED = 0.06  # m, height of the cube's middle
+OPEN = 0.03  # m, way of a finger that holds nothing
 TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 
 
@@ -33,7 +35,7 @@ class VideoRepick(ExchangeFamily):
         if self.level == 2:
             self.draw_swaps(rng)
         self.answers = list(range(count))
-        self.lifts, self.raised = 0, False
+        self.lifts, self.raised, self.held = 0, False, False
 
     def build(self, kit: Kit) -> None:
         self.cubes = [kit.cube(s, c) for s, c in zip(self.spots, self.colours, strict=True)]
@@ -57,21 +59,37 @@ class VideoRepick(ExchangeFamily):
 
     def lift(self, arm: Arm, number: int) -> Script:
         """Pick a cube up and put it down where it was."""
-        at = self.cubes[number].p
-        yield from arm.go_above(at)
+        yield from self.pick_up(arm, number)
+        yield from self.put_down(arm)
+
+    def pick_up(self, arm: Arm, number: int) -> Script:
+        self.taken = self.cubes[number].p
+        yield from arm.go_above(self.taken)
         self.showing = (0,)
-        yield from arm.take(at)
+        yield from arm.take(self.taken)
         yield from arm.wait(5)
-        yield from arm.put((at[0], at[1], CUBE / 2 + 0.002))
+
+    def put_down(self, arm: Arm) -> Script:
+        yield from arm.put((self.taken[0], self.taken[1], CUBE / 2 + 0.002))
         self.showing = ()
 
     def react(self, arm: Arm) -> None:
         self.pressed = push_down(self.button, arm)
 
-    def solve(self, arm: Arm, answer: int) -> Script:
-        for _ in range(self.times):
-            yield from self.lift(arm, answer)
-        yield from arm.press(self.button.home.p)
+    def steps(self) -> int:
+        return 2 * self.times + 1
+
+    def step(self, answer: int, number: int) -> Step:
+        cube = self.cubes[answer]
+        if number == self.steps() - 1:
+            top = self.button.home.p
+            return Step("press the button at <point>", (top,), lambda arm: arm.press(top))
+        if number % 2:
+            return Step("put it down at <point>", (cube.home.p,), self.put_down)
+        return Step("pick up the cube at <point>", (cube.p,), lambda arm: self.pick_up(arm, answer))
+
+    def progress(self) -> int:
+        return 2 * self.lifts - self.held
 
     def judge(self, arm: Arm, answer: int) -> Status:
         heights = [cube.p[2] for cube in self.cubes]
@@ -81,6 +99,7 @@ class VideoRepick(ExchangeFamily):
             self.lifts, self.raised = self.lifts + 1, True
         elif heights[answer] < CUBE:
             self.raised = False
+        self.held = self.raised or (self.held and arm.opening < OPEN)
         if self.lifts > self.times:
             return Status.FAIL
         if self.pressed:

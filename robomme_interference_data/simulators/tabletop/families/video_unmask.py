@@ -6,7 +6,7 @@ from itertools import chain, islice, permutations, product
 from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.family import Family, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
@@ -14,6 +14,7 @@ from robomme_interference_data.simulators.tabletop.stage import along, row, shuf
 HIGH = 0.72  # m, above what the cameras see
 FALL, SEEN = 55, 49  # time steps: of the containers' way down, and until they hide the cubes
 LIFTED = 0.05  # m, of the right container
+OPEN = 0.03  # m, way of a finger that holds nothing
 PEEKED = 0.010  # m, of a wrong one: its cube comes into sight at 0.02
 
 
@@ -36,7 +37,7 @@ class VideoUnmask(Family):
         self.spots = row(rng, count, -0.04, 0.105, zigzag=0.02)
         self.order = shuffled(rng, count)
         self.answers = list(permutations(range(count), len(self.asked)))
-        self.found = 0
+        self.found, self.held = 0, False
 
     def build(self, kit: Kit) -> None:
         self.shells = [kit.container(spot, self.shell) for spot in self.spots]
@@ -81,21 +82,38 @@ class VideoUnmask(Family):
                 shell.put(place)
             yield
 
-    def solve(self, arm: Arm, answer: Sequence[int]) -> Script:
-        for number in answer:
-            knob = self.shells[number].point(0, 0, self.shells[number].size)
-            yield from arm.pick(knob)
-            yield from arm.wait(5)
-            yield from arm.lower(knob)
-            yield from arm.move((knob[0], knob[1], 0.25))
+    def steps(self) -> int:
+        return 2 * len(self.asked)
+
+    def step(self, answer: Sequence[int], number: int) -> Step:
+        shell = self.shells[answer[number // 2]]
+        if number % 2:
+            return Step("put it down at <point>", (shell.home.p,), self.put_down)
+        knob = shell.point(0, 0, shell.size)
+        return Step(
+            "pick up the container at <point>", (knob,), lambda arm: self.pick_up(arm, shell)
+        )
+
+    def progress(self) -> int:
+        return 2 * self.found - self.held
+
+    def pick_up(self, arm: Arm, shell: Body) -> Script:
+        self.taken = shell.point(0, 0, shell.size)
+        yield from arm.pick(self.taken)
+        yield from arm.wait(5)
+
+    def put_down(self, arm: Arm) -> Script:
+        yield from arm.lower(self.taken)
+        yield from arm.move((self.taken[0], self.taken[1], 0.25))
 
     def judge(self, arm: Arm, answer: Sequence[int]) -> Status:
         done = answer[: self.found]
         for number, shell in enumerate(self.shells):
             if number not in (*done, answer[self.found]) and rim(shell) > PEEKED:
                 return Status.FAIL
-        if self.shells[answer[self.found]].p[2] > LIFTED:
-            self.found += 1
+        lifted = self.shells[answer[self.found]].p[2] > LIFTED
+        self.held = lifted or (self.held and arm.opening < OPEN)
+        self.found += lifted
         return Status.SUCCESS if self.found == len(answer) else Status.ONGOING
 
 

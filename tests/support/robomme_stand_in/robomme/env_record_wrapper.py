@@ -77,7 +77,14 @@ class Environment:
             goals = goals[0]
         if self.family == "VideoRepick":
             goals.append(f"open environments: {len(open_environments)}")
-        return {"task_goal": goals, "status": status}
+        info = {"task_goal": goals, "status": status}
+        if self.family in STICKS:
+            return info  # older ones tell no subgoals
+        step = self.steps
+        return info | {
+            "simple_subgoal_online": f"pick up the cube, step {step}",
+            "grounded_subgoal_online": f"pick up the cube at <{step}, 200>, step {step}",
+        }
 
 
 class BenchmarkEnvBuilder:
