@@ -176,6 +176,41 @@ def manifests(
         _plan(split, config, as_json=as_json)
 
 
+@app.command()
+def questions(
+    split: Annotated[Path, typer.Argument(help="Folder of the split.")], as_json: AsJson = False
+) -> None:
+    """Make the questions about the past that `ask` asks: one a query, with a marked picture.
+
+    Only for demonstrations of tabletop, of which the possible answers are known. Rows and pictures
+    are in questions.parquet; the same split gives the same bytes.
+
+    Example:
+    ```
+    robomme-interference build questions my-split
+    ```
+    """
+    from robomme_interference_data.lazy import load_extra
+    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.work_progress import WorkProgress
+
+    module = "robomme_interference_data.build_dataset.questions"
+    make = load_extra(module, "make_questions", "build questions", "retrieval")
+    write = load_extra(module, "write_questions", "build questions", "retrieval")
+    with stoppable("The split is as it was"), WorkProgress(unit="questions") as progress:
+        opened = load_split(split)
+        progress.start("Making questions", len(opened.episode_ids))
+        made = []
+        for one in make(opened):
+            made.append(one)
+            progress.advance(1)
+        out = write(made, split)
+    if as_json:
+        print_json({"out": str(out), "questions": len(made)})
+    else:
+        say(f"{out}: {len(made):,} questions")
+
+
 @app.command(name="all")
 @with_settings
 def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> None:

@@ -123,6 +123,9 @@ FURTHER = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *FURTHER)
 """Names of a split's datasets, which are their kinds."""
+QUESTIONS_PATH = "questions.parquet"
+"""Questions about the past, which a split may have."""
+
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"
 MANIFEST_ROWS = "buffers.parquet"

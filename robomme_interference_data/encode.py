@@ -1,4 +1,4 @@
-"""Encode frames as video with PyAV: datasets, and clips to look at."""
+"""Encode frames with PyAV: as video, for datasets and clips to look at, and as PNG."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -163,3 +163,12 @@ class VideoEncoder:
             yield
         except (av.error.FFmpegError, UnknownCodecError) as error:
             raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Return an image, `(H, W, 3) uint8` RGB, as PNG: nothing of it is lost."""
+    height, width, _ = image.shape
+    encoder = av.CodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
+    packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
+    return b"".join(map(bytes, packets))

@@ -1,8 +1,9 @@
 """Rows and headers as frozen dataclasses: their Arrow schema and JSON follow from the fields.
 
-A field is text, a whole number, a number, a truth value, an `EpisodeId`, another such record, a
-tuple of one of these, a map from text to one of these, or one of these or None. A record with a
-field `episode_id` also has the columns `family`, `split` and `index`, to filter by.
+A field is text, a whole number, a number, a truth value, bytes (in tables only), an `EpisodeId`,
+another such record, a tuple of one of these, a map from text to one of these, or one of these or
+None. A record with a field `episode_id` also has the columns `family`, `split` and `index`, to
+filter by.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
     int: (pa.int64(), (int,), "a whole number"),
     float: (pa.float64(), (float, int), "a number"),
     bool: (pa.bool_(), (bool,), "true or false"),
+    bytes: (pa.binary(), (bytes,), "bytes"),
 }
 _LARGEST = 1 << 63
 """No whole number in a table is as large, and none in JSON may be."""

@@ -5,9 +5,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import av
 import numpy as np
-from numpy.typing import NDArray
 
 from robomme_interference_data.encode import CLIP, VideoEncoder
 from robomme_interference_data.evaluate.models.model import Message, Part, Video
@@ -52,15 +50,6 @@ def _shortened(part: Part, shares: Iterable[int]) -> tuple[Part, ...]:
     if not isinstance(part, Video):
         return (part,)
     return tuple(part.frames[place] for place in spread(0, len(part.frames), next(iter(shares))))
-
-
-def png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image, `(H, W, 3) uint8` RGB, as PNG: nothing of it is lost."""
-    height, width, _ = image.shape
-    encoder = av.CodecContext.create("png", "w")
-    encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
-    packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
-    return b"".join(map(bytes, packets))
 
 
 def mp4(video: Video) -> bytes:

@@ -22,12 +22,13 @@ from support.chat_server import (
     ChatServer,
 )
 
+from robomme_interference_data.encode import png
 from robomme_interference_data.errors import (
     InvalidOptionError,
     ModelError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.models.images import png, within
+from robomme_interference_data.evaluate.models.images import within
 from robomme_interference_data.evaluate.models.model import Message, Video
 from robomme_interference_data.evaluate.models.registry import (
     make_model,

@@ -48,6 +48,10 @@ class ExchangeFamily(Family):
         """What is told of the answer, and then each exchange; see `Family.parts`."""
         return (*self.told(answer), *_words(_way(self.swaps)))
 
+    def choice(self, answer: Any) -> int:
+        """Where what is asked for has ended: of several things, the first."""
+        return _end(answer, _way(self.swaps))[0]
+
     def agreeing(self, known: Mapping[int, str]) -> list[Any]:
         """The answers that may have ended where the right one did; see `Family.agreeing`."""
         way = _way(self.swaps)

@@ -32,6 +32,19 @@ class Step:
     do: Callable[[Arm], Script]
 
 
+@dataclass(frozen=True)
+class Option:
+    """How one of the possible answers is told in a question about the past.
+
+    Attributes:
+        words: In words, as far as they do; empty where only its place tells it.
+        marks: Where it is in the live scene, in m: one point of a thing, or those of a path.
+    """
+
+    words: str
+    marks: tuple[Point, ...] = ()
+
+
 class Family(ABC):
     """One episode of a task family.
 
@@ -79,6 +92,18 @@ class Family(ABC):
     @abstractmethod
     def told(self, answer: Any) -> tuple[str, ...]:
         """The parts of an answer in words, in the order in which the demonstration shows them."""
+
+    @abstractmethod
+    def question(self) -> str:
+        """What is asked about the past, beside the goal."""
+
+    def choice(self, answer: Any) -> Any:
+        """What the question asks for of an answer."""
+        return answer
+
+    @abstractmethod
+    def option(self, choice: Any) -> Option:
+        """How such a choice is told in the live scene."""
 
     def parts(self, answer: Any) -> tuple[str, ...]:
         """All that must be seen of a demonstration to know the answer, in words, in order."""

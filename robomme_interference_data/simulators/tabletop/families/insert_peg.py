@@ -8,7 +8,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import COLOURS, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import row
@@ -58,6 +58,19 @@ class InsertPeg(Family):
             f"holds it at its {_ENDS[end]}",
             f"inserts it from the {_SIDES[side]}",
         )
+
+    def question(self) -> str:
+        return (
+            "Which peg was inserted, held at which end, from which side? Each picture shows a way "
+            "from where a peg is held to where it goes in."
+        )
+
+    def option(self, choice: tuple[int, int, int]) -> Option:
+        number, end, side = choice
+        x, y = self.spots[number]
+        mouth = (self.box_at[0], self.box_at[1] + side * (DEPTH / 2 + 0.03), HOLE)
+        words = f"held at its {_ENDS[end]}, inserted from the {_SIDES[side]}"
+        return Option(words, ((x + end * GRIP, y, 0.02), mouth))
 
     def demonstrate(self, arm: Arm, answer: tuple[int, int, int]) -> Script:
         yield from arm.wait(5)

@@ -7,7 +7,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import is_near, off_line
@@ -58,6 +58,12 @@ class MoveCube(Family):
 
     def told(self, answer: str) -> tuple[str, ...]:
         return (_WORDS[answer],)
+
+    def question(self) -> str:
+        return "In which manner was the cube moved to the target?"
+
+    def option(self, choice: str) -> Option:
+        return Option(_WORDS[choice])
 
     def demonstrate(self, arm: Arm, answer: str) -> Script:
         yield from arm.wait(20)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, Spot
@@ -80,6 +80,12 @@ class PatternLock(StickFamily):
 
     def told(self, answer: tuple[int, ...]) -> tuple[str, ...]:
         return tuple(f"goes to button {number}" for number in answer)
+
+    def question(self) -> str:
+        return "Which path did the stick take over the buttons? Each picture shows one."
+
+    def option(self, choice: tuple[int, ...]) -> Option:
+        return Option("", tuple((*self.spots[number], TALL) for number in choice))
 
     def steps(self) -> int:
         return self.length[self.level]

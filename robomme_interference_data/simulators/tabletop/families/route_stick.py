@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.families.pattern_lock import StickFamily
-from robomme_interference_data.simulators.tabletop.family import Step
+from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import Kit
-from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Script
+from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Point, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line
 
 Route = tuple[tuple[int, ...], tuple[int, ...]]
@@ -65,6 +65,17 @@ class RouteStick(StickFamily):
                 for pair, side in turns
             ),
         )
+
+    def question(self) -> str:
+        return "Which path did the stick take round the posts? Each picture shows one."
+
+    def option(self, choice: Route) -> Option:
+        targets, sides = choice
+        marks: list[Point] = [(*self.spots[targets[0]], FLAT)]
+        for (one, other), side in zip(pairwise(targets), sides, strict=True):
+            x, y = self.posts[min(one, other)]
+            marks += [(x + side * ASIDE, y, FLAT), (*self.spots[other], FLAT)]
+        return Option("", tuple(marks))
 
     def steps(self) -> int:
         return self.turns[self.level] + 1

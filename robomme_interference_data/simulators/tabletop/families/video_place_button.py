@@ -9,7 +9,7 @@ from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
-from robomme_interference_data.simulators.tabletop.family import Step
+from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import (
@@ -74,6 +74,12 @@ class PlaceFamily(ExchangeFamily):
 
     def told(self, answer: int) -> tuple[str, ...]:
         return self.words(self.way(answer))
+
+    def question(self) -> str:
+        return "Which of the marked targets does the goal mean?"
+
+    def option(self, choice: int) -> Option:
+        return Option("", ((*self.target_spots[choice], 0.0),))
 
     def lessons(self) -> Iterable[tuple[int, tuple[str, ...]]]:
         ways = permutations(range(self.count), len(self.times))

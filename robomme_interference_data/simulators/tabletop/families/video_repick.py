@@ -4,7 +4,7 @@ from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
-from robomme_interference_data.simulators.tabletop.family import Step
+from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import push_down, row
@@ -47,6 +47,12 @@ class VideoRepick(ExchangeFamily):
 
     def told(self, answer: int) -> tuple[str, ...]:
         return (f"lifts cube {answer}",)
+
+    def question(self) -> str:
+        return "Which of the marked cubes was picked up?"
+
+    def option(self, choice: int) -> Option:
+        return Option("", ((*self.spots[choice], CUBE / 2),))
 
     def demonstrate(self, arm: Arm, answer: int) -> Script:
         yield from arm.wait(5)

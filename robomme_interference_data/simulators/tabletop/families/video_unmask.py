@@ -6,7 +6,7 @@ from itertools import chain, islice, permutations, product
 from numpy.random import RandomState
 
 from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.family import Family, Step
+from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import along, row, shuffled
@@ -58,6 +58,15 @@ class VideoUnmask(Family):
     def told(self, answer: Sequence[int]) -> tuple[str, ...]:
         cubes = (f"the {c} cube at place {n}" for c, n in zip(self.asked, answer, strict=True))
         return (f"shows {' and '.join(cubes)}",)
+
+    def question(self) -> str:
+        return f"Which of the marked containers hides the {self.asked[0]} cube?"
+
+    def choice(self, answer: Sequence[int]) -> int:
+        return answer[0]
+
+    def option(self, choice: int) -> Option:
+        return Option("", ((*self.spots[choice], SIDE),))
 
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
         self.under = dict(zip(self.covered(answer), self.cubes, strict=True))

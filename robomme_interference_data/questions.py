@@ -1,0 +1,82 @@
+"""Questions about the past that a split may have: one for each query, with a marked picture."""
+
+import string
+from dataclasses import dataclass
+
+from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
+from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.parquet import open_parquet, read_table
+from robomme_interference_data.rows import from_table
+from robomme_interference_data.split import Split
+
+LETTERS = string.ascii_uppercase[:8]
+"""Letters of options, in order."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A multiple-choice question about what a query's lesson showed.
+
+    Attributes:
+        episode_id: The query episode.
+        revision: Revision of the demonstrations that it was made for.
+        text: What is asked, beside the goal.
+        options: The options in words, in the order of `LETTERS`; empty words where only the
+            picture tells one.
+        answers: The number, among the scene's answers, of one that each option stands for.
+        right: Place of the right option, from 0.
+        picture: The first live view with the options marked and lettered, a PNG file.
+    """
+
+    episode_id: EpisodeId
+    revision: str
+    text: str
+    options: tuple[str, ...]
+    answers: tuple[int, ...]
+    right: int
+    picture: bytes
+
+    def __post_init__(self) -> None:
+        count = len(self.options)
+        if not 2 <= count <= len(LETTERS) or len(set(self.answers)) != count:
+            raise FormatError(f"{count} options of {len(set(self.answers))} answers")
+        if not 0 <= self.right < count:
+            raise FormatError(f"right option {self.right} of {count}")
+
+    @property
+    def letters(self) -> str:
+        """Letters of the options, such as `ABCD`."""
+        return LETTERS[: len(self.options)]
+
+    @property
+    def chance(self) -> float:
+        """Share of right answers that drawing at random has."""
+        return 1 / len(self.options)
+
+
+def read_questions(split: Split) -> dict[EpisodeId, Question]:
+    """Read the questions of a split, by query episode.
+
+    Raises:
+        MissingFileError: It has none; says how they are made.
+        FormatError: The file is damaged, or was made for other demonstrations.
+        HubError: It is on the Hub, and cannot be fetched.
+    """
+    mend = "Ask its publisher to make them: robomme-interference build questions SPLIT"
+    if isinstance(split.files, LocalFiles):
+        mend = f"Type: robomme-interference build questions {split.location}"
+    try:
+        path = split.files.path(QUESTIONS_PATH)
+    except MissingFileError:
+        what = f"{split.location} has no questions ({QUESTIONS_PATH})"
+        raise MissingFileError(what, mend) from None
+    table = read_table(open_parquet(path), path)
+    found = {one.episode_id: one for one in from_table(Question, table, path)}
+    revision = split.datasets[DEMONSTRATIONS].identity.revision
+    if len(found) != len(table):
+        raise FormatError.damaged(path, "a query has two questions")
+    if any(one.revision != revision for one in found.values()):
+        raise FormatError(f"{path} has questions for other demonstrations", mend)
+    return found
