@@ -1,7 +1,7 @@
-"""The commands of rollouts: `ceiling`, `evaluate` and `merge`."""
+"""The commands of rollouts and questions: `ceiling`, `evaluate`, `ask` and `merge`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,9 +14,12 @@ from robomme_interference_data.console import (
     say,
     stoppable,
 )
-from robomme_interference_data.evaluate.config import CeilingConfig, RunConfig
+from robomme_interference_data.evaluate.config import AskConfig, CeilingConfig, RunConfig
 from robomme_interference_data.settings import with_settings
 from robomme_interference_data.shifts import NO_SHIFT
+
+if TYPE_CHECKING:
+    from robomme_interference_data.evaluate.run import RunResult
 
 
 @with_settings
@@ -83,24 +86,63 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
       --split S --out runs/shard-2
     ```
     """
-    from robomme_interference_data.evaluate.progress import RunProgress, rate_table
+    from robomme_interference_data.evaluate.progress import RunProgress
     from robomme_interference_data.evaluate.run import run_evaluation
-    from robomme_interference_data.rows import to_dict
 
     check_output(config.out)
     kept = f"Finished rollouts are in {config.out}"
     with stoppable(kept, config.out), RunProgress(quiet=as_json) as shown:
         result = run_evaluation(config, listener=shown, command=[command_line()])
+    _tell(result, "rollouts", as_json=as_json)
+
+
+@with_settings
+def ask(config: AskConfig, as_json: AsJson = False) -> None:
+    r"""Ask multiple-choice questions about what history buffers show, without a simulator.
+
+    Of each query episode: the goal, the first live view with the possible answers marked, and the
+    frames of the buffer that are kept. Right or wrong measures whether the past can be read out of
+    memory. Rows are those of rollouts, and are scored alike; what was asked and answered is in
+    RUN/answers. Make the questions first: robomme-interference build questions SPLIT.
+
+    Examples:
+    ```
+    robomme-interference ask --model recall --split S --out runs/recall --conditions k0 k7
+
+    robomme-interference ask --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct \
+      --system qwen3-vl-4b --split S --out runs/qwen --frames 32 --sampling framesamp
+
+    robomme-interference ask --model transformers:my/model --control blank \
+      --system mine-blank --split S --out runs/blank
+    ```
+    """
+    from robomme_interference_data.evaluate.progress import RunProgress
+    from robomme_interference_data.evaluate.questions.ask import run_examination
+
+    check_output(config.out)
+    kept = f"Answers are in {config.out}"
+    with stoppable(kept, config.out), RunProgress(quiet=as_json, unit="questions") as shown:
+        result = run_examination(config, listener=shown, command=[command_line()])
+    _tell(result, "questions", as_json=as_json)
+
+
+def _tell(result: "RunResult", unit: str, *, as_json: bool) -> None:
+    """Print what a run came to; fails if something broke."""
+    from robomme_interference_data.evaluate.progress import rate_table
+    from robomme_interference_data.rows import to_dict
+
     if as_json:
         print_json([to_dict(row) for row in result.rows])
     else:
         typer.echo(rate_table(result.rows).text())
-        typer.echo(f"{len(result.rows)} of {result.planned} rollouts in {config.out}")
+        chances = [row.chance for row in result.rows if row.chance is not None]
+        chance = f"; chance is {sum(chances) / len(chances):.1%}" if chances else ""
+        typer.echo(f"{len(result.rows)} of {result.planned} {unit} in {result.folder}{chance}")
     if result.stopped is not None:
         say(f"Stopped: {result.stopped}", fg="red")
     if broken := result.counts["error"]:
         say(
-            f"{broken} rollouts broke (see {config.out}/errors.log); the same command runs them "
+            f"{broken} {unit} broke (see {result.folder}/errors.log); the same command runs them "
             f"again:\n{command_line()}"
         )
         raise typer.Exit(1)

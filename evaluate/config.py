@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.constants import PROTOCOL_VERSION, SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.rollouts import Rollout
@@ -23,8 +23,30 @@ class RetrievalConfig:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class WorkConfig(RetrievalConfig):
+    """Which episodes and conditions, under which name, and how the work is done."""
+
+    conditions: tuple[str, ...] = setting(
+        (), help="no-history, k0, k1, …; by default all that apply."
+    )
+    families: tuple[str, ...] = setting((), help="Families; by default all.")
+    episodes: str | None = setting(None, help="Numbers, such as 0-49 or 0,3,10-12; default: all.")
+    episode_split: str = setting("test", help="train, val or test.")
+    shard: str = setting("1/1", help="Part of the plan to run, such as 2/8; see merge.")
+    system: str | None = setting(None, help="Name for the rows; see docs/systems.md.")
+    model_seed: int = setting(0, help="Seed for what is drawn at random.")
+    workers: int = setting(1, help="Worker processes.", metavar="N")
+    rollout_timeout: float = setting(
+        3600.0, help="Seconds that a rollout, or a question, may take."
+    )
+    cache: bool = setting(False, help="Keep decoded history frames on disk: later runs are faster.")
+    max_errors: int = setting(10, help="Errors in a row after which the run stops.", metavar="N")
+    no_resume: bool = setting(False, help="Refuse a folder that holds a run already.")
+
+
 @dataclass(frozen=True)
-class RunConfig(RetrievalConfig):
+class RunConfig(WorkConfig):
     """What to roll out, and how."""
 
     policy: str = setting(
@@ -36,14 +58,6 @@ class RunConfig(RetrievalConfig):
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
     simulator: str = setting("tabletop", help="tabletop, robomme or module:function of your own.")
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
-    conditions: tuple[str, ...] = setting(
-        (), help="no-history, k0, k1, …; by default all that apply."
-    )
-    families: tuple[str, ...] = setting((), help="Families; by default all.")
-    episodes: str | None = setting(None, help="Numbers, such as 0-49 or 0,3,10-12; default: all.")
-    episode_split: str = setting("test", help="train, val or test.")
-    shard: str = setting("1/1", help="Part of the plan to run, such as 2/8; see merge.")
-    system: str | None = setting(None, help="Name for the rows; see docs/systems.md.")
     policy_options: tuple[str, ...] = setting(
         (),
         name="--policy-option",
@@ -68,25 +82,50 @@ class RunConfig(RetrievalConfig):
         metavar="NAME=VALUE…",
         help="Options of what writes subgoals, such as frames=32 or response_s=60.",
     )
-    model_seed: int = setting(0, help="Seed for the policy.")
     robomme_python: str | None = setting(
         None, help="Interpreter that has RoboMME.", env="ROBOMME_PYTHON"
-    )
-    workers: int = setting(
-        1, help="Worker processes, each with a simulator and a policy.", metavar="N"
     )
     videos: bool = setting(False, help="Write a video of each rollout.")
     check_lesson: bool = setting(
         False, help="Compare each lesson with what the simulator plays, bit for bit."
     )
-    rollout_timeout: float = setting(3600.0, help="Seconds that a rollout may take.")
     simulator_timeout: float = setting(
         1800.0, help="Seconds that a reset, or 16 steps, may take before the simulator hung."
     )
-    cache: bool = setting(False, help="Keep decoded history frames on disk: later runs are faster.")
     history_chunk: int = setting(64, help="Frames of history handed over at a time.", metavar="N")
-    max_errors: int = setting(10, help="Errors in a row after which the run stops.", metavar="N")
-    no_resume: bool = setting(False, help="Refuse a folder that holds a run already.")
+
+
+@dataclass(frozen=True)
+class AskConfig(WorkConfig):
+    """Which questions are asked, of whom, and what is shown of the past."""
+
+    model: str = setting(
+        help="openai:URL#MODEL, transformers:ID or transformers:FOLDER; recall, the ideal "
+        "observer, or guess."
+    )
+    split: Path = setting(help="Folder of the split, with its questions.")
+    out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
+    frames: int = setting(
+        SAMPLE_FRAMES, help="Frames that are kept, that of now among them.", metavar="N"
+    )
+    sampling: str = setting("framesamp", help="Which are kept: full, framesamp or window.")
+    control: str = setting(
+        "none", help="blank: the history's frames are grey; text: no images at all."
+    )
+    prompt: str = setting("choice", metavar="NAME|FILE", help="How a model is asked.")
+    model_options: tuple[str, ...] = setting(
+        (),
+        name="--model-option",
+        whole=True,
+        metavar="NAME=VALUE…",
+        help="Options of the model, such as max_tokens=64 or response_s=60.",
+    )
+
+    simulator: ClassVar[str] = "questions"
+    """What their rows have for a simulator: they are not rollouts."""
+
+    shift: ClassVar[str] = NO_SHIFT
+    videos: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -115,7 +154,7 @@ def unusual_retrieval(config: RetrievalConfig) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Run:
+class Run[C: RunConfig | AskConfig]:
     """A run whose settings were checked: what its workers need, and what all its rows say.
 
     Attributes:
@@ -125,7 +164,7 @@ class Run:
         revision: `Split.revision`.
     """
 
-    config: RunConfig
+    config: C
     system: str
     split: str
     revision: str

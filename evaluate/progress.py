@@ -25,14 +25,16 @@ class RunProgress:
 
     Args:
         quiet: Show nothing.
+        unit: What is counted.
     """
 
-    def __init__(self, *, quiet: bool = False):
+    def __init__(self, *, quiet: bool = False, unit: str = "rollouts"):
+        self._unit = unit
         self._console = Console(stderr=True, quiet=quiet)
         self._bar = Progress(
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("rollouts, {task.fields[left]}"),
+            TextColumn(f"{unit}, {{task.fields[left]}}"),
             console=self._console,
         )
         self._task = self._bar.add_task("evaluate", total=None, left="")
@@ -57,7 +59,7 @@ class RunProgress:
         self._bar.reset(self._task, total=len(items), completed=len(done))
         self._began = time.monotonic()
         if done and not self._console.is_terminal:
-            self._console.print(f"{len(done)} of {len(items)} rollouts are done already")
+            self._console.print(f"{len(done)} of {len(items)} {self._unit} are done already")
 
     def row(self, row: Rollout) -> None:
         """Count a row."""

@@ -61,7 +61,7 @@ class _Clock(dict[str, float]):
 
 
 def run_rollout(
-    run: Run,
+    run: Run[RunConfig],
     item: WorkItem,
     *,
     simulator: Simulator,
@@ -137,7 +137,7 @@ def run_rollout(
         lesson_frames=lesson_frames(buffer.sessions, given),
         lesson_share=lesson_share(buffer.sessions, given) if given else None,
         evidence_kept=_evidence_kept(run.system, buffer, given),
-        **_retrieval_columns(selector, buffer, given),
+        **retrieval_columns(selector, buffer, given),
         **_model_columns(writer),
         **times,
         wall_s=round(time.perf_counter() - began, 4),
@@ -211,9 +211,10 @@ def _checked(actions: Any) -> NDArray[np.float32]:
         raise PolicyError(f"the policy's answer: {error.message}", error.hint) from None
 
 
-def _retrieval_columns(
+def retrieval_columns(
     selector: "Selector | None", buffer: Buffer, given: Sequence[int]
 ) -> dict[str, Any]:
+    """Return what a row says of the retrieval step: which, and what it chose of a buffer."""
     columns: dict[str, Any] = {"retrieval_model": selector.name} if selector else {}
     if selector is not None and len(buffer):
         columns |= {"retrieval_start": given[0], "retrieval_stop": given[-1] + 1}
@@ -245,7 +246,7 @@ def _evidence_kept(system: str, buffer: Buffer, given: Sequence[int]) -> float |
 
 
 def _decode(
-    buffer: Buffer, given: Sequence[int], policy: Policy, run: Run
+    buffer: Buffer, given: Sequence[int], policy: Policy, run: Run[RunConfig]
 ) -> AbstractContextManager[Iterator[Chunk]]:
     """Begin to decode what a policy is given of a buffer; give it in chunks, in order."""
     size, cameras = run.config.history_chunk, tuple(policy.history_cameras)

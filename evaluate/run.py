@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.checks import (
     check_simulator,
     default_system,
 )
-from robomme_interference_data.evaluate.config import Run, RunConfig
+from robomme_interference_data.evaluate.config import AskConfig, Run, RunConfig
 from robomme_interference_data.evaluate.log import (
     RunLog,
     clip_name,
@@ -35,7 +35,13 @@ from robomme_interference_data.evaluate.start import now, run_identity, start_of
 from robomme_interference_data.evaluate.subgoals.registry import describe_subgoals, pin_subgoals
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.evaluate.worker import RolloutTask
-from robomme_interference_data.execution import Executor, Outcome, Processes, end_if_starting
+from robomme_interference_data.execution import (
+    Executor,
+    Outcome,
+    Processes,
+    Task,
+    end_if_starting,
+)
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.simulators.registry import simulator_versions
@@ -139,23 +145,37 @@ def run_evaluation(
         with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
             # The same split may be in another folder by now: rows keep one label for it.
             run = Run(config, name, log.header.split, split.revision)
-            log.begin(start_of(config, plan, said | written, versions, command))
-            return _roll_out(run, items, split, log, executor, listener)
+            used = ["lerobot"] if config.policy.startswith("lerobot:") else []
+            log.begin(start_of(config, plan, said | written, versions, command, used))
+            task = RolloutTask(run, log.folder)
+            return run_items(run, task, items, split, log, executor, listener)
 
 
-def _roll_out(
-    run: Run,
+def run_items[C: RunConfig | AskConfig](
+    run: Run[C],
+    task: Task,
     items: Sequence[WorkItem],
     split: Split,
     log: RunLog,
     executor: Executor,
     listener: Listener | None,
 ) -> RunResult:
+    """Do what is not done yet, and write its rows as they come.
+
+    Args:
+        run: The run.
+        task: Makes an item's row; also returns what befell what is written beside it, or None.
+        items: What was asked for, checked.
+        split: The split.
+        log: The run's folder.
+        executor: Who does it.
+        listener: Hears how it goes.
+    """
     done = {item: row for item, row in log.rows.items() if is_done(row)}
     if listener is not None:
         listener.start(items, [done[item] for item in items if item in done])
     outcomes = executor.run(
-        RolloutTask(run, log.folder),
+        task,
         shuffle_work(item for item in items if item not in done),
         time_limit=run.config.rollout_timeout,
         again=(SimulatorCrashError, ServerKeepaliveError),
@@ -190,7 +210,9 @@ def _roll_out(
     return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
 
 
-def _row(run: Run, outcome: Outcome, split: Split, log: RunLog) -> tuple[Rollout, str | None]:
+def _row[C: RunConfig | AskConfig](
+    run: Run[C], outcome: Outcome, split: Split, log: RunLog
+) -> tuple[Rollout, str | None]:
     """Return the row of an outcome, with its attempt and time, and the traceback of what broke."""
     item: WorkItem = outcome.task
     if outcome.error is None:

@@ -4,13 +4,13 @@ import dataclasses
 import datetime
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
-from robomme_interference_data.evaluate.config import RunConfig
+from robomme_interference_data.evaluate.config import AskConfig, RetrievalConfig, RunConfig
 from robomme_interference_data.evaluate.log import Start
 from robomme_interference_data.evaluate.plan import Plan
 from robomme_interference_data.evaluate.policies.identity import plain, policy_identity
@@ -49,14 +49,14 @@ def run_identity(
         "episode_split": config.episode_split,
         "shift": config.shift,
         "model_seed": config.model_seed,
-        "retrieval_index": _retrieval_index(config, split, plan),
+        "retrieval_index": retrieval_index(config, split, plan),
         "subgoals": subgoals_identity(config, written),
         "protocol_version": PROTOCOL_VERSION,
         **policy_identity(config.policy, config.policy_options, said),
     }
 
 
-def _retrieval_index(config: RunConfig, split: Split, plan: Plan) -> Any:
+def retrieval_index(config: RetrievalConfig, split: Split, plan: Plan) -> Any:
     """Return what the retrieval step's choices depend on; None without one.
 
     Looks for the index of every dataset that a planned condition needs.
@@ -71,15 +71,15 @@ def _retrieval_index(config: RunConfig, split: Split, plan: Plan) -> Any:
 
 
 def start_of(
-    config: RunConfig,
+    config: RunConfig | AskConfig,
     plan: Plan,
     said: Mapping[str, Any],
     versions: Mapping[str, str],
     command: Sequence[str],
+    used: Iterable[str] = (),
 ) -> Start:
-    """Return what is recorded of a start that begins now."""
-    names = [*_PACKAGES]
-    names += ["lerobot"] if config.policy.startswith("lerobot:") else []
+    """Return what is recorded of a start that begins now; `used` are further packages."""
+    names = [*_PACKAGES, *used]
     names += ["transformers"] if config.retrieval is not None else []
     installed = {"python": platform.python_version()}
     for name in names:

@@ -15,18 +15,19 @@ from robomme_interference_data.errors import (
     first_line,
 )
 from robomme_interference_data.evaluate.clips import Clip
-from robomme_interference_data.evaluate.config import Run, RunConfig
+from robomme_interference_data.evaluate.config import RetrievalConfig, Run, RunConfig
 from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.record import write_record
 from robomme_interference_data.evaluate.rollout import run_rollout
-from robomme_interference_data.evaluate.subgoals.record import write_turns
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.rollouts import Rollout, Status
+from robomme_interference_data.rows import to_dict
 from robomme_interference_data.simulators.base import CAMERAS, Simulator
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.split import Split
@@ -42,7 +43,7 @@ class RolloutTask:
     that broke is used again. Clips go into the run's folder.
     """
 
-    def __init__(self, run: Run, folder: Path):
+    def __init__(self, run: Run[RunConfig], folder: Path):
         self._run, self._folder = run, folder
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
@@ -116,12 +117,9 @@ class RolloutTask:
 
     def _record(self, item: WorkItem) -> str | None:
         """Write the subgoals of a rollout; return what went wrong with that, or None."""
-        try:
-            if self._writer is not None:
-                write_turns(self._folder, item, self._writer.turns)
-        except OSError as error:
-            return f"the subgoals could not be written: {error}"
-        return None
+        if self._writer is None:
+            return None
+        return write_record(self._folder, "subgoals", item, map(to_dict, self._writer.turns))
 
     def _check_server(self, worker: Worker) -> None:
         """Retire the worker unless the policy's server is still there."""
@@ -135,7 +133,7 @@ class RolloutTask:
             policy.close()
 
 
-def make_selector(config: RunConfig) -> "Selector | None":
+def make_selector(config: RetrievalConfig) -> "Selector | None":
     """Make the retrieval step of a run, None if it has none; see `Selector` for its errors."""
     if config.retrieval is None:
         return None

@@ -84,6 +84,7 @@ _GROUPS = {
     "Rollouts": (
         ("ceiling", evaluating.ceiling),
         ("evaluate", evaluating.evaluate),
+        ("ask", evaluating.ask),
         ("merge", evaluating.merge),
     ),
     "Scores": (("score", scoring.score), ("compare", scoring.compare), ("power", scoring.power)),

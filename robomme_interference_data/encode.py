@@ -14,7 +14,7 @@ from av.codec.codec import UnknownCodecError
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import KEY_FRAMES
-from robomme_interference_data.errors import BuildError, InvalidOptionError
+from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
 
 
 @dataclass(frozen=True)
@@ -172,3 +172,18 @@ def png(image: NDArray[np.uint8]) -> bytes:
     encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
     packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
     return b"".join(map(bytes, packets))
+
+
+def read_png(data: bytes) -> NDArray[np.uint8]:
+    """Decode what `png` encoded, `(H, W, 3) uint8` RGB.
+
+    Raises:
+        FormatError: It is no such image.
+    """
+    codec = av.CodecContext.create("png", "r")
+    try:
+        frames: list[Any] = [*codec.decode(av.Packet(data)), *codec.decode(None)]
+        [image] = (frame.to_ndarray(format="rgb24") for frame in frames)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise FormatError(f"a picture is damaged: {error}") from None
+    return np.asarray(image, np.uint8)

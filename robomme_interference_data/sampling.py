@@ -10,7 +10,7 @@ from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.manifest import Session
 
 
-def even_sample(history_frames: int) -> list[int]:
+def even_sample(history_frames: int, frames: int = SAMPLE_FRAMES) -> list[int]:
     """Return the frames that an even sample takes at the first step: FrameSamp's rule.
 
     The sample is of the history and the first live observation together: all frames while there
@@ -19,25 +19,27 @@ def even_sample(history_frames: int) -> list[int]:
 
     Args:
         history_frames: Frames of the history buffer; also the index of the live observation.
+        frames: Frames of the sample, the live one among them, 2 or more; FrameSamp has 32.
 
     Returns:
         Indices, ascending; the last one is the live observation's.
     """
-    if history_frames + 1 < SAMPLE_FRAMES:
+    if history_frames + 1 < frames:
         return list(range(history_frames + 1))
     # Exact integers: index j of linspace(0, t, n) is floor(j·t / (n − 1)).
-    return [j * history_frames // (SAMPLE_FRAMES - 1) for j in range(SAMPLE_FRAMES)]
+    return [j * history_frames // (frames - 1) for j in range(frames)]
 
 
-MEMORIES: dict[str, Callable[[int], Sequence[int]]] = {
-    "full": range,
-    "framesamp": lambda live: even_sample(live)[:-1],
-    "window": lambda live: range(max(0, live - SAMPLE_FRAMES + 1), live),
+MEMORIES: dict[str, Callable[..., Sequence[int]]] = {
+    "full": lambda live, frames=SAMPLE_FRAMES: range(live),
+    "framesamp": lambda live, frames=SAMPLE_FRAMES: even_sample(live, frames)[:-1],
+    "window": lambda live, frames=SAMPLE_FRAMES: range(max(0, live - frames + 1), live),
 }
 """Memory rule: which frames it keeps when the live observation has index `live`, itself apart.
 
-`full` keeps all; `framesamp` all while they are fewer than 32 with the live one, else those of
-the integer `linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last 32.
+Also given how many it may keep, the live one among them, 32 unless told. `full` keeps all;
+`framesamp` all while they are fewer than that with the live one, else those of the integer
+`linspace(0, live, 32)` (the released FrameSamp's rule); `window` the last ones.
 """
 
 

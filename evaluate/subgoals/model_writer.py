@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
+from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply
+from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.subgoals.prompt import Answer, load_prompt, merge_near
 from robomme_interference_data.evaluate.subgoals.writer import (
@@ -107,7 +108,7 @@ class ModelWriter(SubgoalWriter):
             Turn(
                 step,
                 subgoal.grounded,
-                prompt="".join(map(_told, asked)),
+                prompt=told(asked),
                 answer=reply.text,
                 fault=fault,
                 keyframes=tuple(sorted(self._kept)),
@@ -146,10 +147,3 @@ class ModelWriter(SubgoalWriter):
     def _keep(self, images: dict[int, NDArray[np.uint8]], chosen: Sequence[int]) -> None:
         there = self._kept | {number: images[number] for number in chosen}
         self._kept = {number: there[number] for number in merge_near([*there], self._near)}
-
-
-def _told(part: Part) -> str:
-    """Return a part of a question as the record has it."""
-    if isinstance(part, Video):
-        return f"[video of {len(part.frames)} frames]"
-    return part if isinstance(part, str) else "[image]"

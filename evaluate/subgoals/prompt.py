@@ -1,18 +1,15 @@
 """How a model is asked for subgoals, and how its answers are read; prompts are files."""
 
-import hashlib
 import json
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
-from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import FormatError, InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import Part
+from robomme_interference_data.evaluate.models.prompts import fill, read_prompt
 from robomme_interference_data.subgoal import Pixel, Subgoal, read_points, write_points
 
 PROMPTS = ("simple", "grounded", "memer")
@@ -22,10 +19,7 @@ VIEWS = ("<history>", "<keyframes>", "<recent>", "<image>")
 """Where images stand in a prompt: the history, key frames that were kept, the last live frames
 (`MemER`), and what is seen now. A list without an image is the word `none`."""
 
-_WORDS = ("{goal}", "{subgoals}")
-_VIEW = re.compile("|".join(VIEWS))
 _MOST_LETTERS = 300
-_MOST_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -102,16 +96,12 @@ class Prompt:
             views: Images for each of `VIEWS`.
         """
         told = [f"{n}. {self.write(subgoal, size)}" for n, subgoal in enumerate(earlier, 1)]
-        parts: list[Part] = []
-        rest, text = 0, self.then if earlier else self.first
-        words = dict(zip(_WORDS, (goal, "; ".join(told)), strict=True))
-        pattern = re.compile(f"{_VIEW.pattern}|{'|'.join(map(re.escape, words))}")
-        for match in pattern.finditer(text):
-            parts.append(text[rest : match.start()])
-            found = match.group()
-            parts += [words[found]] if found in words else views.get(found) or ["none"]
-            rest = match.end()
-        return _joined([*parts, text[rest:]])
+        words = {"{goal}": goal, "{subgoals}": "; ".join(told)}
+        return fill(
+            self.then if earlier else self.first,
+            words,
+            {place: views.get(place, ()) for place in VIEWS},
+        )
 
     def write(self, subgoal: Subgoal, size: tuple[int, int]) -> str:
         """Return a subgoal with its points as the model writes them."""
@@ -181,17 +171,6 @@ def _to_grid(pixel: int, side: int, grid: int) -> int:
     return -(-pixel * grid // side) if grid else pixel
 
 
-def _joined(parts: Sequence[Part]) -> tuple[Part, ...]:
-    """Return parts with words that follow each other in one."""
-    found: list[Part] = []
-    for part in parts:
-        if isinstance(part, str) and found and isinstance(found[-1], str):
-            found[-1] += part
-        elif not isinstance(part, str) or part:
-            found.append(part)
-    return tuple(found)
-
-
 def _json_object(text: str) -> dict[str, Any]:
     """Return the JSON object in an answer, whatever stands around it."""
     start, stop = text.find("{"), text.rfind("}")
@@ -241,30 +220,4 @@ def load_prompt(name: str) -> tuple[Prompt, str]:
         UnknownNameError: There is no such prompt, nor such a file.
         FormatError: The file is no prompt; says why.
     """
-    path: Any = Path(name)
-    if name in PROMPTS:
-        path = resources.files(__package__) / "prompts" / f"{name}.toml"
-    elif not path.is_file():
-        raise UnknownNameError(
-            f"there is no prompt {name!r}, and no such file",
-            f"Give {', '.join(PROMPTS)}, or the path of a file like those (docs/subgoals.md).",
-        )
-    data = path.read_bytes()
-    known = {one.name: type(one.default) for one in fields(Prompt)}
-    try:
-        if len(data) > _MOST_BYTES:
-            raise ValueError(f"{len(data)} bytes; expected at most {_MOST_BYTES}")
-        given = tomllib.loads(data.decode())
-        for key, value in given.items():
-            if key not in known:
-                raise ValueError(f"it has {key!r}; expected {', '.join(known)}")
-            if not isinstance(value, int if key == "grid" else str) or value is True:
-                raise ValueError(f"{key} is {value!r}")
-        missing = [key for key in ("system", "first", "then") if key not in given]
-        if missing:
-            raise ValueError(f"it lacks {', '.join(missing)}")
-        return Prompt(**given), hashlib.sha256(data).hexdigest()
-    except (ValueError, RecursionError) as error:  # what is no TOML, UTF-8 or option is one too
-        raise FormatError(
-            f"{name} is no prompt: {error}", "docs/subgoals.md says what a prompt file has."
-        ) from None
+    return read_prompt(Prompt, __package__, PROMPTS, name, "docs/subgoals.md")

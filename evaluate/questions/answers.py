@@ -1,0 +1,155 @@
+"""Who answers questions: the ideal observer, chance, or a model."""
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FPS
+from robomme_interference_data.encode import read_png
+from robomme_interference_data.evaluate.models.model import ChatModel, Video
+from robomme_interference_data.evaluate.models.prompts import told
+from robomme_interference_data.evaluate.questions.prompt import load_prompt, read_letter
+from robomme_interference_data.query import Query
+from robomme_interference_data.questions import Question
+
+CONTROLS = ("none", "blank", "text")
+"""What is kept from a model: nothing; what the frames of the history show; all images."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A question, with what may be known of the past.
+
+    Attributes:
+        question: The question.
+        query: Its query episode.
+        seed: Seed for what is drawn.
+        known: Parts of the answer that the kept frames show, by number, in words; None where it is
+            unknown what they show.
+        frames: Decodes the kept frames of the history, `(n, H, W, 3) uint8`, n may be 0.
+    """
+
+    question: Question
+    query: Query
+    seed: int
+    known: Mapping[int, str] | None
+    frames: Callable[[], NDArray[np.uint8]]
+
+    def draw(self, letters: str) -> str:
+        """Draw one of some letters: the same for the same episode and seed."""
+        lot = hashlib.sha256(f"{self.query.episode_id}/{self.seed}".encode()).digest()
+        return letters[int.from_bytes(lot) % len(letters)]
+
+
+@dataclass(frozen=True)
+class Answered:
+    """An answer, for row and record.
+
+    Attributes:
+        letter: The option that was chosen; None if none was named.
+        prompt: What a model was asked, in words; None without a model.
+        text: What it wrote.
+        tokens, calls, seconds: As `Reply` has them.
+    """
+
+    letter: str | None
+    prompt: str | None = None
+    text: str | None = None
+    tokens: int | None = None
+    calls: int | None = None
+    seconds: float | None = None
+
+
+class Answerer(ABC):
+    """Answers questions, one at a time, and keeps nothing from one to the next."""
+
+    @abstractmethod
+    def answer(self, asked: Asked) -> Answered:
+        """Answer.
+
+        Raises:
+            ModelError: See `ChatModel.reply`.
+        """
+
+    @abstractmethod
+    def metadata(self) -> dict[str, Any]:
+        """Return plain values that say who answers."""
+
+    def close(self) -> None:
+        """Release everything."""
+
+
+class Guesser(Answerer):
+    """`guess`: draws an option."""
+
+    def answer(self, asked: Asked) -> Answered:
+        """Draw from all options."""
+        return Answered(asked.draw(asked.question.letters))
+
+    def metadata(self) -> dict[str, Any]:
+        """Return its name."""
+        return {"model": "guess"}
+
+
+class Recaller(Answerer):
+    """`recall`: the ideal observer. It draws from the options that agree with what frames show."""
+
+    def answer(self, asked: Asked) -> Answered:
+        """Draw from the options that cannot be ruled out; from all, if all can be."""
+        from robomme_interference_data.simulators.tabletop.families import draw_episode
+
+        query, question = asked.query, asked.question
+        scene = draw_episode(query.episode_id.family, int(query.seed or 0), str(query.difficulty))
+        left = {scene.choice(answer) for answer in scene.agreeing(asked.known or {})}
+        choices = [scene.choice(scene.answers[number]) for number in question.answers]
+        fits = [
+            one for one, choice in zip(question.letters, choices, strict=True) if choice in left
+        ]
+        return Answered(asked.draw("".join(fits) or question.letters))
+
+    def metadata(self) -> dict[str, Any]:
+        """Return its name."""
+        return {"model": "recall"}
+
+
+class ModelAnswerer(Answerer):
+    """A vision-language model.
+
+    Args:
+        model: The model.
+        prompt: How it is asked: see `load_prompt`.
+        control: One of `CONTROLS`.
+    """
+
+    def __init__(self, model: ChatModel, prompt: str, control: str):
+        self._model, self._control = model, control
+        self._prompt, self._sha256 = load_prompt(prompt)
+
+    def answer(self, asked: Asked) -> Answered:
+        """Ask the model."""
+        views: dict[str, list[Any]] = {"<history>": [], "<picture>": []}
+        if self._control != "text":
+            views["<picture>"] = [read_png(asked.question.picture)]
+            frames = asked.frames()
+            if self._control == "blank":
+                frames = np.full_like(frames, 128)
+            if len(frames):
+                views["<history>"] = [Video(frames, FPS)]
+        messages = self._prompt.fill(asked.query.goal, asked.question, views)
+        reply = self._model.reply(messages)
+        letter = read_letter(reply.text, asked.question.letters)
+        told_parts = told(messages[-1].parts)
+        return Answered(letter, told_parts, reply.text, reply.tokens, reply.calls, reply.seconds)
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what the model says of itself, and the SHA-256 of the prompt's file."""
+        return {"model": self._model.metadata(), "prompt_sha256": self._sha256}
+
+    def close(self) -> None:
+        """Close the model."""
+        self._model.close()
