@@ -3,6 +3,7 @@
 vLLM, SGLang and ms-swift serve open models, with adapters too, in the same way.
 """
 
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -18,13 +19,21 @@ from robomme_interference_data.evaluate.models.model import ChatModel, Message, 
 
 _WAITS = "The same command goes on where it stopped."
 
+_PAUSE_S = 0.5
+"""Seconds to wait after the first answer that is none; twice as many after each further one."""
+
+_LONGEST_PAUSE_S = 8.0
+"""As the client has it after other faults."""
+
+_DAY_S = 86_400.0
+
 
 class OpenAIModel(ChatModel):
     """A chat endpoint that takes images.
 
     What fails for the moment (no connection, no answer in time, 429, 5xx, an answer that is none)
     is asked again up to `repeats` times, later each time, or when the server says so
-    (`Retry-After`, up to two minutes). A refusal is an answer without words. The key is
+    (`Retry-After`; more than two minutes end it). A refusal is an answer without words. The key is
     `OPENAI_API_KEY`; servers of one's own mostly want none.
 
     Args:
@@ -40,7 +49,7 @@ class OpenAIModel(ChatModel):
         response_s: Most seconds until there is an answer.
 
     Raises:
-        InvalidOptionError: A number or `video` is not what it may be.
+        InvalidOptionError: A number, `video` or the key is not what it may be.
     """
 
     def __init__(
@@ -58,21 +67,23 @@ class OpenAIModel(ChatModel):
     ):
         if video not in ("images", "mp4"):
             raise InvalidOptionError.one_of("video", video, ("images", "mp4"))
-        if min(max_tokens, images) < 1 or min(temperature, repeats) < 0:
+        sound = 0 <= temperature < math.inf  # not so of NaN
+        if min(max_tokens, images) < 1 or repeats < 0 or not sound:
             raise InvalidOptionError(
                 f"max_tokens {max_tokens}, images {images}, temperature {temperature}, repeats "
                 f"{repeats}; expected at least 1, 1, 0 and 0"
             )
-        if not min(connect_s, response_s) > 0:
+        if not (0 < connect_s <= _DAY_S and 0 < response_s <= _DAY_S):
             raise InvalidOptionError(
-                f"connect_s {connect_s}, response_s {response_s}; expected positive numbers"
+                f"connect_s {connect_s}, response_s {response_s}; expected seconds above 0, a day "
+                "at most"
             )
         self._url, self._model = url, model
         self._settings: dict[str, Any] = {"max_tokens": max_tokens, "temperature": temperature}
         self._images, self._mp4, self._repeats = images, video == "mp4", repeats
         self._client = OpenAI(
             base_url=url,
-            api_key=os.environ.get("OPENAI_API_KEY") or "none",
+            api_key=_key(),
             timeout=openai.Timeout(response_s, connect=connect_s),
             max_retries=repeats,
         )
@@ -90,6 +101,9 @@ class OpenAIModel(ChatModel):
                 response = client.chat.completions.with_raw_response.create(
                     model=self._model, messages=asked, **self._settings
                 )
+            except openai.NotFoundError as error:
+                self.metadata()  # raises, and names what is served, if it is not this model
+                raise self._error(error) from error
             except openai.APIError as error:
                 raise self._error(error) from error
             calls += response.retries_taken + 1
@@ -97,6 +111,8 @@ class OpenAIModel(ChatModel):
                 return _read(response.parse(), calls, time.perf_counter() - began)
             except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
                 why = f"{type(error).__name__}: {first_line(error)}"
+            if calls <= self._repeats:
+                time.sleep(min(_PAUSE_S * 2 ** (calls - 1), _LONGEST_PAUSE_S))
         raise ModelError(
             f"{self._url} answers what is no chat completion ({why}), asked {calls} times",
             f"Is it the base of an OpenAI-compatible endpoint, mostly ending in /v1? {_WAITS}",
@@ -146,6 +162,17 @@ class OpenAIModel(ChatModel):
         )
 
 
+def _key() -> str:
+    """Return the key; servers of one's own take any."""
+    key = os.environ.get("OPENAI_API_KEY", "").strip() or "none"
+    if not (key.isascii() and key.isprintable()):
+        raise InvalidOptionError(
+            "OPENAI_API_KEY holds what no key does: more than one line, or other than ASCII",
+            "Set it anew: export OPENAI_API_KEY=…",
+        )
+    return key
+
+
 def _content(parts: Sequence[Part]) -> Any:
     if len(parts) == 1 and isinstance(parts[0], str):
         return parts[0]  # some chat templates take no lists for a system message
@@ -168,6 +195,5 @@ def _read(answer: Any, calls: int, seconds: float) -> Reply:
     text = message.content
     if text is not None and not isinstance(text, str):
         raise TypeError(f"content is {text!r}")
-    usage = answer.usage
-    tokens = None if usage is None else int(usage.total_tokens)
-    return Reply(text or "", tokens, calls, seconds)
+    tokens = getattr(answer.usage, "total_tokens", None)
+    return Reply(text or "", tokens if isinstance(tokens, int) else None, calls, seconds)

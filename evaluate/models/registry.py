@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import urlsplit
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.evaluate.models.model import ChatModel
@@ -23,8 +24,12 @@ _KINDS = {
 }
 """What follows each kind, and how that is told."""
 
-_WITHOUT_EFFECT = ("connect_s", "response_s", "repeats", "device")
-"""Options on which no answer depends: where a model runs, and how long it is waited for."""
+_WITHOUT_EFFECT = {
+    "openai": ("connect_s", "response_s", "repeats"),
+    "transformers": ("device", "adapter", "model", "revision"),
+}
+"""Options, and what models say of themselves, that no answer depends on, by kind: where they run,
+or lie (files are known by their digests), and how long they are waited for."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +55,18 @@ def parse_model(text: str) -> ModelSpec:
         )
     pattern, form = _KINDS[kind]
     match = re.fullmatch(pattern, rest, re.DOTALL)
-    if match is None:
+    if match is None or (kind == "openai" and not _is_endpoint(match["url"])):
         raise InvalidOptionError.expected("model", text, form)
     return ModelSpec(kind, match.groupdict())
+
+
+def _is_endpoint(url: str) -> bool:
+    """Whether it has a host and no key, which would be told with it; that has a variable."""
+    try:
+        parts = urlsplit(url)
+        return bool(parts.hostname) and parts.port != 0 and "@" not in parts.netloc
+    except ValueError:  # its port
+        return False
 
 
 def pin_model(text: str) -> str:
@@ -96,12 +110,14 @@ def model_identity(
 ) -> dict[str, Any]:
     """Return what of a model can change an answer, as plain values.
 
-    Where it is served or lies is no part of it; `said` is its metadata.
+    Where it is served or lies is no part of it, a digest of its files is; `said` is its metadata.
     """
     spec = parse_model(text)
     taken = bind_options(text, _factory(text), spec.given, options, what)
-    kept = {name: value for name, value in taken.items() if name not in _WITHOUT_EFFECT}
-    return {"kind": spec.kind, **said, "options": dict(sorted(kept.items()))}
+    without = _WITHOUT_EFFECT[spec.kind]
+    told = {name: value for name, value in said.items() if name not in without}
+    kept = {name: value for name, value in sorted(taken.items()) if name not in without}
+    return {"kind": spec.kind, **told, "options": kept}
 
 
 def _factory(text: str) -> Callable[..., Any]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 import transformers
+from jinja2 import TemplateError
 from PIL import Image
 
 from robomme_interference_data.errors import (
@@ -120,7 +121,7 @@ class TransformersModel(ChatModel):
                 tokens = self._model.generate(
                     **inputs, max_new_tokens=self._max_tokens, do_sample=False
                 )[0]
-        except (RuntimeError, ValueError, TypeError, IndexError) as error:
+        except (RuntimeError, ValueError, TypeError, IndexError, TemplateError) as error:
             raise ModelError(
                 f"the model broke: {type(error).__name__}: {first_line(error)}",
                 "With too little memory, give fewer images (images=16) or another device.",

@@ -13,12 +13,16 @@ from hypothesis import strategies as st
 from support.chat_server import (
     BROKEN,
     BUSY,
+    BUSY_FOR_AN_HOUR,
+    BUSY_SOME_TIME,
     CLOSED,
     EMPTY,
     GARBAGE,
     GONE,
+    LOCKED,
     REFUSED,
     SLOW,
+    UNCOUNTED,
     ChatServer,
 )
 
@@ -28,6 +32,7 @@ from robomme_interference_data.errors import (
     ModelError,
     UnknownNameError,
 )
+from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.images import within
 from robomme_interference_data.evaluate.models.model import Message, Video
 from robomme_interference_data.evaluate.models.registry import (
@@ -44,6 +49,7 @@ ASKED = [Message("system", ("be brief",)), Message("user", ("what is it? ", NOIS
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the client repeat without waiting, unless the server says for how long."""
     monkeypatch.setattr(openai._base_client, "INITIAL_RETRY_DELAY", 0.001)
+    monkeypatch.setattr(endpoint, "_PAUSE_S", 0.001)
 
 
 @pytest.fixture
@@ -109,7 +115,7 @@ def test_budgets(lengths: list[int], single: int, images: int) -> None:
 # --- faults --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fault", [BUSY, BROKEN, GARBAGE, EMPTY, CLOSED])
+@pytest.mark.parametrize("fault", [BUSY, BUSY_SOME_TIME, BROKEN, GARBAGE, EMPTY, CLOSED])
 def test_what_fails_for_the_moment_is_asked_again(server: ChatServer, fault: str) -> None:
     server.faults = [fault, fault]
     reply = model_of(server).reply(ASKED)
@@ -144,12 +150,50 @@ def test_no_answer_in_time(server: ChatServer) -> None:
     server.faults = [SLOW] * 2
     with pytest.raises(ModelError, match="no answer in time"):
         model_of(server, "repeats=1", "response_s=0.05").reply(ASKED)
+    assert len(server.seen) == 2
 
 
 def test_a_refusal_is_an_answer_without_words(server: ChatServer) -> None:
     server.faults = [REFUSED]
     reply = model_of(server).reply(ASKED)
     assert (reply.text, reply.calls) == ("", 1)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "next_step"),
+    [(BUSY_FOR_AN_HOUR, "answers 429", "goes on"), (LOCKED, "answers 401", "OPENAI_API_KEY")],
+)
+def test_what_no_repetition_mends(
+    server: ChatServer, fault: str, words: str, next_step: str
+) -> None:
+    server.faults = [fault]
+    with pytest.raises(ModelError, match=words) as raised:
+        model_of(server).reply(ASKED)
+    assert next_step in str(raised.value.hint)
+    assert len(server.seen) == 1
+
+
+def test_tokens_that_nobody_counted(server: ChatServer) -> None:
+    server.faults = [UNCOUNTED]
+    reply = model_of(server).reply(ASKED)
+    assert (reply.text, reply.tokens, reply.calls) == ("1 images", None, 1)
+
+
+def test_a_wrong_model_is_told_with_those_that_are_served(server: ChatServer) -> None:
+    with pytest.raises(ModelError, match="serves no model 'small'") as raised:
+        model_of(server, name="small").reply(ASKED)
+    assert "tiny" in str(raised.value.hint)
+    assert len(server.seen) == 1
+
+
+@pytest.mark.parametrize("key", ["one\ntwo", "schlüssel"])
+def test_a_key_that_is_none_is_refused_and_not_told(
+    server: ChatServer, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    with pytest.raises(InvalidOptionError, match="OPENAI_API_KEY") as raised:
+        model_of(server)
+    assert key not in str(raised.value)
 
 
 def test_a_model_that_is_gone_is_not_asked_again(server: ChatServer) -> None:
@@ -186,7 +230,12 @@ def test_another_page_is_no_endpoint(server: ChatServer) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["openai:localhost:8000#m", "openai:http://h:1/v1", "openai:http://h#", "transformers:"]
+    "text",
+    [
+        *("openai:localhost:8000#m", "openai:http://h:1/v1", "openai:http://h#", "transformers:"),
+        *("openai:http://h:99999#m", "openai:http://h:x#m", "openai:http://[::1#m"),
+        *("openai:http:///v1#m", "openai:http://me:key@h#m"),
+    ],
 )
 def test_what_is_not_written_as_a_model(text: str) -> None:
     with pytest.raises(InvalidOptionError, match="expected"):
@@ -200,7 +249,11 @@ def test_an_unknown_kind_and_the_nearest_one() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", ["max_tokens=0", "images=0", "video=gif", "repeats=-1", "response_s=0", "colour=red"]
+    "option",
+    [
+        *("max_tokens=0", "images=0", "video=gif", "repeats=-1", "response_s=0", "colour=red"),
+        *("temperature=NaN", "temperature=Infinity", "response_s=NaN", "connect_s=Infinity"),
+    ],
 )
 def test_options_out_of_range(server: ChatServer, option: str) -> None:
     with pytest.raises(InvalidOptionError, match=option.partition("=")[0]):

@@ -8,7 +8,7 @@ from support.vision_language import save_tiny_adapter, save_tiny_model
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
 from robomme_interference_data.evaluate.models.model import Message, Video
-from robomme_interference_data.evaluate.models.registry import make_model, pin_model
+from robomme_interference_data.evaluate.models.registry import make_model, model_identity, pin_model
 
 NOISE = np.random.default_rng(0).integers(0, 256, (6, 32, 24, 3), dtype=np.uint8)
 
@@ -55,6 +55,10 @@ def test_where_it_lies_is_no_part_of_it(tiny: Path, tmp_path: Path) -> None:
         make_model(f"transformers:{path}").metadata() for path in (tiny, tmp_path / "moved", other)
     ]
     assert said[0] == said[1] != said[2]
+    hub = said[0] | {"model": "someone/tiny", "revision": "0" * 40}
+    assert model_identity(f"transformers:{tiny}", ["device=cpu"], said[0]) == model_identity(
+        "transformers:someone/tiny", ["adapter=elsewhere"], hub
+    )
 
 
 def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:

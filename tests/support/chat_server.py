@@ -5,8 +5,9 @@
 
 `answer` gets what was asked, `Seen`: the words, and the images as they came. `faults` are used up
 one a question, in order, before it: `SLOW` (`slow_s` seconds), `BUSY` (429, `Retry-After: 0.01`),
-`BUSY_SOME_TIME` (429 alone), `BROKEN` (500), `GARBAGE` (no JSON), `EMPTY` (JSON that is no answer),
-`CLOSED` (no answer at all), `REFUSED` (no words), `GONE` (404, as for another model).
+`BUSY_SOME_TIME` (429 alone), `BUSY_FOR_AN_HOUR` (429, `Retry-After: 3600`), `BROKEN` (500),
+`GARBAGE` (no JSON), `EMPTY` (JSON that is no answer), `CLOSED` (no answer at all), `REFUSED` (no
+words), `GONE` (404, as for another model), `LOCKED` (401), `UNCOUNTED` (tells no tokens).
 """
 
 import base64
@@ -24,10 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-SLOW, BUSY, BUSY_SOME_TIME, BROKEN, GARBAGE, EMPTY, CLOSED, REFUSED, GONE = (
-    *("slow", "busy", "busy some time", "broken", "garbage", "empty", "closed", "refused"),
-    "gone",
-)
+SLOW, BUSY, BUSY_SOME_TIME, BUSY_FOR_AN_HOUR = "slow", "busy", "busy some time", "busy for an hour"
+BROKEN, GARBAGE, EMPTY, CLOSED, REFUSED = "broken", "garbage", "empty", "closed", "refused"
+GONE, LOCKED, UNCOUNTED = "gone", "locked", "uncounted"
 
 
 @dataclass(frozen=True)
@@ -147,6 +147,8 @@ class ChatServer:
         failed = {
             BUSY: (429, {"error": {"message": "too many"}}, {"Retry_After": "0.01"}),
             BUSY_SOME_TIME: (429, {"error": {"message": "too many"}}, {}),
+            BUSY_FOR_AN_HOUR: (429, {"error": {"message": "too many"}}, {"Retry_After": "3600"}),
+            LOCKED: (401, {"error": {"message": "who are you"}}, {}),
             BROKEN: (500, {"error": {"message": "out of memory"}}, {}),
             GARBAGE: (200, b"<html>busy</html>", {}),
             EMPTY: (200, {"object": "chat.completion", "choices": []}, {}),
@@ -171,6 +173,8 @@ class ChatServer:
                         "message": {"role": "assistant", "content": text},
                     }
                 ],
-                "usage": {"prompt_tokens": 100, "completion_tokens": 5, "total_tokens": 105},
+                "usage": {}
+                if fault == UNCOUNTED
+                else {"prompt_tokens": 100, "completion_tokens": 5, "total_tokens": 105},
             },
         )
