@@ -109,7 +109,7 @@ def test_a_stop_tells_of_rollouts_only_where_there_are_some(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_module, "_roll_out" if begun else "check_plan", stop)
+    monkeypatch.setattr(run_module, "run_items" if begun else "check_plan", stop)
     line = f"evaluate --policy hold {USUAL} --families MoveCube --split {tiny_split}"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 130 and "go on with:\nrobomme-interference" in done.stderr
