@@ -190,21 +190,18 @@ def questions(
     robomme-interference build questions my-split
     ```
     """
-    from robomme_interference_data.lazy import load_extra
+    from robomme_interference_data.build_dataset.questions import make_questions, write_questions
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
-    module = "robomme_interference_data.build_dataset.questions"
-    make = load_extra(module, "make_questions", "build questions", "retrieval")
-    write = load_extra(module, "write_questions", "build questions", "retrieval")
     with stoppable("The split is as it was"), WorkProgress(unit="questions") as progress:
         opened = load_split(split)
         progress.start("Making questions", len(opened.episode_ids))
         made = []
-        for one in make(opened):
+        for one in make_questions(opened):
             made.append(one)
             progress.advance(1)
-        out = write(made, split)
+        out = write_questions(made, split)
     if as_json:
         print_json({"out": str(out), "questions": len(made)})
     else:

@@ -26,6 +26,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFESTS,
+    QUESTIONS_PATH,
     RECORDS_PATH,
     REPORT_PATH,
     STATS_PATH,
@@ -52,10 +53,13 @@ def listed_files(root: Path) -> list[str]:
     """Return the files of a dataset whose SHA-256 is recorded: all but the list and what it names.
 
     An index has a list of its own; so have the manifests, which a published split has beside its
-    units. What people put beside a dataset has none: README, LICENSE, cards and hidden files.
+    units, and the questions, which are made anew to be checked. What people put beside a dataset
+    has none: README, LICENSE, cards and hidden files.
     """
     own = (IDENTITY_PATH, SUMS_PATH)
-    beside = re.compile(rf"(README|LICENSE|croissant)[^/]*|\..*|({INDEX_DIR}|{MANIFESTS})/.*")
+    beside = re.compile(
+        rf"(README|LICENSE|croissant)[^/]*|{QUESTIONS_PATH}|\..*|({INDEX_DIR}|{MANIFESTS})/.*"
+    )
     return [path for path in all_files(root) if path not in own and not beside.fullmatch(path)]
 
 

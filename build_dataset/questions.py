@@ -1,22 +1,20 @@
-"""Make the questions about the past of a split: what is asked, and the marked pictures."""
+"""Make the questions about the past of a split: what is asked, and what stands for an answer."""
 
+import dataclasses
 import hashlib
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
 from robomme_interference_data.encode import png
 from robomme_interference_data.errors import BuildError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.parquet import writing
-from robomme_interference_data.query import Query
-from robomme_interference_data.questions import LETTERS, Question
+from robomme_interference_data.questions import Question
 from robomme_interference_data.rows import arrow_schema, to_table
 from robomme_interference_data.simulators.tabletop.camera import to_pixels
 from robomme_interference_data.simulators.tabletop.episodes import turn_of
@@ -27,12 +25,8 @@ from robomme_interference_data.subgoal import Pixel
 _MOST, _DRAWN = 5, 4
 """Options of a question at most; and of one whose scene allows more answers."""
 
-_LARGER = 3  # times: the picture of things
-_OVER = 14  # pixels of the view: a letter over its thing
-_TILE, _MARGIN = 480, 16  # pixels: a drawing at most; of the view, round all paths
-_INK, _PAPER, _PATH = "black", "white", "#ffe800"
-
-Spot = tuple[float, float]
+Marks = Sequence[Sequence[Pixel]]
+"""Of each option the points, (y, x) in pixels of the first live view; none where words tell it."""
 
 
 def make_questions(split: Split) -> Iterator[Question]:
@@ -40,7 +34,21 @@ def make_questions(split: Split) -> Iterator[Question]:
 
     Raises:
         BuildError: An episode is not of `tabletop`: its possible answers are not known.
+        MissingExtraError: Pillow is not installed.
         MissingFileError, FormatError, TruncatedVideoError: A first live view cannot be read.
+    """
+    module = "robomme_interference_data.build_dataset.question_pictures"
+    picture = load_extra(module, "picture", "build questions", "retrieval")
+    for question, marks in planned_questions(split):
+        view = split.query(question.episode_id).frame()
+        yield dataclasses.replace(question, picture=png(picture(view, marks)))
+
+
+def planned_questions(split: Split) -> Iterator[tuple[Question, Marks]]:
+    """Yield the questions of a split without their pictures, and what is marked on these.
+
+    Raises:
+        BuildError: See `make_questions`.
     """
     revision = split.datasets[DEMONSTRATIONS].identity.revision
     for episode in sorted(split.episode_ids):
@@ -51,22 +59,26 @@ def make_questions(split: Split) -> Iterator[Question]:
                 "possible answers are not known",
                 "Only splits whose demonstrations are of tabletop have questions.",
             )
-        yield _question(query, revision)
+        yield _planned(episode, query.seed, query.difficulty, revision)
 
 
 def write_questions(questions: Sequence[Question], folder: Path) -> Path:
     """Write questions into a split's folder, whole or not at all; return the file."""
     out = folder / QUESTIONS_PATH
     schema = arrow_schema(Question)
-    with writing(out) as file, pq.ParquetWriter(file, schema, compression="none") as writer:
+    with (
+        writing(out) as file,
+        pq.ParquetWriter(file, schema, compression="none", write_page_checksum=True) as writer,
+    ):
         for one in questions:  # a row group each: the pictures are compressed already
             writer.write_table(to_table([one], schema))
     return out
 
 
-def _question(query: Query, revision: str) -> Question:
-    seed, name = int(query.seed or 0), str(query.episode_id)
-    scene = draw_episode(query.episode_id.family, seed, str(query.difficulty))
+def _planned(
+    episode: EpisodeId, seed: int, difficulty: str, revision: str
+) -> tuple[Question, Marks]:
+    scene, name = draw_episode(episode.family, seed, difficulty), str(episode)
     numbers: dict[Any, int] = {}  # choice to the first answer that stands for it
     for number, answer in enumerate(scene.answers):
         numbers.setdefault(scene.choice(answer), number)
@@ -76,107 +88,17 @@ def _question(query: Query, revision: str) -> Question:
         others = others[: _DRAWN - 1]
     chosen = sorted([right, *others], key=lambda one: _lot(name, "order", one))
     options = [scene.option(one) for one in chosen]
-    marks = [to_pixels(one.marks) for one in options]
-    return Question(
-        query.episode_id,
+    question = Question(
+        episode,
         revision,
         scene.question(),
         tuple(one.words for one in options),
         tuple(numbers[one] for one in chosen),
         chosen.index(right),
-        png(picture(query.frame(), marks)),
+        picture=b"",
     )
+    return question, [to_pixels(one.marks) for one in options]
 
 
 def _lot(*parts: Any) -> bytes:
     return hashlib.sha256("/".join(map(repr, parts)).encode()).digest()
-
-
-def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArray[np.uint8]:
-    """Return a first live view with options marked and lettered, `(H, W, 3) uint8`, larger.
-
-    Options of one point have their letters over it; options of several points, which are paths, a
-    drawing each; without points the picture is the view.
-
-    Args:
-        view: The view, `(H, W, 3) uint8`.
-        marks: Of each option the points, (y, x) in pixels of the view.
-    """
-    if not all(marks):
-        return _enlarged(view, 2)
-    if max(map(len, marks)) == 1:
-        image = Image.fromarray(_enlarged(view, _LARGER))
-        draw = ImageDraw.Draw(image)
-        for letter, [(y, x)] in zip(LETTERS, marks, strict=False):
-            at = (_LARGER * x, _LARGER * (y - _OVER))
-            draw.line((at, (_LARGER * x, _LARGER * y)), fill=_INK, width=3)
-            _letter(draw, letter, at)
-        return np.asarray(image)
-    top, left, side = _window(view, [point for path in marks for point in path])
-    part = _enlarged(view[top : top + side, left : left + side], times := _TILE // side)
-    tiles = [
-        _tile(part, letter, [(times * (x - left), times * (y - top)) for y, x in path])
-        for letter, path in zip(LETTERS, marks, strict=False)
-    ]
-    tiles += [np.full_like(tiles[0], 255)] * (len(tiles) % 2)
-    rows = [np.concatenate(tiles[place : place + 2], 1) for place in range(0, len(tiles), 2)]
-    return np.concatenate(rows)
-
-
-def _window(view: NDArray[np.uint8], points: Sequence[Pixel]) -> tuple[int, int, int]:
-    """Return top, left and side of the square of a view that has points well inside."""
-    low, high = np.min(points, 0), np.max(points, 0)
-    side = min(int((high - low).max()) + 2 * _MARGIN, *view.shape[:2])
-    top, left = (
-        int(np.clip((a + b - side) // 2, 0, whole - side))
-        for a, b, whole in zip(low, high, view.shape[:2], strict=True)
-    )
-    return top, left, side
-
-
-def _tile(part: NDArray[np.uint8], letter: str, path: Sequence[Spot]) -> NDArray[np.uint8]:
-    """Return a view with a path on it: a dot where it begins, an arrow where it ends.
-
-    The points of a longer one are numbered, as it may come back to some.
-    """
-    image = Image.fromarray(part)
-    draw = ImageDraw.Draw(image)
-    for colour, wide in ((_INK, 9), (_PATH, 5)):
-        draw.line(list(path), fill=colour, width=wide, joint="curve")
-        _arrow(draw, path, colour, wide)
-        x, y = path[0]
-        draw.ellipse((x - wide - 2, y - wide - 2, x + wide + 2, y + wide + 2), fill=colour)
-    numbers: dict[Spot, list[str]] = {}
-    for number, point in enumerate(path, 1):
-        numbers.setdefault(point, []).append(str(number))
-    for (x, y), those in numbers.items() if len(path) > 2 else ():
-        _text(draw, ",".join(those), (x, y - 22))
-    _letter(draw, letter, (30, 30))
-    draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_PAPER, width=2)
-    return np.asarray(image)
-
-
-def _arrow(draw: Any, points: Sequence[Spot], colour: str, wide: int) -> None:
-    (x0, y0), (x1, y1) = points[-2:]
-    way = math.atan2(y1 - y0, x1 - x0)
-    size = 2 * wide + 6
-    corners = [
-        (x1 + size * math.cos(way + turn), y1 + size * math.sin(way + turn))
-        for turn in (0.0, 2.4, -2.4)
-    ]
-    draw.polygon(corners, fill=colour)
-
-
-def _letter(draw: Any, letter: str, at: Spot) -> None:
-    x, y = at
-    draw.ellipse((x - 19, y - 19, x + 19, y + 19), fill=_PAPER, outline=_INK, width=3)
-    draw.text(at, letter, fill=_INK, font=ImageFont.load_default(27), anchor="mm")
-
-
-def _text(draw: Any, text: str, at: Spot) -> None:
-    font = ImageFont.load_default(19)
-    draw.text(at, text, fill=_PAPER, font=font, anchor="mm", stroke_width=2, stroke_fill=_INK)
-
-
-def _enlarged(view: NDArray[np.uint8], times: int) -> NDArray[np.uint8]:
-    return np.repeat(np.repeat(view, times, 0), times, 1)

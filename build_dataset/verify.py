@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from robomme_interference_data.build_dataset.identity import identity_of, listed_files
 from robomme_interference_data.build_dataset.lerobot_meaning import lerobot_violations
 from robomme_interference_data.build_dataset.manifests import planned_buffers
 from robomme_interference_data.build_dataset.material import plan_manifests
+from robomme_interference_data.build_dataset.questions import planned_questions
 from robomme_interference_data.conditions import datasets_of
 from robomme_interference_data.constants import (
     DATASETS,
@@ -20,6 +21,7 @@ from robomme_interference_data.constants import (
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
+    QUESTIONS_PATH,
     RULE_VERSION,
     SHIFTED,
     UNIT_MIN_RAW_FRAMES,
@@ -28,10 +30,11 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.digest import combine
 from robomme_interference_data.embeddings import IndexHeader, index_folder
-from robomme_interference_data.encode import CODECS
-from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.encode import CODECS, read_png
+from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.manifest import ManifestHeader
+from robomme_interference_data.questions import read_questions
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rows import read_header, to_dict
 from robomme_interference_data.shifts import SHIFTS
@@ -62,8 +65,8 @@ def verify_split(
     Checked are: the SHA-256 of every file, and that none is missing or too many; with `decode`,
     every frame and vector of every episode against its recorded hashes; what LeRobot's columns
     and statistics mean; embeddings that lie beside the data, if any, against their hashes (they
-    are not made anew); and every manifest row, which is made anew from the datasets, rules and
-    seed and compared field by field.
+    are not made anew); every manifest row, which is made anew from the datasets, rules and seed
+    and compared field by field; and so every question, if there are any, but for its picture.
 
     Args:
         split: The split; all of one on the Hub is downloaded.
@@ -100,6 +103,8 @@ def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Viola
         yield from _indexes(name, dataset, datasets.get(DISTRACTORS))
     if len(datasets) == len(header.datasets):
         yield from _told(MANIFESTS, _buffers(split, datasets))
+    if (own / QUESTIONS_PATH).is_file():
+        yield from _told(QUESTIONS_PATH, _questions(split))
 
 
 def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
@@ -252,6 +257,26 @@ def _buffers(split: Split, datasets: Mapping[str, Dataset]) -> Iterator[Violatio
     needed = set(datasets_of(plan.conditions))
     if not needed <= header.datasets.keys() <= {*DATASETS}:
         yield Violation(where, f"datasets are {sorted(header.datasets)}")
+
+
+def _questions(split: Split) -> Iterator[Violation]:
+    """Plan all questions anew, and compare them with those that are there."""
+    given = read_questions(split)
+    for question, _ in planned_questions(split):
+        where = f"{QUESTIONS_PATH} {question.episode_id}"
+        there = given.pop(question.episode_id, None)
+        if there is None:
+            yield Violation(where, "is missing")
+            continue
+        if (found := replace(there, picture=b"")) != question:
+            told, rules = _difference(to_dict(found), to_dict(question))
+            yield Violation(where, f"is {told}; the rules give {rules}")
+            continue
+        try:  # not compared: versions of Pillow draw letters a little otherwise
+            read_png(there.picture)
+        except FormatError as error:
+            yield Violation(where, error.message)
+    yield from (Violation(f"{QUESTIONS_PATH} {one}", "is of no query") for one in given)
 
 
 def _difference(found: Any, expected: Any) -> tuple[str, str]:

@@ -19,6 +19,7 @@ _WORDS = {
     pa.int64(): "whole number",
     pa.float64(): "number",
     pa.bool_(): "true or false",
+    pa.binary(): "bytes",
 }
 
 

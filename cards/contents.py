@@ -1,5 +1,6 @@
 """What the repositories of a split hold: its demonstrations, and its units with the manifests."""
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import PurePosixPath
@@ -13,12 +14,14 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFEST_PATH,
+    QUESTIONS_PATH,
     SUMS_PATH,
 )
 from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.errors import HashMismatchError
+from robomme_interference_data.errors import HashMismatchError, MissingFileError
 from robomme_interference_data.files import canonical_json, indented_json
 from robomme_interference_data.manifest import BufferManifest, ManifestHeader
+from robomme_interference_data.questions import read_questions
 from robomme_interference_data.rows import to_dict
 from robomme_interference_data.split import Split
 
@@ -68,9 +71,18 @@ def split_tree(split: Split, base: str | None) -> Tree:
     return {
         **dataset_tree(split.datasets[DISTRACTORS]),
         **further,
+        **questions_of(split),
         MANIFEST_PATH: Content(header),
         BUFFERS_FILE: rows,
     }
+
+
+def questions_of(split: Split) -> Tree:
+    """Return the file of a split's questions, if it has some."""
+    try:
+        return {QUESTIONS_PATH: Content(split.files.path(QUESTIONS_PATH))}
+    except MissingFileError:
+        return {}
 
 
 def placed(header: ManifestHeader, base: str | None) -> ManifestHeader:
@@ -102,6 +114,16 @@ def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
         del told["query"]
         held = [[one[name] for name in ("role", "source", "repeat", "sha256")] for one in sessions]
         parts[str(manifest)] = canonical_json([told, held])
+    return parts
+
+
+def parts_of_questions(split: Split) -> dict[str, str]:
+    """Return what each question asks, and what its picture is."""
+    parts = {}
+    for one in read_questions(split).values() if questions_of(split) else ():
+        told = to_dict(one)
+        told["picture"] = hashlib.sha256(one.picture).hexdigest()
+        parts[f"question {one.episode_id}"] = canonical_json(told)
     return parts
 
 

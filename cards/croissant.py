@@ -13,8 +13,15 @@ import pyarrow as pa
 
 from robomme_interference_data.cards import citation
 from robomme_interference_data.cards.columns import Column, columns_of
+from robomme_interference_data.cards.contents import questions_of
 from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts, kinds_of_sources
-from robomme_interference_data.cards.metadata import BUFFERS, BUFFERS_FILE, EPISODES, ROLLOUTS
+from robomme_interference_data.cards.metadata import (
+    BUFFERS,
+    BUFFERS_FILE,
+    EPISODES,
+    QUESTIONS,
+    ROLLOUTS,
+)
 from robomme_interference_data.cards.publication import HUB, OTHER, Publication
 from robomme_interference_data.cards.responsible import origin, responsible
 from robomme_interference_data.cards.results import ResultsFacts
@@ -22,6 +29,7 @@ from robomme_interference_data.constants import RECORDS_PATH, SUMS_PATH
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.files import sha256_file
 from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.questions import Question
 from robomme_interference_data.records import EpisodeRecord
 
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0")
@@ -52,6 +60,7 @@ _TYPES = {
     pa.int64(): "sc:Integer",
     pa.float64(): "sc:Float",
     pa.bool_(): "sc:Boolean",
+    pa.binary(): "sc:ImageObject",
 }
 _FORMATS = {
     ".parquet": "application/x-parquet",
@@ -94,6 +103,8 @@ def of_split(facts: SplitFacts, about: Publication) -> dict[str, Any]:
     """Return the description of a split."""
     buffers = _file(about, BUFFERS_FILE, facts.split.header.rows)
     tables = [_episodes_file(one, about) for one in facts.units.values()][:1]
+    pictures = questions_of(facts.split).items()
+    questions = [_file(about, path, content.sha256) for path, content in pictures]
     families = dict.fromkeys(record.episode_id.family for record in facts.queries)
     told = (
         f"History buffers of RoboMME-Interference: {len(facts.manifests):,} buffers of "
@@ -114,12 +125,14 @@ def of_split(facts: SplitFacts, about: Publication) -> dict[str, Any]:
             _repository(about),
             buffers,
             *tables,
+            *questions,
             *_datafiles(),
             _file_set("manifest", "manifests/*.json"),
         ],
         "recordSet": [
             _record_set(BUFFERS, BufferManifest, buffers["@id"]),
             *(_record_set(EPISODES, EpisodeRecord, one["@id"]) for one in tables),
+            *(_record_set(QUESTIONS, Question, one["@id"]) for one in questions),
         ],
     }
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from statistics import mean, median
 from typing import Any
 
+from robomme_interference_data.cards.contents import questions_of
 from robomme_interference_data.cards.limits import limits
 from robomme_interference_data.cards.markdown import escape
 from robomme_interference_data.cards.publication import check_repo_id, is_commit
@@ -157,6 +158,11 @@ class SplitFacts:
     def manifests(self) -> tuple[BufferManifest, ...]:
         """All buffers."""
         return tuple(self.split.manifests())
+
+    @property
+    def questions(self) -> bool:
+        """Whether it has questions about the past."""
+        return bool(questions_of(self.split))
 
     @property
     def split_name(self) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.constants import MANIFEST_ROWS, MANIFESTS
 
-BUFFERS, EPISODES, ROLLOUTS = "buffers", "episodes", "rollouts"
+BUFFERS, EPISODES, QUESTIONS, ROLLOUTS = "buffers", "episodes", "questions", "rollouts"
 """Names under which `datasets.load_dataset` gives the tables."""
 
 BUFFERS_FILE = f"{MANIFESTS}/{MANIFEST_ROWS}"

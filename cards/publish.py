@@ -9,6 +9,7 @@ from robomme_interference_data.cards.contents import (
     dataset_tree,
     parts_of_buffers,
     parts_of_dataset,
+    parts_of_questions,
     split_tree,
 )
 from robomme_interference_data.cards.publish_config import PublishConfig
@@ -68,7 +69,7 @@ def units_of(split: Split, config: PublishConfig, base: str | None) -> Goods:
 
     def parts(earlier: HubFiles | None) -> dict[str, str]:
         there = load_split(earlier.describe()) if earlier else split
-        found = parts_of_buffers(there.manifests())
+        found = parts_of_buffers(there.manifests()) | parts_of_questions(there)
         for name, one in there.datasets.items():
             found |= parts_of_dataset(one) if name != DEMONSTRATIONS else {}
         return found

@@ -21,6 +21,7 @@ from robomme_interference_data.cards.metadata import (
     BUFFERS,
     BUFFERS_FILE,
     EPISODES,
+    QUESTIONS,
     config,
     front_matter,
 )
@@ -39,6 +40,7 @@ from robomme_interference_data.constants import (
     FPS,
     MAX_STEPS,
     POSITION_LIMIT,
+    QUESTIONS_PATH,
     RECORDS_PATH,
     UNIT_FRAMES,
     UNIT_MIN_RAW_FRAMES,
@@ -197,6 +199,7 @@ def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
         "counts": facts.counts(),
         "goals": facts.demonstrations.goals(),
         "columns": _columns(columns_of(BufferManifest)),
+        "questions": facts.questions,
         "first": str(facts.queries[0].episode_id),
         "split_name": facts.split_name,
         "units_split": facts.units_split,
@@ -217,6 +220,7 @@ def _split_text(facts: SplitFacts, about: Publication) -> tuple[str, Film]:
         [
             config(BUFFERS, facts.split_name, BUFFERS_FILE, default=True),
             config(EPISODES, facts.units_split, RECORDS_PATH),
+            *[config(QUESTIONS, facts.split_name, QUESTIONS_PATH)] * facts.questions,
         ],
         facts.repositories,
         ("LeRobot",),

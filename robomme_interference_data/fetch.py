@@ -14,6 +14,7 @@ from robomme_interference_data.constants import (
     INDEX_HEADER,
     MANIFEST_PATH,
     MANIFESTS,
+    QUESTIONS_PATH,
     SHIFTED,
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
@@ -36,6 +37,7 @@ class FetchConfig:
     episodes: str | None = setting(None, help="Numbers, such as 0-9 or 0,3,10-12; default: all.")
     cameras: tuple[str, ...] = setting((), help="Cameras, such as front; by default all.")
     index: str | None = setting(None, help="Also the embeddings of this encoder, as thumbnail.")
+    questions: bool = setting(False, help="Also the questions; all buffers come with them.")
 
 
 @dataclass(frozen=True)
@@ -70,20 +72,21 @@ def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
             "Give the split as namespace/name.",
         )
     cameras = config.cameras or split.cameras
-    whole = replace(config, index=None) == FetchConfig()
+    whole = replace(config, index=None, questions=False) == FetchConfig()
     episodes = _episodes(split, config)
     others = {n: d.files for n, d in split.datasets.items() if d.files is not split.files}
     parts = []
     for folder, files in {"": split.files, **others}.items():
         assert isinstance(files, HubFiles)  # so is every place of a split on the Hub
         sizes = files.sizes()
-        # What tells of a dataset or split is small: all at the root, in meta/ and manifests/. All
-        # of a split is more than its buffers need: units that no query drew, too.
+        # What tells of a dataset or split is small: all in meta/ and manifests/, and at the root
+        # but for questions, which have pictures. All of a split is more than its buffers need:
+        # units that no query drew, too.
         wanted = {
             path
             for path, (top, *below) in ((path, path.split("/")) for path in sizes)
             if top in ("meta", MANIFESTS)
-            or not below
+            or (not below and (config.questions or top != QUESTIONS_PATH))
             or (whole and top not in (INDEX_DIR, *FURTHER))
         }
         for name, dataset in split.datasets.items():

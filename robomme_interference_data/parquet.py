@@ -67,6 +67,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         file = pq.ParquetFile(
             pa.OSFile(os.fsencode(path)),  # as pyarrow cannot encode names that are not UTF-8
             buffer_size=1 << 20,
+            page_checksum_verification=True,  # of pages that have one
             thrift_string_size_limit=MOST_FOOTER,
             thrift_container_size_limit=_MOST_LISTED,
         )
