@@ -73,6 +73,7 @@ _GROUPS = {
         ("conditions", commands.list_conditions),
         ("list", commands.list_buffers),
         ("show", commands.show),
+        ("question", commands.show_question),
         ("simulate", simulating.simulate),
     ),
     "Retrieval": (

@@ -159,6 +159,45 @@ def show(
         typer.echo(f"\n{spans.text()}")
 
 
+def show_question(
+    episode: QueryName,
+    split: SplitOption = Path(),
+    out: Picture = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the question about the past of one query: in words, and its picture with --out.
+
+    Example:
+    ```
+    robomme-interference question VideoUnmask/test/0 --split my-split --out question.png
+    ```
+    """
+    from robomme_interference_data.files import atomic_path
+    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.questions import read_questions
+
+    check_output(out)
+    opened = load_split(split)
+    query = opened.query(episode)
+    question = read_questions(opened)[query.episode_id]
+    if out is not None:
+        with atomic_path(out) as partial:
+            partial.write_bytes(question.picture)
+        say(f"{out} written")
+    told = {
+        "goal": query.goal,
+        "question": question.text,
+        "options": question.lines,
+        "right": question.letters[question.right],
+    }
+    if as_json:
+        print_json(told)
+        return
+    for name, text in told.items():
+        lines = text if isinstance(text, tuple) else (text,)
+        typer.echo("\n".join(f"{name if not n else '':8}  {line}" for n, line in enumerate(lines)))
+
+
 @with_settings
 def fetch(
     split: Annotated[str, typer.Argument(help="Repository, namespace/name or …@data-1.0.0.")],

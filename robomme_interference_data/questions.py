@@ -51,6 +51,14 @@ class Question:
         return LETTERS[: len(self.options)]
 
     @property
+    def lines(self) -> tuple[str, ...]:
+        """The options as they are read, such as `A: the red cube`."""
+        return tuple(
+            f"{letter}: {words or f'the one marked {letter}'}"
+            for letter, words in zip(self.letters, self.options, strict=True)
+        )
+
+    @property
     def chance(self) -> float:
         """Share of right answers that drawing at random has."""
         return 1 / len(self.options)
@@ -61,7 +69,7 @@ def read_questions(split: Split) -> dict[EpisodeId, Question]:
 
     Raises:
         MissingFileError: It has none; says how they are made.
-        FormatError: The file is damaged, or was made for other demonstrations.
+        FormatError: The file is damaged, lacks a query, or was made for other demonstrations.
         HubError: It is on the Hub, and cannot be fetched.
     """
     mend = "Ask its publisher to make them: robomme-interference build questions SPLIT"
@@ -79,4 +87,6 @@ def read_questions(split: Split) -> dict[EpisodeId, Question]:
         raise FormatError.damaged(path, "a query has two questions")
     if any(one.revision != revision for one in found.values()):
         raise FormatError(f"{path} has questions for other demonstrations", mend)
+    if lacking := sorted({*split.episode_ids} - found.keys()):
+        raise FormatError(f"{path} lacks the question of {lacking[0]}", mend)
     return found

@@ -3,7 +3,8 @@
 Where RoboMME's recordings lie beside the project (../shared/data), the demonstrations are the
 nine families' first test episodes and the distractors come from its training episodes, filled up
 with made-up sessions; elsewhere, all of it is a sample that the project records itself. Then the
-embedded simulator plays all nine families, and the controls are evaluated on it and scored.
+embedded simulator plays all nine families, the controls are evaluated on it and scored, and
+questions about what it showed are asked of the ideal observer and of chance.
 Everything lands in demo/; what is there already is not made again.
 """
 
@@ -30,7 +31,7 @@ FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour
 
 
 def main() -> None:
-    """Build, draw, audit, publish, load, retrieve; the same simulated, then evaluate and score."""
+    """Build, draw, audit, publish, load, retrieve; the same simulated; evaluate, ask, and score."""
     began = time.monotonic()
     DEMO.mkdir(exist_ok=True)
     sample = ["--source sample"]
@@ -47,6 +48,7 @@ def main() -> None:
     simulate()
     retrieve(DEMO / "tabletop", "MoveCube/test/0", DEMO / "tabletop_retrieval.png")
     evaluate()
+    ask()
     say(f"\nDone in {time.monotonic() - began:.0f} s: {DEMO / 'score' / 'report.html'}")
 
 
@@ -81,6 +83,17 @@ def evaluate() -> None:
         )
     # Three episodes a cell, not the benchmark's 450: a cell is complete with those given.
     run(f"score {' '.join(map(str, runs))} --grid given --out {DEMO}/score")
+
+
+def ask() -> None:
+    """Ask questions about the past: of the ideal observer, and of chance."""
+    split = DEMO / "tabletop"
+    run(f"build questions {split}")
+    run(f"question VideoUnmask/test/0 --split {split} --out {DEMO}/question.png")
+    runs = [DEMO / "asked" / model for model in ("recall", "guess")]
+    for out in runs:
+        run(f"ask --model {out.name} --split {split} --out {out} --conditions no-history k0 k7")
+    run(f"score {' '.join(map(str, runs))} --grid given --out {DEMO}/score-questions")
 
 
 def recorded_here() -> tuple[list[str], list[str]]:

@@ -85,7 +85,7 @@ def run_examination(
     """
     end_if_starting()
     split, folder = load_split(config.split), Path(config.out)
-    questions = read_questions(split)
+    read_questions(split)  # is refused with what makes them
     _check_settings(config)
     config = dataclasses.replace(
         config,
@@ -100,7 +100,7 @@ def run_examination(
     finally:
         answerer.close()
     plan = plan_work(
-        questions,
+        split.episode_ids,
         conditions=config.conditions or [one for one in split.conditions if _applies(config, one)],
         families=config.families,
         episodes=config.episodes,

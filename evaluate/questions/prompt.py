@@ -42,10 +42,7 @@ class QuestionPrompt:
             question: The question.
             views: Images for `<history>` and `<picture>`.
         """
-        options = "\n".join(
-            f"{letter}: {words or f'the one marked {letter}'}"
-            for letter, words in zip(question.letters, question.options, strict=True)
-        )
+        options = "\n".join(question.lines)
         words = {"{goal}": goal, "{question}": question.text, "{options}": options}
         asked = fill(self.question, words, views)
         return [Message("system", (self.system,)), Message("user", asked)]
