@@ -73,3 +73,18 @@ def test_replay_retraces_the_lesson_with_one_worker_as_with_two(
 def test_the_oracle_always_succeeds_and_nothing_is_drawn(split: Path, tmp_path: Path) -> None:
     config = RunConfig("oracle", split, tmp_path / "run", conditions=("no-history",))
     assert [row.status for row in run_evaluation(config).rows] == ["success"] * 2
+
+
+def test_who_obeys_reaches_the_oracle_with_its_subgoals_and_the_guess_without(
+    split: Path, tmp_path: Path
+) -> None:
+    def ended(policy: str, subgoals: str | None = None) -> dict[tuple[str, str], tuple[str, int]]:
+        out = tmp_path / f"{policy}-{subgoals}"
+        rows = run_evaluation(RunConfig(policy, split, out, subgoals=subgoals, workers=2)).rows
+        return {(row.family, row.condition): (row.status, row.steps) for row in rows}
+
+    obeyed, guessed = ended("obey", "oracle"), ended("guess")
+    assert {condition for _, condition in obeyed} == {"no-history", "k0", "k1"}
+    assert {status for status, _ in obeyed.values()} == {"success"}
+    assert ended("obey") == guessed  # the floor, to the very step
+    assert {status for status, _ in guessed.values()} != {"success"}
