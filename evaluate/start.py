@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.subgoals.registry import subgoals_identi
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.split import Split
 
-_PACKAGES = ("robomme-interference-data", "numpy", "av", "mani-skill", "sapien", "torch")
+_PACKAGES = ("robomme-interference-data", "numpy", "av", "torch")
 
 
 def run_identity(
@@ -44,7 +44,7 @@ def run_identity(
     return {
         "system": system,
         "simulator": config.simulator,
-        "simulator_version": versions.get(config.simulator),
+        "simulator_version": dict(versions),
         "revision": split.revision,
         "episode_split": config.episode_split,
         "shift": config.shift,
@@ -81,6 +81,8 @@ def start_of(
     """Return what is recorded of a start that begins now; `used` are further packages."""
     names = [*_PACKAGES, *used]
     names += ["transformers"] if config.retrieval is not None else []
+    # RoboMME's interpreter has others, which `versions` tells.
+    names += ["mani-skill", "sapien"] if config.simulator == "tabletop" else []
     installed = {"python": platform.python_version()}
     for name in names:
         try:

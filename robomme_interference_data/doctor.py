@@ -55,7 +55,7 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """Look at everything; takes a few seconds."""
+    """Look at everything; takes a few seconds, and a minute more where RoboMME is."""
     return [
         Check("Python", True, f"{platform.python_version()} ({sys.executable})"),
         check_packages("Core libraries"),
@@ -67,6 +67,7 @@ def checks() -> list[Check]:
         check_renderer(),
         check_robomme(),
         check_packages("Evaluate", "evaluate"),
+        check_packages("Vision-language models", "vlm"),
         check_packages("Retrieval", "retrieval"),
         check_packages("Score", "score"),
         check_hub_token(),
@@ -213,8 +214,10 @@ def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check
 
 
 def check_robomme() -> Check:
-    """Start RoboMME's interpreter, if one is named."""
-    from robomme_interference_data.simulators.robomme import PYTHON_VARIABLE, RoboMMESimulator
+    """Have RoboMME play a demonstration with each of its arms, if its interpreter is named."""
+    from robomme_interference_data.console import say
+    from robomme_interference_data.simulators.robomme import ARMS, RoboMMESimulator
+    from robomme_interference_data.simulators.robomme_process import PYTHON_VARIABLE
 
     name = "Official simulator"
     fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
@@ -222,9 +225,13 @@ def check_robomme() -> Check:
     if not python:
         detail = f"{PYTHON_VARIABLE} is not set; only --simulator robomme needs it"
         return Check(name, None, detail, fix)
+    played = " and ".join(f"{family}/test/0" for family in ARMS)
+    say(f"RoboMME plays {played}, one with each of its arms: a minute or so")
     try:
         with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
             versions = [f"{key} {value}" for key, value in simulator.versions.items()]
+            for family in ARMS:
+                simulator.reset(f"{family}/test/0")
     except InterferenceError as error:
         return Check(name, False, first_line(error), fix)
     return Check(name, True, f"{python}: {', '.join(versions)}")

@@ -13,14 +13,29 @@ import os
 import platform
 import queue
 import signal
+import subprocess
 import sys
 import threading
 import traceback
+import urllib.parse
+import urllib.request
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 LISTS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
 """Camera name to the key under which RoboMME returns its frames."""
+
+
+def _neighbour(name: str) -> Any:
+    """Load the module in the file beside this one: its folder is not on the path."""
+    spec: Any = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+_mends = _neighbour("robomme_mends")
 
 
 def send(
@@ -65,30 +80,59 @@ def receive(channel: Connection) -> tuple[dict[str, Any], dict[str, Any]]:
     return head, arrays
 
 
-def probe() -> dict[str, Any]:
-    """Return this interpreter's versions and RoboMME's families, or what it lacks, as `problem`."""
+def probe(folder: Path) -> dict[str, Any]:
+    """Mend what differs in this installation; return its versions and RoboMME's families.
+
+    Or what it lacks, or what cannot be mended, as `problem`.
+
+    Args:
+        folder: See `robomme_mends.mend`.
+    """
     if importlib.util.find_spec("robomme") is None:
         return {"problem": "robomme is not installed there"}
     try:
         numpy = str(importlib.import_module("numpy").__version__)
         if int(numpy.partition(".")[0]) >= 2:
             return {"problem": f"numpy is {numpy}; RoboMME needs numpy < 2"}
-        versions = {"robomme_python": platform.python_version(), "robomme_numpy": numpy}
-        return {"families": list(_builder().get_task_list()), "versions": versions | _version()}
+        families = list(_builder().get_task_list())
+        mended = _mends.mend(folder)
+        versions = _versions() | {"robomme_mended": "; ".join(mended) or "nothing"}
+        return {"families": families, "versions": versions}
+    except _mends.CannotMend as error:
+        return {"problem": str(error)}
     except Exception as error:
         traceback.print_exc()
         return {"problem": f"robomme cannot be imported: {_text(error)}"}
 
 
-def _version() -> dict[str, str]:
-    """Return RoboMME's version, if known, with the commit if it was installed from one."""
+def _versions() -> dict[str, str]:
+    """Return the versions in this interpreter, each with its commit if that is known."""
+    found = {"robomme_python": platform.python_version()}
+    for name in ("robomme", "mani_skill", "sapien", "torch", "numpy"):
+        key = "robomme" if name == "robomme" else f"robomme_{name}"
+        try:
+            installed = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:  # it is only on the path
+            continue
+        origin = json.loads(installed.read_text("direct_url.json") or "{}")
+        commit = origin.get("vcs_info", {}).get("commit_id") or _commit(origin.get("url", ""))
+        found[key] = f"{installed.version}+{commit}" if commit else installed.version
+    return found
+
+
+def _commit(url: str) -> str | None:
+    """Return the commit of the folder that a package was installed from, if it is a checkout."""
+    folder = urllib.request.url2pathname(urllib.parse.urlparse(url).path)
+    if not url.startswith("file:") or not Path(folder, ".git").exists():
+        return None
+    command = ["git", "-C", folder, "describe", "--always", "--abbrev=40", "--dirty"]
     try:
-        installed = importlib.metadata.distribution("robomme")
-    except importlib.metadata.PackageNotFoundError:
-        return {}  # it is only on the path
-    origin = json.loads(installed.read_text("direct_url.json") or "{}")
-    commit = origin.get("vcs_info", {}).get("commit_id")
-    return {"robomme": f"{installed.version}+{commit}" if commit else installed.version}
+        done = subprocess.run(
+            [*command, "--exclude=*"], check=True, capture_output=True, text=True, timeout=20
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
 
 
 class UnknownEpisode(Exception):
@@ -174,11 +218,11 @@ class Episodes:
         return arrays
 
 
-def serve(channel: Connection) -> None:
+def serve(channel: Connection, folder: Path) -> None:
     """Answer requests until the other side closes the pipe, which ends this process."""
     requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(channel, requests), daemon=True).start()
-    hello = probe()
+    hello = probe(folder)
     send(channel, hello)
     if "problem" in hello:
         return
@@ -225,10 +269,10 @@ def _text(error: BaseException) -> str:
 
 
 def main() -> None:
-    """Serve on the pipe whose descriptor is the argument."""
+    """Serve on the pipe whose descriptor is the first argument; the second is a folder of ours."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the other side's to handle
     os.set_inheritable(int(sys.argv[1]), False)
-    serve(Connection(int(sys.argv[1])))
+    serve(Connection(int(sys.argv[1])), Path(sys.argv[2]))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -24,13 +25,14 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.registry import simulator_versions
-from robomme_interference_data.simulators.robomme import EPISODES, RoboMMESimulator, find_python
+from robomme_interference_data.simulators.robomme import EPISODES, RoboMMESimulator
+from robomme_interference_data.simulators.robomme_process import find_python
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 from robomme_interference_data.subgoal import Subgoal
 
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
 
-DIES, HANGS, RAISES, BREAKS, SMALL_WRIST = 40, 41, 42, 43, 44
+DIES, HANGS, RAISES, BREAKS, LARGE_WRIST = 40, 41, 42, 43, 44
 """Indices of the stand-in's episodes that do so."""
 
 
@@ -169,8 +171,8 @@ def test_what_robomme_does_not_have(simulator: RoboMMESimulator) -> None:
             simulator.reset(episode)
     with pytest.raises(UnknownNameError, match="no built-in policy"):
         simulator.act("oracle")
-    with pytest.raises(InvalidOptionError, match=r"wrist camera .* \(128, 128, 3\) uint8"):
-        simulator.reset(f"MoveCube/test/{SMALL_WRIST}")
+    with pytest.raises(InvalidOptionError, match=r"wrist camera .* \(512, 512, 3\) uint8"):
+        simulator.reset(f"MoveCube/test/{LARGE_WRIST}")
     assert len(simulator.reset("MoveCube/test/0")[0]) == 2
 
 
@@ -292,6 +294,48 @@ def test_an_interpreter_that_will_not_do(
     refused(sys.executable, MissingExtraError, f"numpy is {np.__version__}; RoboMME needs numpy")
 
 
+# --- another ManiSkill than RoboMME's fork of it ----------------------------------------------
+
+
+def test_what_differs_from_the_fork_is_mended(
+    robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    results = []
+    for kind in ("fork", "index", "index"):
+        monkeypatch.setenv("STAND_IN_MANI_SKILL", kind)
+        with RoboMMESimulator(robomme_python) as simulator:
+            results.append(
+                [told(simulator, f"{name}/test/3") for name in ("MoveCube", "RouteStick")]
+            )
+            mended = simulator.versions["robomme_mended"]
+            assert (mended == "nothing") == (kind == "fork")
+    assert results[1] == results[2] == results[0]
+    assert len(mended.split("; ")) == 4
+    # The description of the arm is written once: the stick's own, and of the camera what hangs on
+    # it, but for its colour, which the fork leaves out too.
+    [folder] = (tmp_path / "robomme-interference" / "robomme").iterdir()
+    urdf, srdf = ((folder / f"panda_stick.{kind}").read_text() for kind in ("urdf", "srdf"))
+    links = [one.get("name") for one in ElementTree.fromstring(urdf).iter("link")]
+    assert sorted(links) == ["camera_base_link", "camera_link", "hand"]
+    assert "aluminum" in urdf and "color" not in urdf and "finger" not in urdf + srdf
+    pairs = ElementTree.fromstring(srdf).iter("disable_collisions")
+    assert [(one.get("link1"), one.get("link2")) for one in pairs] == [("hand", "camera_link")]
+    assert (folder / "meshes" / "camera.stl").read_text() == "solid\n"
+
+
+def test_what_cannot_be_mended_is_refused(
+    robomme_python: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STAND_IN_MANI_SKILL", "strange")
+    with pytest.raises(MissingExtraError, match="ManiSkill has no hand_camera on PandaWristCam"):
+        RoboMMESimulator(robomme_python)
+    monkeypatch.setenv("STAND_IN_MANI_SKILL", "index")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
+    with pytest.raises(MissingExtraError, match="/proc/robomme-interference"):
+        RoboMMESimulator(robomme_python)
+
+
 def test_versions_are_told(
     robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -302,8 +346,10 @@ def test_versions_are_told(
     origin = {"url": "https://example.org/robomme", "vcs_info": {"vcs": "git", "commit_id": "ab12"}}
     (installed / "direct_url.json").write_text(json.dumps(origin))
     found = simulator_versions("robomme", str(robomme_python))
-    assert found.keys() == {"robomme_python", "robomme_numpy"}  # it is on the path, not installed
+    # What is only on the path, not installed, has no version.
+    assert found.keys() == {"robomme_python", "robomme_numpy", "robomme_mended"}
     assert found["robomme_python"] == platform.python_version()
+    assert found["robomme_mended"] == "nothing"
     assert found["robomme_numpy"].startswith("1.")
     monkeypatch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}:{tmp_path}")
     installed_too = simulator_versions("robomme", str(robomme_python))

@@ -161,6 +161,11 @@ def test_robommes_interpreter_is_asked(
         row = doctor.check_robomme()
         assert row.ok is ok
         assert detail in row.detail
+    # It has to play, not only to be there.
+    monkeypatch.setenv("ROBOMME_PYTHON", str(robomme_python))
+    monkeypatch.setattr("robomme_interference_data.simulators.robomme.ARMS", ("VideoSleep",))
+    assert (row := doctor.check_robomme()).ok is False
+    assert "VideoSleep" in row.detail
 
 
 def test_a_token_is_found_and_never_shown(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,13 @@ go on for one step more than it is told.
 
 import os
 import time
+from xml.etree import ElementTree
 
 import numpy as np
+from mani_skill.agents.robots.panda import PandaStick, PandaWristCam
+from mani_skill.examples.motionplanning.panda.motionplanner_stick import (
+    PandaStickMotionPlanningSolver,
+)
 
 time.sleep(float(os.environ.get("STAND_IN_IMPORT_SECONDS", "0")))
 
@@ -22,6 +27,10 @@ class Environment:
         open_environments.add(self)
         self.family, self.index, self.seed, self.max_steps = family, index, seed, max_steps
         self.resets = 0
+        kind = PandaStick if family in STICKS else PandaWristCam
+        self.description = ElementTree.parse(kind.urdf_path).getroot()
+        arm = kind([link.get("name") for link in self.description.iter("link")])
+        self.cameras = {one.uid: one for one in arm._sensor_configs}
 
     def reset(self):
         for number in range(100):
@@ -30,11 +39,19 @@ class Environment:
             os._exit(7)
         if self.index == 42:
             raise RuntimeError("no Vulkan device")
+        if self.family in STICKS:
+            planner = PandaStickMotionPlanningSolver(
+                self, vis=False, visualize_target_grasp_pose=False, joint_vel_limits=0.3
+            )
+            assert planner.settings == (self, False, True, 0.3)
         self.steps = 0
         shift = 50 * self.resets
         self.resets += 1
         frames = range(shift, shift + self.index % 40 + 2 + 1)
-        joints = [np.float32(t + np.arange(7) / 8) for t in frames]
+        # As on the real one: an arm without the camera's body sways otherwise.
+        body = any(link.get("name") == "camera_link" for link in self.description.iter("link"))
+        sway = 0 if body else 0.0007
+        joints = [np.float32(t + sway + np.arange(7) / 8) for t in frames]
         return self._lists(frames, joints, [t / 100 for t in frames]), self._info("ongoing")
 
     def step(self, action):
@@ -60,7 +77,7 @@ class Environment:
         open_environments.remove(self)
 
     def _lists(self, frames, joints, grippers):
-        side = 128 if self.index == 44 else 256
+        side = 512 if self.index == 44 else self.cameras["hand_camera"].width
         stick = self.family in STICKS
         return {
             "front_rgb_list": [np.full((256, 256, 3), t, np.uint8) for t in frames],
@@ -95,7 +112,7 @@ class BenchmarkEnvBuilder:
 
     @classmethod
     def get_task_list(cls):
-        return ["MoveCube", "VideoRepick", "PatternLock", "RouteStick"]
+        return ["MoveCube", "VideoRepick", "VideoUnmask", "PatternLock", "RouteStick"]
 
     def get_episode_num(self):
         return 50
