@@ -17,6 +17,7 @@ from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _TOO_ALIKE = 0.9  # of difflib's ratio: one letter in ten
+_OF_QUESTIONS = "questions-"  # so begin the names of controls that are asked
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,14 @@ _CONTROLS = (
     *_control("Replay", retrieval=True),
     *_control("Recall", retrieval=False, bound=True),
     *_control("Recall", retrieval=True, bound=True),
+    System("questions-guess", "Questions-Guess", "none", bound=True),
+    System(
+        *("retrieval-questions-guess", "Retrieval-Questions-Guess", "none"),
+        retrieval=True,
+        bound=True,
+    ),
+    *_control("Questions-Recall", retrieval=False, bound=True),
+    *_control("Questions-Recall", retrieval=True, bound=True),
 )
 
 SYSTEMS: dict[str, System] = {system.name: system for system in (*PAPER_SYSTEMS, *_CONTROLS)}
@@ -157,12 +166,14 @@ def name_system(name: str) -> System:
 
     A name of your own is free of conditions and limits. It may not read like one of the table:
     what differs from one in case, separators or one letter in ten is refused, so that neither a
-    slip nor a variant passes for a published system.
+    slip nor a variant passes for a published system. Nor may it begin as those of the controls
+    that are asked questions.
 
     Raises:
         InvalidIdError: The name has other than 1 to 64 letters, digits, `.`, `_` and `-`, or
             does not begin with a letter or digit.
-        UnknownNameError: It reads like a system of the table, without being one.
+        UnknownNameError: It reads like a system of the table, or like a control that is asked
+            questions, without being one.
     """
     if not _FREE_NAME.fullmatch(name):
         raise InvalidIdError(
@@ -178,6 +189,11 @@ def name_system(name: str) -> System:
                 f"Write {system.name!r} if that is what runs, or take a name that cannot be "
                 "mistaken for it.",
             )
+    if name.lower().removeprefix("retrieval-").startswith(_OF_QUESTIONS):
+        raise UnknownNameError(
+            f"{name!r} reads like a control that is asked questions, which it is not",
+            f"Take a name that does not begin with {_OF_QUESTIONS!r}.",
+        )
     return System(name, name, "own")
 
 

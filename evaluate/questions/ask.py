@@ -92,8 +92,7 @@ def run_examination(
         model=config.model if config.model in _OWN else pin_model(config.model),
         split=Path(split.location),
     )
-    name = config.system or _default_system(config)
-    _check_name(name)
+    name = _name(config)
     answerer = make_answerer(config)
     try:
         said = answerer.metadata()
@@ -155,12 +154,7 @@ def _applies(config: AskConfig, condition: str) -> bool:
 
 
 def _default_system(config: AskConfig) -> str:
-    """Return the name under which rows stand if none is given; see `is_bound`."""
-    if config.model not in _OWN:
-        raise InvalidOptionError(
-            f"the rows of {config.model} need a name",
-            "Give --system, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
-        )
+    """Return the name of who answers without a model, that of a bound (see `is_bound`)."""
     parts = ["questions", config.model]
     parts += [config.sampling] if config.model == "recall" else []
     if config.retrieval is None:
@@ -168,13 +162,21 @@ def _default_system(config: AskConfig) -> str:
     return "-".join(["retrieval", *parts, *unusual_retrieval(config).values()]).replace("/", "-")
 
 
-def _check_name(name: str) -> None:
-    name_system(name)
-    if known_system(name) is not None:
+def _name(config: AskConfig) -> str:
+    """Return the name under which rows stand: of the table only that of who answers."""
+    own = _default_system(config) if config.model in _OWN else None
+    name = config.system or own
+    if name is None:
         raise InvalidOptionError(
-            f"{name} is a system that acts; who answers questions is another one",
-            "Give --system a name of your own.",
+            f"the rows of {config.model} need a name",
+            "Give --system, such as qwen3-vl-4b, or qwen3-vl-4b-blank for a control.",
         )
+    name_system(name)
+    if name != own and known_system(name) is not None:
+        raise InvalidOptionError(
+            f"{config.model} is not the system {name}", "Give --system a name of your own."
+        )
+    return name
 
 
 def make_answerer(config: AskConfig) -> Answerer:

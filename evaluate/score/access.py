@@ -16,16 +16,15 @@ from robomme_interference_data.tables import Table
 
 
 def ceiling_of(system: str) -> str | None:
-    """Return the ideal observer with a system's memory; None for itself, and where none is known.
+    """Return the ideal observer with a system's memory; None for bounds, and where none is known.
 
     Of a system with retrieval it is the observer behind the same step.
     """
     known = known_system(system)
-    if known is None or known.sampling is None:
+    if known is None or known.sampling is None or known.bound:
         return None
     name = f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(known.step)}"
-    name += known.step
-    return name if name != system else None
+    return name + known.step
 
 
 def access_table(cubes: Iterable[Cube]) -> Table:

@@ -83,6 +83,21 @@ def test_own_names_do_not_pretend(name: str, system: str) -> None:
         name_system(name)
 
 
+@pytest.mark.parametrize("sampling", ["full", "framesamp", "window"])
+def test_who_answers_without_a_model_is_a_bound(sampling: str) -> None:
+    for name in ("questions-guess", f"questions-recall-{sampling}"):
+        for known in (name, f"retrieval-{name}", f"retrieval-{name}-joined"):
+            assert name_system(known).name == known and is_bound(known)
+        assert base_of(f"retrieval-{name}") == base_of(f"retrieval-{name}-joined") == name
+
+
+@pytest.mark.parametrize("name", ["questions-qwen", "Questions-8b", "retrieval-questions-mine"])
+def test_names_of_who_answers_without_a_model_are_kept_for_them(name: str) -> None:
+    with pytest.raises(UnknownNameError, match=f"{name!r} reads like a control that is asked"):
+        name_system(name)
+    assert name_system(f"my-{name}").name == f"my-{name}"
+
+
 @pytest.mark.parametrize("name", ["", " ", "-x", "a b", "a/b", "x" * 65, "π"])
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(InvalidIdError, match="is not the name of a system"):
