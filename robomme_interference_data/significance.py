@@ -86,6 +86,26 @@ def _heads(coins: int) -> NDArray[np.float64]:
     return np.array([math.comb(coins, heads) / 2**coins for heads in range(coins + 1)])
 
 
+def poisson_binomial(successes: int, chances: Sequence[float]) -> float:
+    """Return the one-sided p-value of so many successes or more, if each came by its own chance.
+
+    The number of successes of independent trials with chances c is Poisson-binomial: the chance of
+    i of them is the coefficient of xⁱ in Π (1 − c + c x), which is multiplied out. All terms are
+    positive, so small p-values have all their digits.
+
+    Source: Hong (2013), On computing the distribution function for the Poisson binomial
+    distribution, Computational Statistics and Data Analysis 59, 41–51.
+
+    Args:
+        successes: Observed successes.
+        chances: Of each trial, from 0 to 1.
+    """
+    counts: NDArray[np.float64] = np.ones(1)  # of each number of successes, from none
+    for chance in chances:
+        counts = np.convolve(counts, (1 - chance, chance)).astype(np.float64)
+    return min(1.0, float(counts[successes:].sum()))
+
+
 def two_proportions(
     successes: float, trials: float, other_successes: float, other_trials: float
 ) -> float:

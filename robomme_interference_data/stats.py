@@ -178,6 +178,16 @@ def fieller(
     return (b - root) / a, (b + root) / a
 
 
+def above_chance(rate: float, chance: float) -> float:
+    """Return the share of what chance leaves that a rate has: 1 is all, 0 none, below 0 less.
+
+    (rate − chance) / (1 − chance); NaN where chance leaves nothing.
+
+    Source: Abbott's formula, J. Economic Entomology 18 (1925), 265–267.
+    """
+    return (rate - chance) / (1 - chance) if chance < 1 else math.nan
+
+
 def cohens_h(rate: float, other: float) -> float:
     """Return Cohen's effect size for two rates, 2 arcsin √rate − 2 arcsin √other.
 

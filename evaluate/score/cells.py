@@ -42,6 +42,8 @@ class Cell:
         interval: Its 95% Wilson interval; `(0, 1)` if n is 0.
         trials: How many independent ones the rate is worth: n, and with repeats more.
         counts: Rollouts by status, as `STATUSES`.
+        chance: Mean over them of the share of right answers that guessing has; NaN unless each is
+            a question.
         expected: How many episodes are expected.
         missing: Those that do not count with every model seed of the condition.
         broken: Episodes in which a rollout broke.
@@ -62,6 +64,7 @@ class Cell:
     interval: tuple[float, float]
     trials: float
     counts: tuple[int, ...] = (0,) * len(STATUSES)
+    chance: float = math.nan
     expected: int = 0
     missing: Sequence[EpisodeId] = ()
     broken: Sequence[EpisodeId] = ()
@@ -102,7 +105,8 @@ def _cells(cube: Cube) -> list[Cell]:
         for name, (here, wanted) in parts.items():
             if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
                 continue
-            known = rates[s, c][here & cube.counted[s, c]]
+            counted = here & cube.counted[s, c]
+            known = rates[s, c][counted]
             n, counts = len(known), cube.counts[s, c]
             rate, worth = float(known.sum() / n) if n else math.nan, trials(cube.status[s, c, here])
             cells.append(
@@ -111,6 +115,7 @@ def _cells(cube: Cube) -> list[Cell]:
                     interval=wilson(rate * worth if n else 0, worth),
                     trials=worth,
                     counts=tuple(counts[here].sum(axis=0).tolist()),
+                    chance=float(cube.chance[counted].mean()) if n else math.nan,
                     expected=int((wanted & cube.expected).sum()),
                     missing=cube.chosen(wanted & cube.missing[s, c]),
                     broken=cube.chosen(here & (counts[:, _ERROR] > 0)),
@@ -184,6 +189,10 @@ def main_grids(cells: Sequence[Cell]) -> list[Table]:
         note = _NOTE if several or not episodes else f"n = {episodes.pop()} in each cell. {_NOTE}"
         note += _BEST * any(cell.best for cell in found)
         note += f" Not ranked either, as they only show bounds: {', '.join(bounds)}." * bool(bounds)
+        chances = [cell.chance for cell in found if not math.isnan(cell.chance)]
+        if chances:
+            levels = dict.fromkeys(percent(one(chances)) for one in (min, max))
+            note += f" Guessing would have {' to '.join(levels)}: see the table chance."
         note += f" Rollouts that broke: {errors}." if errors else " No rollout broke."
         title = f"Success by system and condition, {simulator}"
         grids.append(Table.make(simulator, title, " ".join(["system", *conditions]), rows, note))

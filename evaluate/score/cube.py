@@ -39,6 +39,8 @@ class Cube:
         evidence: Share of the lesson's evidence that the memory kept, NaN where that is not known,
             `(S, C, E, M) float64`.
         difficulty: Place of each episode's in `DIFFICULTIES`, −1 unknown, `(E,) int64`.
+        chance: Of each episode's question, the share of right answers that drawing at random has,
+            NaN where nothing was asked, `(E,) float64`.
         expected: The episodes of a complete cell, `(E,) bool`.
         due: The cells that are expected or have rows, `(S, C) bool`.
         unpinned: Whether rows of a system name no revision of a split, `(S,) bool`.
@@ -52,6 +54,7 @@ class Cube:
     status: Statuses
     evidence: NDArray[np.float64]
     difficulty: NDArray[np.int64]
+    chance: NDArray[np.float64]
     expected: Flags
     due: Flags
     unpinned: Flags
@@ -172,6 +175,8 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
     difficulty = np.full(len(episodes), -1)
     found = rows.places("difficulty", DIFFICULTIES)
     difficulty[at[found >= 0]] = found[found >= 0]
+    chance, drawn = np.full(len(episodes), np.nan), np.array(rows.list("chance"), float)
+    chance[at[~np.isnan(drawn)]] = drawn[~np.isnan(drawn)]
     known = [name_system(system) for system in systems]
     applies = np.array([[one.applies(c) and c in due for c in conditions] for one in known])
     return Cube(
@@ -183,6 +188,7 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
         status,
         evidence,
         difficulty,
+        chance,
         expected=np.array([key in wanted for key in places]),
         due=applies | (status >= 0).any(axis=(2, 3)),
         unpinned=np.array([(simulator, system) in rows.unpinned for system in systems]),

@@ -22,6 +22,7 @@ from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.significance import SURE
 
 _PUBLISHED = ", published"
+_CHANCE = "(chance)"  # among systems: no name of one has brackets
 
 FEW = 4
 """Up to so many systems, curves have intervals."""
@@ -37,13 +38,15 @@ class Data:
         systems: Those that have rows.
         absent: Published ones without rows here, behind a retrieval step that has: drawn in full.
         beside: Published ones of systems with rows: dashes beside their points.
-        looks: Of all of them.
+        looks: Of all of them, and of the chance level.
         conditions: Of all of them, in the order of tables.
         least: The fewest sessions that one of them counts.
         contrasts: The comparisons of the systems that have rows.
         flips: Share of outcomes that differ between repeats; None without repeats.
         apart: Condition and two systems that can be told apart under it.
         access: The rows of the table `access`, without the simulator.
+        chance: Part of the episodes, or empty for all, to the share that guessing has: of those
+            that are all questions, as most episodes have it.
     """
 
     def __init__(self, score: Score, simulator: str):
@@ -61,8 +64,11 @@ class Data:
         }
         access = score.tables.get("access")
         self.access = [row[1:] for row in access.rows if row[0] == simulator] if access else []
+        asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
+        self.chance = {one.part: one.chance for one in asked}
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
         self.looks = looks_of([*self.systems, *bases])
+        self.looks[_CHANCE] = Look("chance", INK, "", ":", 0.9)
         self.cells: dict[tuple[str, str, str], Cell] = {
             (one.system, one.condition, one.part): one for one in found
         }
@@ -170,6 +176,19 @@ def curve(
     return {system: points[-1][2]}
 
 
+def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
+    """Draw the share that guessing has in a part of the episodes, where they are questions.
+
+    Returns:
+        That share in percent, to be named as systems are; nothing where nothing was asked.
+    """
+    if part not in data.chance:
+        return {}
+    level, look = 100 * data.chance[part], data.looks[_CHANCE]
+    axes.axhline(level, color=look.colour, linestyle=look.line, linewidth=look.width, zorder=0)
+    return {_CHANCE: level}
+
+
 # --- axes and labels ---------------------------------------------------------------------------
 
 
@@ -245,7 +264,8 @@ def label_ends(
             *axes.plot(1, label, **look.point, clip_on=False, transform=beside(0.029 * size)),
             axes.text(1, label, look.label, transform=beside(0.041 * size), **letters),
         ]
-        mark(drawn, of or system)
+        if system != _CHANCE:
+            mark(drawn, of or system)
 
 
 def spread(

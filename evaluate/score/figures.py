@@ -95,6 +95,7 @@ def _success(figure: Any, data: Data) -> bool:
     for name in beside:
         shift = places[name.removesuffix(", published")]
         curve(axes, data, name, "", shift, bars=False)
+    ends |= curves.chance_level(axes, data, "")
     curves.set_axes(axes, data, [*places, *beside], "success, %")
     curves.label_ends(axes, ends, data.looks, high - 1, 8)
     note = "published rates: in the table “paper”" if len(beside) < len(data.beside) else ""
@@ -153,6 +154,7 @@ def _panels(
         ends.append({})
         for system, shift in curves.shifts(systems).items():
             ends[-1] |= curve(axes, shown, system, part, shift, bars=bars)
+        ends[-1] |= curves.chance_level(axes, shown, part)
         axes.set_title(title, size=9, color=INK, weight="bold" if title == _ALL else "normal")
     for number, axes in enumerate(grid.flat):
         if number < len(panels):

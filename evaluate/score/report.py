@@ -34,7 +34,7 @@ _LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
 """What the numbers and pictures depend on."""
 
 _SHOWN_IN = {
-    **{"effects": ("lift", "effects"), "success": ("main", "paper")},
+    **{"effects": ("lift", "effects"), "success": ("main", "chance", "paper")},
     **{"families": ("family", "paper_family"), "heatmap": ("family",)},
     **{"difficulty": ("difficulty",), "retention": ("lift",)},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},

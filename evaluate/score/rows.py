@@ -191,7 +191,7 @@ class _Joined:
         """Return the rows that are sound, beside each other too, and what is against the others."""
         self._check_success()
         self._check_alike("revision", ("simulator",), "rows of different splits do not mix")
-        for name in ("difficulty", "seed"):
+        for name in ("difficulty", "seed", "chance"):
             self._check_alike(name, _EPISODE, "an episode has one")
         self._check_repeats()
         found = [(*self._where(row), reason) for row, reason in self._reasons.items()]

@@ -13,6 +13,7 @@ from robomme_interference_data.evaluate.score import (
     Settings,
     access,
     cells,
+    chance,
     contrasts,
     effects,
     equivalence,
@@ -29,8 +30,17 @@ from robomme_interference_data.tables import Table
 from robomme_interference_data.templates import load_jinja2
 
 TABLES = (
-    *("main", "systems", "ranks", "family", "difficulty", "lift", "effects", "interaction"),
-    *("equivalence", "interference", "access", "ceiling", "decay", "noise", "families"),
+    *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
+    *(
+        "interaction",
+        "equivalence",
+        "interference",
+        "access",
+        "ceiling",
+        "decay",
+        "noise",
+        "families",
+    ),
     *("family_effects", "matrix", "coverage", "paper", "paper_family"),
 )
 """Every table that a score may have."""
@@ -105,6 +115,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         compared += ranks.systems_of(cube) + interaction.interactions_of(cube)
     every = cells.cells_of(cubes.values())
     between = [
+        chance.chance_table(cubes, every),
         contrasts.contrast_table(compared, "systems"),
         ranks.rank_table(cubes.values(), draws),
     ]

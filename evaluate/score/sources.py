@@ -43,7 +43,7 @@ which exported rows of other simulators have as one column more."""
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
 
 _READ = {*KEY_COLUMNS, *_NEEDED, "seed", "difficulty", "steps", "video"}
-_READ |= {"evidence_kept", "retrieval_model"}
+_READ |= {"evidence_kept", "chance", "retrieval_model"}
 COLUMNS = tuple(n for n in _SCHEMA.names if n in _READ - {"split"} or n.endswith("_fraction"))
 """What scoring reads of a file, as far as it is there."""
 

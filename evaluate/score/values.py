@@ -27,7 +27,7 @@ _NUMBERS = {
     "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION),
 }
 _WORDS = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
-_FRACTIONS = {"evidence_kept", *(name for name in COLUMNS if name.endswith("_fraction"))}
+_FRACTIONS = {"evidence_kept", "chance", *(name for name in COLUMNS if name.endswith("_fraction"))}
 _OPTIONAL = {"seed", "difficulty", "steps", "success", "video", "retrieval_model", *_FRACTIONS}
 
 _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # programs save some whole numbers as floats

@@ -11,7 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.bootstrap import bootstrap, enough, slope_weights
-from robomme_interference_data.significance import holm, mcnemar, sign_flip, two_proportions
+from robomme_interference_data.significance import (
+    holm,
+    mcnemar,
+    poisson_binomial,
+    sign_flip,
+    two_proportions,
+)
 from robomme_interference_data.stats import (
     cohens_h,
     effective,
@@ -180,6 +186,30 @@ def test_mcnemar_is_the_binomial_test(gained: int, lost: int) -> None:
     if gained + lost:
         expected = scipy.stats.binomtest(gained, gained + lost).pvalue
         assert mcnemar(gained, lost)[0] == pytest.approx(expected, rel=1e-8, abs=1e-200)
+
+
+def test_right_guesses_by_hand() -> None:
+    # (1/2 + x/2) (3/4 + x/4) = (3 + 4 x + x²) / 8
+    assert [poisson_binomial(n, [1 / 2, 1 / 4]) for n in range(4)] == [1, 5 / 8, 1 / 8, 0]
+    assert poisson_binomial(0, []) == poisson_binomial(1, [1, 0]) == 1
+
+
+@given(st.integers(0, 450), st.integers(0, 450), st.integers(2, 5))
+def test_guesses_of_equal_chances_are_binomial(first: int, second: int, options: int) -> None:
+    right, n = sorted((first, second))
+    expected = scipy.stats.binom.sf(right - 1, n, 1 / options)
+    assert poisson_binomial(right, [1 / options] * n) == pytest.approx(expected, rel=1e-9)
+
+
+@given(st.lists(st.floats(0, 1), max_size=8), st.integers(0, 9))
+def test_guesses_are_all_that_can_be(chances: list[float], right: int) -> None:
+    every = itertools.product((False, True), repeat=len(chances))
+    expected = sum(
+        math.prod(c if won else 1 - c for c, won in zip(chances, one, strict=True))
+        for one in every
+        if sum(one) >= right
+    )
+    assert poisson_binomial(right, chances) == pytest.approx(expected, abs=1e-12)
 
 
 def test_holm_by_hand() -> None:

@@ -62,7 +62,7 @@ def test_score_and_export_on_the_command_line(
     assert f"Report: {out / 'report.html'}" in done.stderr
     beyond = {"interference", "access", "ceiling"}  # what the paper's conditions do not have
     beyond |= {"systems", "ranks", "matrix", "interaction"}  # nor one system alone
-    beyond |= {"equivalence"}  # nobody asked for it
+    beyond |= {"equivalence", "chance"}  # nobody asked for it, or anybody anything
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
     drawn = sorted(path.name for path in (out / "figures").iterdir())
     kinds = ("difficulty", "effects", "families", "heatmap", "retrieval", "success")
