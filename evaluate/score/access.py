@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.cube import Cube, counting, success, trials
+from robomme_interference_data.evaluate.score.cube import Cube, counting, rate_of, trials
 from robomme_interference_data.evaluate.systems import known_system
 from robomme_interference_data.stats import wilson
 from robomme_interference_data.tables import Table
@@ -39,11 +39,9 @@ def access_table(cubes: Iterable[Cube]) -> Table:
         for s, c in np.argwhere(cube.has_rows).tolist():
             for name, chosen in levels.items():
                 status = np.where(chosen[s, c], cube.status[s, c], np.int8(-1))
-                rates = success(status)[counting(status).any(axis=-1)]
-                if n := len(rates):
-                    rate = float(rates.mean())
+                if n := int(counting(status).any(axis=-1).sum()):
                     cell = (cube.simulator, cube.systems[s], cube.conditions[c], name)
-                    worth = trials(status)
+                    rate, worth = rate_of(status), trials(status)
                     rows.append((*cell, n, rate, *wilson(rate * worth, worth)))
     return Table.make(
         "access",

@@ -10,7 +10,7 @@ import numpy as np
 
 from robomme_interference_data.conditions import in_order
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.evaluate.score.cube import STATUSES, Cube, Flags, success, trials
+from robomme_interference_data.evaluate.score.cube import STATUSES, Cube, Flags, rate_of, trials
 from robomme_interference_data.evaluate.score.ranks import cannot_be_told, to_best
 from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
@@ -93,7 +93,6 @@ def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
 
 
 def _cells(cube: Cube) -> list[Cell]:
-    rates = success(cube.status)
     every: Flags = np.ones(len(cube.episodes), bool)
     parts = {"": (every, every)}  # name to its episodes, and to those that are expected in it
     parts |= {name: (here, here) for name in FAMILIES if (here := cube.of_family(name)).any()}
@@ -106,9 +105,8 @@ def _cells(cube: Cube) -> list[Cell]:
             if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
                 continue
             counted = here & cube.counted[s, c]
-            known = rates[s, c][counted]
-            n, counts = len(known), cube.counts[s, c]
-            rate, worth = float(known.sum() / n) if n else math.nan, trials(cube.status[s, c, here])
+            n, counts, status = int(counted.sum()), cube.counts[s, c], cube.status[s, c, here]
+            rate, worth = rate_of(status), trials(status)
             cells.append(
                 Cell(
                     *(cube.simulator, cube.systems[s], cube.conditions[c], name, n, rate),

@@ -1,6 +1,8 @@
 """What came of every rollout in one simulator, as one array."""
 
+import math
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
@@ -132,6 +134,20 @@ def success(status: Statuses) -> NDArray[np.float64]:
     """
     with np.errstate(invalid="ignore"):
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
+
+
+def rate_of(status: Statuses) -> float:
+    """Return the mean of `success` over the episodes that count, NaN of none.
+
+    It is exact: of repeats, too, means that are equal are equal numbers.
+
+    Args:
+        status: The rate's rollouts, `(E, M) int8`.
+    """
+    won, of = (status == _SUCCESS).sum(-1), counting(status).sum(-1)
+    counts, episodes = np.unique(of[of > 0], return_counts=True)
+    total = sum(Fraction(int(won[of == count].sum()), count) for count in counts.tolist())
+    return float(total / int(episodes.sum())) if len(counts) else math.nan
 
 
 def trials(status: Statuses) -> float:

@@ -183,9 +183,8 @@ def _beside_base(score: Score, contrast: Contrast) -> list[str]:
 def _best(cells: Sequence[Cell], condition: str | None = None) -> list[Cell]:
     """Return the cells of the highest rate, in the order of tables, under one condition or all."""
     found = [cell for cell in cells if condition in (None, cell.condition)]
-    # Rounded: means of repeats that are equal may differ in the last bit.
-    highest = max((round(cell.rate, 12) for cell in found), default=math.nan)
-    return [cell for cell in found if round(cell.rate, 12) == highest]
+    highest = max((cell.rate for cell in found), default=math.nan)
+    return [cell for cell in found if cell.rate == highest]
 
 
 def _interval(cell: Cell) -> str:

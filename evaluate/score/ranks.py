@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.bootstrap import DRAWS, Floats, drawn_means
 from robomme_interference_data.evaluate.score.contrasts import Contrast
-from robomme_interference_data.evaluate.score.cube import Cube, Flags, success, trials
+from robomme_interference_data.evaluate.score.cube import (
+    Cube,
+    Flags,
+    counting,
+    rate_of,
+    success,
+    trials,
+)
 from robomme_interference_data.evaluate.score.pairs import Pairs, apart, pair
 from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.significance import SURE, holm
@@ -28,10 +35,8 @@ def against(cube: Cube, condition: str, one: str, other: str, here: Flags) -> Pa
     sides = [cube.status[cube.cell(name, condition)][here] for name in (other, one)]
     if cube.pairable(one, other):
         return pair(*sides)
-    counted = [
-        (rates[~np.isnan(rates)], trials(side)) for side in sides for rates in [success(side)]
-    ]
-    return apart([(float(rates.mean()), worth, len(rates)) for rates, worth in counted])
+    counted = [int(counting(side).any(-1).sum()) for side in sides]
+    return apart([(rate_of(s), trials(s), n) for s, n in zip(sides, counted, strict=True)])
 
 
 def to_best(
@@ -48,9 +53,7 @@ def to_best(
     Returns:
         System to its comparison, and the best to None.
     """
-    rates = [np.nanmean(success(cube.status[cube.cell(s, condition)][here])) for s in systems]
-    # Rounded: means of repeats that are equal may differ in the last bit.
-    best = systems[int(np.argmax(np.round(rates, 12)))]
+    best = max(systems, key=lambda one: rate_of(cube.status[cube.cell(one, condition)][here]))
     return {s: None if s == best else against(cube, condition, s, best, here) for s in systems}
 
 
@@ -112,12 +115,9 @@ def rank_table(cubes: Iterable[Cube], draws: int = DRAWS) -> Table:
         for condition, systems in ranked(cube):
             if len(systems) < 2:
                 continue
-            values = np.stack(
-                [success(cube.status[cube.cell(s, condition)])[cube.expected] for s in systems],
-                axis=1,
-            )
-            means = drawn_means(values, cube.simulator, draws)
-            rates = values.mean(axis=0).round(12)  # as those are: equal ones share a rank
+            sides = [cube.status[cube.cell(s, condition)][cube.expected] for s in systems]
+            means = drawn_means(np.stack([*map(success, sides)], axis=1), cube.simulator, draws)
+            rates = np.array([*map(rate_of, sides)])
             bounds = np.quantile(_ranks(means), (0.025, 0.975), axis=0, method="nearest").T
             rows += [
                 (cube.simulator, condition, system, float(rate), int(rank), int(low), int(high))

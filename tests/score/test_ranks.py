@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
+from robomme_interference_data.evaluate.score.headline import headline
 from robomme_interference_data.evaluate.score.pairs import corrected
 from robomme_interference_data.significance import holm, mcnemar, sign_flip, two_proportions
 from robomme_interference_data.stats import combined, newcombe, newcombe_paired
@@ -50,6 +51,21 @@ def test_equal_rates_lead_by_the_order_of_tables(tmp_path: Path) -> None:
     assert record(found, "systems")["against_system"] == BASE
     assert {r["rank"] for r in records(found, "ranks")} == {1}
     assert {r["best"] for r in records(found, "main")} == {True}
+
+
+def test_equal_means_of_repeats_share_a_rank(tmp_path: Path) -> None:
+    # A third and four times two thirds, which as floats add up to less than three times 1.
+    own = ("fssss", "sssss", "fffff")
+    rows = [
+        row
+        for seed, letters in enumerate(own)
+        for row in cells({(OWN, "k0"): letters, (BASE, "k0"): "ffsss"}, seed)
+    ]
+    found = made.score(made.write_csv(tmp_path / "a.csv", rows))
+    assert {(r["rate"], r["rank"]) for r in records(found, "main")} == {(3 / 5, 1)}
+    assert {r["rank"] for r in records(found, "ranks")} == {1}
+    assert record(found, "systems")["against_system"] == BASE
+    assert "k0, my-memory has the same rate" in headline(found, "tabletop")
 
 
 def test_systems_of_other_histories_are_not_paired(tmp_path: Path) -> None:
