@@ -3,6 +3,7 @@
 import math
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from robomme_interference_data.bootstrap import Interval
 from robomme_interference_data.conditions import KINDS, NO_HISTORY, parse_condition
@@ -112,29 +113,35 @@ def asked(
 
 
 _TOGETHER = "the tests of this table in one simulator"
+_WITHIN = "the tests of a condition in one simulator"
 
 
 # --- tables ------------------------------------------------------------------------------------
 
 
+def _of_table(
+    contrasts: Iterable[Contrast], name: str
+) -> tuple[list[Contrast], list[tuple[Any, ...]], str]:
+    """Return a table's comparisons, values of each row, and how these are to be read.
+
+    The values are n, both sides, the difference and those of `COLUMNS` (see `tested`).
+    """
+    found = [one for one in contrasts if one.table == name]
+    tests = [one.tested for one in found]
+    sides = [(one.pairs.n, one.pairs.second, one.pairs.first) for one in found]
+    values = [(*side, *test) for side, test in zip(sides, tested(tests), strict=True)]
+    return found, values, how_to_read(tests, _WITHIN if name in WITHIN else _TOGETHER)
+
+
 def lift_table(contrasts: Iterable[Contrast]) -> Table:
     """Return each condition's lift over the system's own rate without history."""
-    found = [one for one in contrasts if one.table == "lift"]
-    tests = [one.tested for one in found]
+    found, tests, read = _of_table(contrasts, "lift")
     rows = [
         (
             *(c.simulator, c.system, c.condition, c.against[0]),
-            *(
-                c.pairs.n,
-                c.pairs.second,
-                c.pairs.first,
-                *test,
-                *c.retention,
-                c.retention_n,
-                c.complete,
-            ),
+            *(*test, *c.retention, c.retention_n, c.complete),
         )
-        for c, test in zip(found, tested(tests), strict=True)
+        for c, test in zip(found, tests, strict=True)
     ]
     return Table.make(
         "lift",
@@ -143,9 +150,8 @@ def lift_table(contrasts: Iterable[Contrast]) -> Table:
         f"lift:points {COLUMNS} retention:ratio retention_low:ratio retention_high:ratio "
         "retention_n:count complete:flag",
         rows,
-        "Over the n episodes that count on both sides. "
-        f"{how_to_read(tests, _TOGETHER)} retention: lift divided by the lift at k0, "
-        f"where that one is above zero with p < {SURE}, with Fieller's interval; of the "
+        f"Over the n episodes that count on both sides. {read} retention: lift divided by the lift "
+        f"at k0, where that one is above zero with p < {SURE}, with Fieller's interval; of the "
         "retention_n episodes that count under no-history, k0 and the condition, which of cells "
         "that are not complete can be fewer than n. A system with retrieval is, without history, "
         f"the system without it.{power.note(one.pairs for one in found)}",
@@ -175,18 +181,16 @@ _CONTRASTS = {
 def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
     """Return effect sizes as a table of `_CONTRASTS`."""
     title, note = _CONTRASTS[name]
-    together = "the tests of a condition in one simulator" if name in WITHIN else _TOGETHER
-    found = [one for one in contrasts if one.table == name]
-    tests = [one.tested for one in found]
+    found, tests, read = _of_table(contrasts, name)
     asks = any(one.asks for one in found)
     rows = [
         (
             *(c.simulator, c.system, c.condition, *c.against),
             *([c.asks] if asks else []),
-            *(c.pairs.n, c.pairs.second, c.pairs.first, *test),
+            *test,
             *(cohens_h(c.pairs.second, c.pairs.first) if c.pairs.n else math.nan, c.complete),
         )
-        for c, test in zip(found, tested(tests), strict=True)
+        for c, test in zip(found, tests, strict=True)
     ]
     return Table.make(
         name,
@@ -195,21 +199,17 @@ def contrast_table(contrasts: Iterable[Contrast], name: str) -> Table:
         f"n:count rate:rate against_rate:rate difference:points {COLUMNS} cohens_h:ratio "
         "complete:flag",
         rows,
-        f"{note}Over the n episodes that count on both sides. {how_to_read(tests, together)}"
+        f"{note}Over the n episodes that count on both sides. {read}"
         f"{power.note(one.pairs for one in found)}",
     )
 
 
 def interaction_table(contrasts: Iterable[Contrast]) -> Table:
     """Return how the change from k0 differs between systems (see `interaction`)."""
-    found = [one for one in contrasts if one.table == "interaction"]
-    tests = [one.tested for one in found]
+    found, tests, _ = _of_table(contrasts, "interaction")
     rows = [
-        (
-            *(c.simulator, c.system, c.condition, c.against[0], c.pairs.n),
-            *(c.pairs.second, c.pairs.first, *test, c.complete),
-        )
-        for c, test in zip(found, tested(tests), strict=True)
+        (c.simulator, c.system, c.condition, c.against[0], *test, c.complete)
+        for c, test in zip(found, tests, strict=True)
     ]
     return Table.make(
         "interaction",
