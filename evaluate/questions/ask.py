@@ -174,7 +174,8 @@ def _name(config: AskConfig) -> str:
     name_system(name)
     if name != own and known_system(name) is not None:
         raise InvalidOptionError(
-            f"{config.model} is not the system {name}", "Give --system a name of your own."
+            f"{name} is a system that acts, or answers, otherwise than {config.model}",
+            "Give --system a name of your own.",
         )
     return name
 
