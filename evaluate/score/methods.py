@@ -56,6 +56,7 @@ def _part(score: Score, cube: Cube) -> dict[str, Any]:
     cells = [one for one in score.cells if one.simulator == cube.simulator and not one.part]
     return {
         "simulator": cube.simulator,
+        "asked": bool((cube.chance >= 0).any()),
         "systems": list(map(display_name, cube.systems)),
         "conditions": list(dict.fromkeys(one.condition for one in cells if one.n)),
         "rollouts": sum(sum(one.counts) for one in cells),

@@ -133,9 +133,13 @@ def test_figures_draw_the_chance_level(tmp_path: Path, asked: Score) -> None:
     assert levels(scored(tmp_path, cells(OUTCOMES)), "success") == [[]]
 
 
-def test_methods_tell_of_guessing_where_something_was_asked(tmp_path: Path, asked: Score) -> None:
-    assert "@hong2013" in methods(asked)[0] and "{hong2013," in methods(asked)[1]
-    assert "@hong2013" not in methods(scored(tmp_path, cells(OUTCOMES)))[0]
+def test_methods_tell_of_answers_where_something_was_asked(tmp_path: Path, asked: Score) -> None:
+    text, entries = methods(asked)
+    assert "We asked 3 systems (Questions-Recall-Full, my-memory, my-memory-blank) about" in text
+    assert "20 answers of 4 episodes" in text
+    assert "@hong2013" in text and "{hong2013," in entries
+    text, _ = methods(scored(tmp_path, cells(OUTCOMES)))
+    assert "We rolled out 3 systems" in text and "@hong2013" not in text and "answer" not in text
 
 
 def test_tables_are_those_of_the_golden_files(asked: Score) -> None:
