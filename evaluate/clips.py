@@ -1,10 +1,11 @@
-"""Clips of rollouts: what was in the history, what the robot sees, how it went, side by side."""
+"""Clips of rollouts: the lesson, what was given of the history, and how it went, side by side."""
 
 import textwrap
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
 from functools import wraps
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from robomme_interference_data.strip import session_colors
 from robomme_interference_data.subgoal import Subgoal
 
 _VIEW = 256  # side of a camera's picture
-_WIDTH = 4 * _VIEW  # history to the left, then front and wrist, then the facts
+_HEADS = ("lesson", "given", "front", "wrist")
+_WIDTH = (len(_HEADS) + 1) * _VIEW  # and the facts
 _HEAD = 24
 _HEIGHT = _VIEW + _HEAD
 _COLUMNS = 8
@@ -91,8 +93,8 @@ class Clip:
         names = (system, str(item.episode), f"condition {item.condition}")
         self._heading = [line for name in names for line in textwrap.wrap(name, _LETTERS)]
         self._goal = self._given = ""
-        self._history: NDArray[np.uint8] = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
-        self._images: Mapping[str, NDArray[np.uint8]] = {}
+        self._views: dict[str, NDArray[np.uint8]] = {}
+        self._lesson: Iterator[NDArray[np.uint8]] = iter(())
         self._subgoal: Subgoal | None = None
         self._steps = 0
         self._file = ExitStack()
@@ -107,8 +109,9 @@ class Clip:
         """Take what is known before the first step, and which frames of the buffer were given."""
         self._goal = info.goal
         self._given = f"history given: {len(given)} frames" if given else "no history"
-        self._history = history_picture(buffer, given)
-        self._images = first.images
+        self._views = {"given": history_picture(buffer, given)}
+        self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
+        self._show(first)
         partial = self._file.enter_context(atomic_path(self._path))
         self._encoder = VideoEncoder(partial, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
         self._encoder.add(self._picture(Status.ONGOING))
@@ -118,7 +121,8 @@ class Clip:
         """Take what came of a step, with the images of both cameras, and the subgoal of it."""
         if self._encoder is not None:
             self._steps += 1
-            self._images, self._subgoal = observation.images, subgoal
+            self._subgoal = subgoal
+            self._show(observation)
             self._encoder.add(self._picture(status))
 
     @_harmless
@@ -134,17 +138,23 @@ class Clip:
             self._encoder.close()
             self._file.close()
 
+    def _show(self, observation: Observation) -> None:
+        """Take what is seen, and the lesson's next frame, while there is one."""
+        self._views |= observation.images
+        for frame in islice(self._lesson, 1):
+            self._views["lesson"] = frame
+
     def _picture(self, status: Status, *, error: str | None = None) -> NDArray[np.uint8]:
-        """Return the clip's present picture, `(280, 1024, 3) uint8`."""
+        """Return the clip's present picture, `(280, 1280, 3) uint8`."""
         canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
-        canvas[_HEAD:, :_VIEW] = self._history
-        for place, name in enumerate(("front", "wrist"), 1):
-            if name in self._images:
-                view = self._images[name][:_VIEW, :_VIEW]
+        for place, name in enumerate(_HEADS):
+            if name in self._views:
+                view = self._views[name][:_VIEW, :_VIEW]
                 x = place * _VIEW
                 canvas[_HEAD : _HEAD + view.shape[0], x : x + view.shape[1]] = view
+        front = _HEADS.index("front") * _VIEW
         for y, x in self._subgoal.points if self._subgoal else ():
-            _cross(canvas[_HEAD:, _VIEW : 2 * _VIEW], y, x)
+            _cross(canvas[_HEAD:, front : front + _VIEW], y, x)
         lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
         subgoal = self._subgoal and self._subgoal.simple
         for head, text in (("subgoal:", subgoal), ("what broke:", error)):
@@ -152,7 +162,16 @@ class Clip:
                 lines += ["", head, *textwrap.wrap(text, _LETTERS)]
         # The last two lines always have their place, however long the words before them are.
         lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
-        return _lettered(canvas, (self._given, "front", "wrist"), lines, _COLORS[status])
+        heads = ["lesson" if "lesson" in self._views else "no lesson", self._given, *_HEADS[2:]]
+        return _lettered(canvas, heads, lines, _COLORS[status])
+
+
+def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
+    """Yield the front frames of a buffer's lesson, `(H, W, 3) uint8`, as they are wanted."""
+    lesson = [one for one in buffer.sessions if one.role == "lesson"]
+    indices = [index for one in lesson for index in range(one.start, one.stop)]
+    for chunk in buffer.stream(1, ("front",), indices):
+        yield chunk.frames["front"][0]
 
 
 def _cross(view: NDArray[np.uint8], y: int, x: int) -> None:
@@ -193,10 +212,10 @@ def _lettered(
     font = ImageFont.load_default(13)
     for place, head in enumerate(heads):
         draw.text((place * _VIEW + 4, 4), head, fill="#333333", font=font)
-    y = _HEAD + 4
+    y, left = _HEAD + 4, len(_HEADS) * _VIEW
     for line in lines[:-1]:
-        draw.text((3 * _VIEW + 10, y), line, fill="black", font=font)
+        draw.text((left + 10, y), line, fill="black", font=font)
         y += 17
-    draw.rectangle((3 * _VIEW + 8, y + 2, 4 * _VIEW - 8, y + 24), fill=color)
-    draw.text((3 * _VIEW + 14, y + 5), lines[-1], fill="white", font=font)
+    draw.rectangle((left + 8, y + 2, left + _VIEW - 8, y + 24), fill=color)
+    draw.text((left + 14, y + 5), lines[-1], fill="white", font=font)
     return np.asarray(image)

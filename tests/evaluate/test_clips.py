@@ -45,8 +45,8 @@ def frames(path: Path) -> list[np.ndarray]:
 
 def banner(picture: np.ndarray) -> list[float]:
     """Mean colour of the right part of the line that names the status."""
-    rows = [y for y in range(30, 275) if (picture[y, 990:1010].mean(axis=0) < 240).any()]
-    return picture[rows[4] : rows[-4], 990:1010].reshape(-1, 3).mean(axis=0).tolist()
+    rows = [y for y in range(30, 275) if (picture[y, 1246:1266].mean(axis=0) < 240).any()]
+    return picture[rows[4] : rows[-4], 1246:1266].reshape(-1, 3).mean(axis=0).tolist()
 
 
 def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
@@ -55,11 +55,16 @@ def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
     assert clip_name(K1) == "videos/MoveCube_test_0_k1.mp4"
     shown = frames(tmp_path / row.video)
     assert len(shown) == 1 + 40 + 10  # the first view, one a step, the end held
-    assert shown[0].shape == (280, 1024, 3)
+    assert shown[0].shape == (280, 1280, 3)
     assert banner(shown[0]) == pytest.approx([0x55] * 3, abs=12)
     assert banner(shown[-1]) == pytest.approx([0xD5, 0x5E, 0x00], abs=12)
     picture = history_picture(buffer, range(80))
-    assert np.abs(shown[0][24:, :256].astype(int) - picture).mean() < 10
+    assert np.abs(shown[0][24:, 256:512].astype(int) - picture).mean() < 10
+    # The lesson goes along, a frame a step: 48 frames, of which the clip has time for 41.
+    for step, image in enumerate(shown[:41]):
+        taught = buffer.frame(step)
+        seen = image[24 : 24 + len(taught), : taught.shape[1]]
+        assert np.abs(seen.astype(int) - taught).mean() < 10
     assert [path.name for path in (tmp_path / "videos").iterdir()] == ["MoveCube_test_0_k1.mp4"]
 
 
