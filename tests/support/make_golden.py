@@ -1,8 +1,10 @@
-"""Make the golden split anew: `python tests/support/make_golden.py tests/golden/split`."""
+"""Make the golden splits anew: `python tests/support/make_golden.py tests/golden`."""
 
 import shutil
 import sys
 from pathlib import Path
+
+from support.tabletop import make_tabletop
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
@@ -16,7 +18,7 @@ FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 
 
 def make(root: Path) -> None:
-    """Build the split."""
+    """Build the split of the source `sample`."""
     source = (SampleSource(size=32),)
     queries = list_episodes(source, families=FAMILIES, split="test")
     units = list_episodes(source, split="train", numbers=(0, 1))
@@ -28,6 +30,7 @@ def make(root: Path) -> None:
 
 
 if __name__ == "__main__":
-    golden = Path(sys.argv[1])
-    shutil.rmtree(golden, ignore_errors=True)  # a build goes on with what is there
-    make(golden)
+    for name, build in (("split", make), ("tabletop", make_tabletop)):
+        golden = Path(sys.argv[1]) / name
+        shutil.rmtree(golden, ignore_errors=True)  # a build goes on with what is there
+        build(golden)

@@ -1,0 +1,102 @@
+"""A split as of `tabletop`, made without it: its scenes, answers and evidence, other frames.
+
+Every pixel of a frame tells what it shows: red the frame's number in the lesson, green the number
+of the query, blue the part of the answer that the frame shows, from 1, or 0.
+"""
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
+from robomme_interference_data.build_dataset.manifests import write_manifests
+from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.questions import make_questions, write_questions
+from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evidence import spans_of_parts
+from robomme_interference_data.execution import Serial
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+from robomme_interference_data.simulators.tabletop.camera import SIZE
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
+from robomme_interference_data.simulators.tabletop.families import draw_episode
+from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.work_progress import WorkProgress
+
+TABLETOP = Path(__file__).parents[1] / "golden" / "tabletop"
+"""Two queries and a unit of each family, the queries with their questions; made by
+`support/make_golden.py`."""
+
+NUMBERS = (0, 2)
+"""Of each family's queries: an easy one and a hard one."""
+
+QUERIES = tuple(EpisodeId(family, "test", number) for family in FAMILIES for number in NUMBERS)
+CONDITIONS = ("no-history", "k0", "k1")
+
+LESSON, UNIT = 40, 249
+"""Frames of a lesson, and of an episode that yields a unit."""
+
+LIVE, NOBODY = 255, 254
+"""Red of a first live view; green of what is of no query."""
+
+
+def scene_of(episode: EpisodeId) -> tuple[Family, Any]:
+    """The scene of an episode, and its answer."""
+    seed = seed_of(episode)
+    scene = draw_episode(episode.family, seed, difficulty_of(seed))
+    return scene, scene.answers[turn_of(seed, len(scene.answers))]
+
+
+def shown(parts: int) -> list[tuple[int, ...]]:
+    """The parts of the answer that each frame of a lesson shows: each part on two frames of three.
+
+    The last ones show nothing.
+    """
+    return [(n // 3,) if n % 3 < 2 and n // 3 < parts else () for n in range(LESSON)]
+
+
+@dataclass
+class Drawn(Source):
+    """The queries, and a train episode of each family."""
+
+    provenance: dict[str, Any] = field(
+        default_factory=lambda: {"kind": "tabletop", "suite_version": SUITE_VERSION}
+    )
+
+    def episodes(self) -> list[SourceEpisode]:
+        train = [SourceEpisode(EpisodeId(family, "train", 0), NOBODY) for family in FAMILIES]
+        test = [SourceEpisode(one, number) for number, one in enumerate(QUERIES)]
+        return sorted([*train, *test], key=lambda one: one.id)
+
+    def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
+        scene, answer = scene_of(episode.id)
+        parts, seed = scene.parts(answer), seed_of(episode.id)
+        seen = shown(len(parts))
+        evidence = spans_of_parts(seen, parts)
+        told = scene.goals(), seed, difficulty_of(seed), "tabletop", True
+        return Recording(*told, self._frames(episode.key, seen), evidence)
+
+    def _frames(self, number: int, seen: Sequence[Sequence[int]]) -> Generator[Frame]:
+        for place in range(UNIT):
+            lesson = place < LESSON
+            part = 1 + seen[place][0] if lesson and seen[place] else 0
+            colour = (place if lesson else LIVE, number, part)
+            image = np.full((SIZE, SIZE, 3), colour, np.uint8)
+            yield Frame({"front": image}, np.zeros(8, np.float32), None, lesson)
+
+
+def make_tabletop(root: Path) -> None:
+    """Build the split, and its questions."""
+    source, quiet = (Drawn(),), WorkProgress(quiet=True)
+    for kind, split in (("demonstrations", "test"), ("distractors", "train")):
+        plan = BuildPlan(kind, source, list_episodes(source, split=split))
+        build_dataset(plan, root / kind, Serial(), quiet)
+    for _ in write_manifests(plan_manifests(in_folder(root), CONDITIONS), root):
+        pass
+    write_questions([*make_questions(load_split(root))], root)
