@@ -33,7 +33,7 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
     SHIFTED,
 )
-from robomme_interference_data.errors import visible
+from robomme_interference_data.errors import MissingFileError, visible
 from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
@@ -194,6 +194,11 @@ def questions(
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.work_progress import WorkProgress
 
+    if not split.is_dir():
+        raise MissingFileError(
+            f"there is no folder {split}",
+            "A split on the Hub is fetched first: robomme-interference fetch NAME --to FOLDER",
+        )
     with stoppable("The split is as it was"), WorkProgress(unit="questions") as progress:
         opened = load_split(split)
         progress.start("Making questions", len(opened.episode_ids))

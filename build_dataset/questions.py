@@ -11,14 +11,14 @@ import pyarrow.parquet as pq
 from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
 from robomme_interference_data.encode import png
 from robomme_interference_data.errors import BuildError
-from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.parquet import writing
+from robomme_interference_data.query import Query
 from robomme_interference_data.questions import Question
 from robomme_interference_data.rows import arrow_schema, to_table
-from robomme_interference_data.simulators.tabletop.camera import to_pixels
+from robomme_interference_data.simulators.tabletop.camera import SIZE, to_pixels
 from robomme_interference_data.simulators.tabletop.episodes import turn_of
-from robomme_interference_data.simulators.tabletop.families import draw_episode
+from robomme_interference_data.simulators.tabletop.families import recorded_scene
 from robomme_interference_data.split import Split
 from robomme_interference_data.subgoal import Pixel
 
@@ -33,7 +33,8 @@ def make_questions(split: Split) -> Iterator[Question]:
     """Make the questions of a split, in canonical order; the same split gives the same bytes.
 
     Raises:
-        BuildError: An episode is not of `tabletop`: its possible answers are not known.
+        BuildError: An episode is not of `tabletop`, so that its possible answers are not known; or
+            it was not recorded in the size that `tabletop` draws.
         MissingExtraError: Pillow is not installed.
         MissingFileError, FormatError, TruncatedVideoError: A first live view cannot be read.
     """
@@ -41,6 +42,12 @@ def make_questions(split: Split) -> Iterator[Question]:
     picture = load_extra(module, "picture", "build questions", "retrieval")
     for question, marks in planned_questions(split):
         view = split.query(question.episode_id).frame()
+        if view.shape != (SIZE, SIZE, 3):
+            raise BuildError(
+                f"the first live view of {question.episode_id} has {view.shape[1]}×{view.shape[0]} "
+                f"pixels; where things are is known in {SIZE}×{SIZE}",
+                "Build the demonstrations from --source tabletop.",
+            )
         yield dataclasses.replace(question, picture=png(picture(view, marks)))
 
 
@@ -52,14 +59,7 @@ def planned_questions(split: Split) -> Iterator[tuple[Question, Marks]]:
     """
     revision = split.datasets[DEMONSTRATIONS].identity.revision
     for episode in sorted(split.episode_ids):
-        query = split.query(episode)
-        if query.simulator != "tabletop" or query.seed is None or query.difficulty is None:
-            raise BuildError(
-                f"{episode} is of the simulator {query.simulator!r}, of whose episodes the "
-                "possible answers are not known",
-                "Only splits whose demonstrations are of tabletop have questions.",
-            )
-        yield _planned(episode, query.seed, query.difficulty, revision)
+        yield _planned(split.query(episode), revision)
 
 
 def write_questions(questions: Sequence[Question], folder: Path) -> Path:
@@ -75,10 +75,14 @@ def write_questions(questions: Sequence[Question], folder: Path) -> Path:
     return out
 
 
-def _planned(
-    episode: EpisodeId, seed: int, difficulty: str, revision: str
-) -> tuple[Question, Marks]:
-    scene, name = draw_episode(episode.family, seed, difficulty), str(episode)
+def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
+    scene, seed, name = recorded_scene(query), query.seed, str(query.episode_id)
+    if scene is None or seed is None:
+        raise BuildError(
+            f"{name} is of the simulator {query.simulator!r}, of whose episodes the possible "
+            "answers are not known",
+            "Only splits whose demonstrations are of tabletop have questions.",
+        )
     numbers: dict[Any, int] = {}  # choice to the first answer that stands for it
     for number, answer in enumerate(scene.answers):
         numbers.setdefault(scene.choice(answer), number)
@@ -89,7 +93,7 @@ def _planned(
     chosen = sorted([right, *others], key=lambda one: _lot(name, "order", one))
     options = [scene.option(one) for one in chosen]
     question = Question(
-        episode,
+        query.episode_id,
         revision,
         scene.question(),
         tuple(one.words for one in options),

@@ -7,7 +7,6 @@ and follows from manifests and records alone; nothing is decoded, nor simulated.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.conditions import NO_HISTORY, in_order
@@ -20,8 +19,7 @@ from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, choose, measure
 from robomme_interference_data.sampling import MEMORIES, check_memory, evidence_kept
 from robomme_interference_data.shifts import NO_SHIFT, parse_shift
-from robomme_interference_data.simulators.tabletop.families import draw_episode
-from robomme_interference_data.simulators.tabletop.family import Family
+from robomme_interference_data.simulators.tabletop.families import recorded_scene
 from robomme_interference_data.split import Split
 from robomme_interference_data.tables import Table
 from robomme_interference_data.views import live_embedding
@@ -120,18 +118,12 @@ def chance(query: Query, known: dict[int, str]) -> float | None:
     Returns:
         The chance; None where the answers of the query's simulator cannot be told.
     """
-    spans, difficulty = query.record.evidence, query.difficulty
-    if query.simulator != "tabletop" or None in (spans, difficulty, query.seed):
+    spans, scene = query.record.evidence, recorded_scene(query)
+    if spans is None or scene is None:
         return None
-    scene = _scene(query.episode_id.family, int(query.seed or 0), str(difficulty))
-    [right] = scene.agreeing({span.part: span.text for span in spans or ()})
+    [right] = scene.agreeing({span.part: span.text for span in spans})
     left = scene.agreeing(known)
     return (right in left) / len(left)
-
-
-@lru_cache(256)
-def _scene(family: str, seed: int, difficulty: str) -> Family:
-    return draw_episode(family, seed, difficulty)
 
 
 def _given(split: Split, buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:

@@ -190,7 +190,7 @@ def run_items[C: RunConfig | AskConfig](
                 listener.row(row)
             errors = 0 if is_done(row) else errors + 1
             if errors >= run.config.max_errors:
-                stopped = f"{errors} rollouts in a row broke; the last: {row.error}"
+                stopped = f"{errors} in a row broke; the last: {row.error}"
                 break
         else:
             stopped = None

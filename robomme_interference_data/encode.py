@@ -1,4 +1,4 @@
-"""Encode frames with PyAV: as video, for datasets and clips to look at, and as PNG."""
+"""Encode frames with PyAV: as video, for datasets and clips, and as PNG; decode single images."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import KEY_FRAMES
 from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
+from robomme_interference_data.video import MOST_PIXELS
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 
 @dataclass(frozen=True)
@@ -174,16 +177,42 @@ def png(image: NDArray[np.uint8]) -> bytes:
     return b"".join(map(bytes, packets))
 
 
-def read_png(data: bytes) -> NDArray[np.uint8]:
-    """Decode what `png` encoded, `(H, W, 3) uint8` RGB.
+def is_png(data: bytes) -> bool:
+    """Tell whether an encoded image is a PNG.
 
     Raises:
-        FormatError: It is no such image.
+        FormatError: It is neither PNG nor JPEG.
     """
-    codec = av.CodecContext.create("png", "r")
+    if data.startswith(_PNG):
+        return True
+    if data.startswith(_JPEG):
+        return False
+    raise FormatError(
+        f"an image starts with the bytes {data[:8].hex(' ') or '(none)'}; expected PNG or JPEG",
+        "Store images as PNG: it is exact.",
+    )
+
+
+def decode_image(data: bytes) -> NDArray[np.uint8]:
+    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB; transparency is left out.
+
+    Raises:
+        FormatError: It is neither, damaged, or has more than 8 bits a channel.
+    """
+    codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
+    codec.thread_count = 1
+    # Without these, a PNG with a broken checksum is decoded as if nothing were wrong.
+    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MOST_PIXELS)}
     try:
-        frames: list[Any] = [*codec.decode(av.Packet(data)), *codec.decode(None)]
-        [image] = (frame.to_ndarray(format="rgb24") for frame in frames)
+        frames = codec.decode(av.Packet(data)) + codec.decode(None)
     except (av.error.FFmpegError, ValueError) as error:
-        raise FormatError(f"a picture is damaged: {error}") from None
-    return np.asarray(image, np.uint8)
+        raise FormatError(f"an image is damaged: {error}") from None
+    if len(frames) != 1:
+        raise FormatError(f"an image is damaged: it decodes to {len(frames)} frames")
+    depth = max(component.bits for component in frames[0].format.components)
+    if depth > 8:
+        raise FormatError(
+            f"an image has {depth} bits a channel ({frames[0].format.name}); expected 8",
+            "Convert the images to 8 bits a channel.",
+        )
+    return frames[0].to_ndarray(format="rgb24")

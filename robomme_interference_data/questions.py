@@ -1,14 +1,16 @@
 """Questions about the past that a split may have: one for each query, with a marked picture."""
 
 import string
+from collections.abc import Iterable
 from dataclasses import dataclass
+from hashlib import sha256
 
 from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.files import LocalFiles, canonical_json
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.parquet import open_parquet, read_table
-from robomme_interference_data.rows import from_table
+from robomme_interference_data.rows import from_table, to_dict
 from robomme_interference_data.split import Split
 
 LETTERS = string.ascii_uppercase[:8]
@@ -42,8 +44,8 @@ class Question:
         count = len(self.options)
         if not 2 <= count <= len(LETTERS) or len(set(self.answers)) != count:
             raise FormatError(f"{count} options of {len(set(self.answers))} answers")
-        if not 0 <= self.right < count:
-            raise FormatError(f"right option {self.right} of {count}")
+        if not 0 <= self.right < count or min(self.answers) < 0:
+            raise FormatError(f"right option {self.right} of {count}, answers {self.answers}")
 
     @property
     def letters(self) -> str:
@@ -62,6 +64,15 @@ class Question:
     def chance(self) -> float:
         """Share of right answers that drawing at random has."""
         return 1 / len(self.options)
+
+
+def digest_questions(questions: Iterable[Question]) -> str:
+    """Return the SHA-256 over all that is asked, and that is right: the pictures too."""
+    digest = sha256()
+    for one in sorted(questions, key=lambda one: one.episode_id):
+        told = to_dict(one) | {"picture": sha256(one.picture).hexdigest()}
+        digest.update(canonical_json(told).encode(errors="backslashreplace"))
+    return digest.hexdigest()
 
 
 def read_questions(split: Split) -> dict[EpisodeId, Question]:

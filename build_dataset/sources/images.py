@@ -1,4 +1,4 @@
-"""Images of recordings: which kept every pixel, and how single ones are decoded.
+"""Images of recordings: which kept every pixel.
 
 A recording counts as exact only where that is certain: PNG images, or video of RGB pixels with a
 codec, or options, that lose nothing. Converting to YUV alone already changes 8-bit RGB values.
@@ -8,12 +8,12 @@ from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 
+from robomme_interference_data.encode import decode_image, is_png
 from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
-from robomme_interference_data.video import MOST_PIXELS, open_video
+from robomme_interference_data.video import open_video
 
 _RGB_FORMATS = (
     *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),
@@ -21,8 +21,6 @@ _RGB_FORMATS = (
 )
 _LOSSLESS_CODECS = ("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle")
 _TRUE = ("1", "true", "yes")
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8\xff"
 
 
 def probe_video(path: Path) -> tuple[float, bool]:
@@ -81,22 +79,6 @@ def _options(extra: dict[str, Any]) -> dict[str, str]:
     return found
 
 
-def is_png(data: bytes) -> bool:
-    """Tell whether an encoded image is a PNG.
-
-    Raises:
-        FormatError: It is neither PNG nor JPEG.
-    """
-    if data.startswith(_PNG):
-        return True
-    if data.startswith(_JPEG):
-        return False
-    raise FormatError(
-        f"an image starts with the bytes {data[:8].hex(' ') or '(none)'}; expected PNG or JPEG",
-        "Store images as PNG: it is exact.",
-    )
-
-
 def decode_images(
     encoded: Iterable[tuple[object, bytes]], exact: bool
 ) -> Generator[NDArray[np.uint8]]:
@@ -120,28 +102,3 @@ def decode_images(
         except FormatError as error:
             raise error.about(where) from None
         yield image
-
-
-def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB; transparency is left out.
-
-    Raises:
-        FormatError: It is neither, damaged, or has more than 8 bits a channel.
-    """
-    codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
-    codec.thread_count = 1
-    # Without these, a PNG with a broken checksum is decoded as if nothing were wrong.
-    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MOST_PIXELS)}
-    try:
-        frames = codec.decode(av.Packet(data)) + codec.decode(None)
-    except (av.error.FFmpegError, ValueError) as error:
-        raise FormatError(f"an image is damaged: {error}") from None
-    if len(frames) != 1:
-        raise FormatError(f"an image is damaged: it decodes to {len(frames)} frames")
-    depth = max(component.bits for component in frames[0].format.components)
-    if depth > 8:
-        raise FormatError(
-            f"an image has {depth} bits a channel ({frames[0].format.name}); expected 8",
-            "Convert the images to 8 bits a channel.",
-        )
-    return frames[0].to_ndarray(format="rgb24")

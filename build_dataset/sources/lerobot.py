@@ -26,16 +26,13 @@ from robomme_interference_data.build_dataset.sources.families import (
     ids_by_columns,
     ids_by_file,
 )
-from robomme_interference_data.build_dataset.sources.images import (
-    decode_images,
-    info_is_exact,
-    is_png,
-)
+from robomme_interference_data.build_dataset.sources.images import decode_images, info_is_exact
 from robomme_interference_data.build_dataset.sources.robomme_families import (
     BLOCKS,
     ROBOMME,
     families_for_goal,
 )
+from robomme_interference_data.encode import is_png
 from robomme_interference_data.errors import FormatError, SourceError
 from robomme_interference_data.evidence import spans_of_texts
 from robomme_interference_data.hub import HubFiles, locate

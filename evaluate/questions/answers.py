@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
-from robomme_interference_data.encode import read_png
+from robomme_interference_data.encode import decode_image
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.models.model import ChatModel, Video
 from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.questions.prompt import load_prompt, read_letter
 from robomme_interference_data.query import Query
 from robomme_interference_data.questions import Question
+from robomme_interference_data.simulators.tabletop.families import recorded_scene
 
 CONTROLS = ("none", "blank", "text")
 """What is kept from a model: nothing; what the frames of the history show; all images."""
@@ -100,11 +102,17 @@ class Recaller(Answerer):
     """`recall`: the ideal observer. It draws from the options that agree with what frames show."""
 
     def answer(self, asked: Asked) -> Answered:
-        """Draw from the options that cannot be ruled out; from all, if all can be."""
-        from robomme_interference_data.simulators.tabletop.families import draw_episode
+        """Draw from the options that cannot be ruled out; from all, if all can be.
 
-        query, question = asked.query, asked.question
-        scene = draw_episode(query.episode_id.family, int(query.seed or 0), str(query.difficulty))
+        Raises:
+            FormatError: The question's options are not answers of `tabletop`.
+        """
+        question, scene = asked.question, recorded_scene(asked.query)
+        if scene is None or max(question.answers) >= len(scene.answers):
+            raise FormatError(
+                f"the options of {question.episode_id} are no answers of tabletop's",
+                "recall answers questions that were made of tabletop's scenes alone.",
+            )
         left = {scene.choice(answer) for answer in scene.agreeing(asked.known or {})}
         choices = [scene.choice(scene.answers[number]) for number in question.answers]
         fits = [
@@ -131,10 +139,18 @@ class ModelAnswerer(Answerer):
         self._prompt, self._sha256 = load_prompt(prompt)
 
     def answer(self, asked: Asked) -> Answered:
-        """Ask the model."""
+        """Ask the model.
+
+        Raises:
+            FormatError: The question's picture is damaged.
+            ModelError: See `ChatModel.reply`.
+        """
         views: dict[str, list[Any]] = {"<history>": [], "<picture>": []}
         if self._control != "text":
-            views["<picture>"] = [read_png(asked.question.picture)]
+            try:
+                views["<picture>"] = [decode_image(asked.question.picture)]
+            except FormatError as error:
+                raise error.about(f"the question of {asked.question.episode_id}") from None
             frames = asked.frames()
             if self._control == "blank":
                 frames = np.full_like(frames, 128)

@@ -10,7 +10,7 @@ import numpy as np
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import FRONT, PROTOCOL_VERSION
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.evaluate.config import AskConfig, Run, unusual_retrieval
 from robomme_interference_data.evaluate.log import open_log
 from robomme_interference_data.evaluate.models.registry import (
@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.models.registry import (
     parse_model,
     pin_model,
 )
-from robomme_interference_data.evaluate.plan import WorkItem, plan_work
+from robomme_interference_data.evaluate.plan import Plan, WorkItem, plan_work
 from robomme_interference_data.evaluate.questions.answers import (
     CONTROLS,
     Answerer,
@@ -38,16 +38,16 @@ from robomme_interference_data.evidence import known_parts
 from robomme_interference_data.execution import Executor, Processes, Worker, end_if_starting
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.loading import load_split
-from robomme_interference_data.questions import Question, read_questions
+from robomme_interference_data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.sampling import (
     MEMORIES,
-    check_memory,
     evidence_kept,
     lesson_frames,
     lesson_share,
 )
+from robomme_interference_data.simulators.tabletop.families import recorded_scene
 from robomme_interference_data.split import Split
 
 if TYPE_CHECKING:
@@ -84,9 +84,9 @@ def run_examination(
         MissingExtraError, HubError, FormatError: See `make_model` and `read_questions`.
     """
     end_if_starting()
-    split, folder = load_split(config.split), Path(config.out)
-    read_questions(split)  # is refused with what makes them
     _check_settings(config)
+    split, folder = load_split(config.split), Path(config.out)
+    questions = read_questions(split)
     config = dataclasses.replace(
         config,
         model=config.model if config.model in _OWN else pin_model(config.model),
@@ -114,8 +114,11 @@ def run_examination(
                 f"a retrieval step has nothing to retrieve from under {NO_HISTORY}",
                 f"Leave {NO_HISTORY} out of --conditions.",
             )
+    if config.model == "recall":
+        _check_known(split, plan)
     identity = _identity(config, name, split, said) | {
-        "retrieval_index": retrieval_index(config, split, plan)
+        "questions": digest_questions(questions.values()),
+        "retrieval_index": retrieval_index(config, split, plan),
     }
     with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
         run = Run(config, name, log.header.split, split.revision)
@@ -126,7 +129,8 @@ def run_examination(
 
 def _check_settings(config: AskConfig) -> None:
     """Check the settings by themselves and against each other; see `run_examination`."""
-    check_memory(config.sampling, "ask")
+    if config.sampling not in MEMORIES:
+        raise InvalidOptionError.one_of("--sampling", config.sampling, MEMORIES)
     Rule.parse(config.retrieval_rule)
     unusual_retrieval(config)
     if config.frames < 2:
@@ -145,8 +149,24 @@ def _check_settings(config: AskConfig) -> None:
                 raise InvalidOptionError(
                     f"{option} says nothing of {config.model}", "It is for models: leave it out."
                 )
+    elif ":" not in config.model:
+        raise UnknownNameError(
+            f"there is no model {config.model!r}; expected recall, guess, openai:URL#MODEL, "
+            "transformers:ID or transformers:FOLDER",
+            nearest(config.model, _OWN, more=""),
+        )
     else:
         parse_model(config.model)
+
+
+def _check_known(split: Split, plan: Plan) -> None:
+    """Refuse queries whose possible answers the ideal observer does not know."""
+    for episode in {item.episode for item in plan.items()}:
+        if recorded_scene(split.query(episode)) is None:
+            raise InvalidOptionError(
+                f"recall knows what may have been the answer in tabletop alone, not in {episode}",
+                "Ask a model, or guess.",
+            )
 
 
 def _applies(config: AskConfig, condition: str) -> bool:

@@ -11,7 +11,16 @@ from robomme_interference_data.questions import Question
 PROMPTS = ("choice",)
 """The prompt that comes with the package."""
 
-_SAID = re.compile(r"\b(?:answer|option|letter)\b\W*(?:is\b\W*)?([A-Z])\b", re.IGNORECASE)
+_ONE = r"\b(?!\s*(?:[,/]|or\b|and\b)\s*[A-H]\b)"
+"""After a letter: it is not the first of several."""
+
+_LETTER = rf"([A-H]|[a-h](?![ '’]\w)){_ONE}"
+"""An option's letter, and no article."""
+
+_ANSWER = re.compile(rf"(?i:\banswer\b\W*(?:(?:is|option|letter)\b\W*)*){_LETTER}")
+_FIRST = re.compile(rf"^[^\w\n]*([A-H]){_ONE}(?=[*_`'\"]*(?:[.:,)\]]|\s+[-–—]|\s*$))", re.MULTILINE)
+_OPTION = re.compile(rf"(?i:\b(?:option|letter)\b\W*(?:is\b\W*)?){_LETTER}")
+_ALONE = re.compile(r"\b([B-H]|A(?!['’ ](?!or\b|and\b|is\b)[a-z]))\b")
 
 
 @dataclass(frozen=True)
@@ -51,21 +60,22 @@ class QuestionPrompt:
 def read_letter(text: str, letters: str) -> str | None:
     """Return the option that an answer names, or None.
 
-    That is the answer itself, if it is a letter alone, whatever stands around it; else the last
-    letter after the word answer, option or letter; else the only option's letter that stands
-    alone, in capitals, in a text without another.
+    That is, whatever stands around it: the letter that is all of the answer; else the last one
+    after the word answer; else the one with which a line begins, as in "B. Because …"; else the one
+    after the words option or letter; else the one that stands alone, in capitals. Where one of
+    these finds several letters, or one of no option, none was named. What a model wrote while it
+    thought, before `</think>`, is left aside.
 
     Args:
         text: What the model wrote.
         letters: Letters of the options, such as `ABCD`.
     """
-    bare = re.sub(r"[^A-Za-z]", "", text)
-    said = [letter.upper() for letter in _SAID.findall(text)]
-    alone = set(re.findall(rf"\b([{letters}])\b(?!['’ ][a-z])", text))
-    for found in ([bare.upper()] if len(bare) == 1 else [], said[-1:], [*alone][:2]):
-        if len(found) == 1:
-            return found[0] if found[0] in letters else None
-    return None
+    said = text.rpartition("</think>")[2]
+    bare = re.sub(r"[^A-Za-z]", "", said)
+    ways = [[bare] if len(bare) == 1 else [], _ANSWER.findall(said)[-1:]]
+    ways += [pattern.findall(said) for pattern in (_FIRST, _OPTION, _ALONE)]
+    named = {letter.upper() for letter in next(filter(None, ways), ())}
+    return named.pop() if len(named) == 1 and named <= {*letters} else None
 
 
 def load_prompt(name: str) -> tuple[QuestionPrompt, str]:

@@ -8,13 +8,8 @@ import pytest
 from PIL import Image
 from support.recordings import encode_image, make_episode, write_video
 
-from robomme_interference_data.build_dataset.sources.images import (
-    decode_image,
-    info_is_exact,
-    is_png,
-    probe_video,
-)
-from robomme_interference_data.encode import CODECS
+from robomme_interference_data.build_dataset.sources.images import info_is_exact, probe_video
+from robomme_interference_data.encode import CODECS, decode_image, is_png
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.video import iter_frames
 

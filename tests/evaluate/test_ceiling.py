@@ -131,7 +131,8 @@ def test_it_needs_neither_simulator_nor_weights() -> None:
         "import sys\n"
         "for name in ('sapien', 'mani_skill', 'torch', 'gymnasium', 'transformers'):\n"
         "    sys.modules[name] = None\n"
-        "from robomme_interference_data.evaluate.ceiling import draw_episode\n"
+        "import robomme_interference_data.evaluate.ceiling\n"
+        "from robomme_interference_data.simulators.tabletop.families import draw_episode\n"
         "print(len(draw_episode('VideoUnmaskSwap', 3, 'hard').agreeing({})))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)

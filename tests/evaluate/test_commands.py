@@ -83,7 +83,7 @@ def test_what_broke_is_told_with_the_command_to_go_on(
     done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'} --max-errors 1")
     assert done.exit_code == 1
     assert "1 rollouts broke (see" in done.stderr
-    assert "Stopped: 1 rollouts in a row broke" in done.stderr
+    assert "Stopped: 1 in a row broke" in done.stderr
     assert done.stderr.rstrip().splitlines()[-1].startswith("robomme-interference")
 
 

@@ -191,7 +191,7 @@ def test_a_run_in_which_everything_breaks_stops(tmp_path: Path, trouble: Path) -
         (trouble / f"{family}-0").write_text("raise")
     result = run(tmp_path / "run", conditions=("no-history",), max_errors=1)
     assert result.stopped is not None
-    assert result.stopped.startswith("1 rollouts in a row broke; the last: SimulatorCrashError")
+    assert result.stopped.startswith("1 in a row broke; the last: SimulatorCrashError")
     assert (len(result.rows), result.planned) == (1, 2)
 
 

@@ -192,7 +192,7 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None]]] = {
 def read(kind: str, path: Path) -> object:
     """Read a file as what it is."""
     from robomme_interference_data.arrays import read_array
-    from robomme_interference_data.build_dataset.sources.images import decode_image
+    from robomme_interference_data.encode import decode_image
     from robomme_interference_data.evaluate.log import whole_lines
     from robomme_interference_data.files import read_json, read_sums
     from robomme_interference_data.parquet import RowSpan

@@ -22,10 +22,10 @@ from support.splits import GOLDEN
 
 from robomme_interference_data import load_split
 from robomme_interference_data.arrays import read_array
-from robomme_interference_data.build_dataset.sources.images import decode_image
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.embeddings import EmbeddingIndex
+from robomme_interference_data.encode import decode_image
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.log import read_run
 from robomme_interference_data.evaluate.score.sources import read_part

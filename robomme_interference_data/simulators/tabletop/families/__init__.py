@@ -1,9 +1,13 @@
 """The nine task families: a file each."""
 
+from functools import lru_cache
+
 from numpy.random import RandomState
 
+from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.query import Query
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
 from robomme_interference_data.simulators.tabletop.families.insert_peg import InsertPeg
 from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
@@ -33,6 +37,9 @@ _FAMILIES: dict[str, type[Family]] = {
     )
 }
 
+_SEEDS = 1 << 32
+"""Seeds that `RandomState` takes."""
+
 
 def draw_episode(family: str, seed: int, difficulty: str) -> Family:
     """Return the episode of a seed, its hidden answer apart; nothing is simulated.
@@ -41,6 +48,24 @@ def draw_episode(family: str, seed: int, difficulty: str) -> Family:
         UnknownNameError: There is no such family.
     """
     return family_class(family)(difficulty, RandomState(seed))
+
+
+def recorded_scene(query: Query) -> Family | None:
+    """Return the scene of a recorded query, to be looked at and not played.
+
+    Returns:
+        The scene; None if the query is not known to be of `tabletop`.
+    """
+    family, seed, difficulty = query.episode_id.family, query.seed, query.difficulty
+    known = query.simulator == "tabletop" and family in _FAMILIES and difficulty in DIFFICULTIES
+    if not known or seed is None or not 0 <= seed < _SEEDS:
+        return None
+    return _drawn(family, seed, str(difficulty))
+
+
+@lru_cache(256)
+def _drawn(family: str, seed: int, difficulty: str) -> Family:
+    return draw_episode(family, seed, difficulty)
 
 
 def family_class(name: str) -> type[Family]:
