@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from support.recordings import encode_image
 from support.splits import GOLDEN
+from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_split
 from robomme_interference_data.arrays import read_array
@@ -30,6 +31,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.log import read_run
 from robomme_interference_data.evaluate.score.sources import read_part
 from robomme_interference_data.files import LocalFiles, read_sums
+from robomme_interference_data.questions import digest_questions, read_questions
 from robomme_interference_data.video import iter_frames
 
 _VIDEO = "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
@@ -73,6 +75,7 @@ def places(root: Path) -> Path:
     shutil.copytree(GOLDEN, root / "split")
     shutil.copytree(GOLDEN.parent / "index/golden/index", root / "split/distractors/index")
     shutil.copytree(GOLDEN.parent / "run", root / "run")
+    shutil.copytree(TABLETOP, root / "asked")
     (root / "single").mkdir()
     np.save(root / "single/a.npy", np.ones((3, 8), np.float16))
     image = encode_image(np.arange(8 * 6 * 3, dtype=np.uint8).reshape(8, 6, 3), "png")
@@ -159,6 +162,16 @@ def _image(root: Path) -> None:
     assert image.ndim == 3 and image.shape[2] == 3
 
 
+def _questions(root: Path) -> None:
+    split = load_split(root / "asked")
+    questions = read_questions(split)
+    assert tuple(sorted(questions)) == split.episode_ids
+    for one in questions.values():
+        assert one.letters[one.right] in one.letters and one.chance <= 0.5
+    assert len(digest_questions(questions.values())) == 64
+    decode_image(next(iter(questions.values())).picture)
+
+
 def rewritten(data: bytes) -> list[bytes]:
     """Return a parquet file as others would write it: what is compressed hides all behind it."""
     table = pq.read_table(pa.BufferReader(data))
@@ -185,6 +198,7 @@ TARGETS = {
     "video": Target(f"split/{_VIDEO}", _video),
     "array": Target("single/a.npy", _array),
     "image": Target("single/a.png", _image),
+    "questions": Target("asked/questions.parquet", _questions, rewritten),
     "sums": Target("single/SHA256SUMS", lambda root: read_sums(root / "single/SHA256SUMS")),
     "index": Target("split/distractors/index/thumbnail/index.json", _index),
     "run": Target(f"run/{RUN_HEADER}", _run),

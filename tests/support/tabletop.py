@@ -4,6 +4,7 @@ Every pixel of a frame tells what it shows: red the frame's number in the lesson
 of the query, blue the part of the answer that the frame shows, from 1, or 0.
 """
 
+import shutil
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,6 +45,11 @@ LESSON, UNIT = 40, 249
 
 LIVE, NOBODY = 255, 254
 """Red of a first live view; green of what is of no query."""
+
+
+def copy_tabletop(folder: Path) -> Path:
+    """Copy the split, to be changed."""
+    return Path(shutil.copytree(TABLETOP, folder))
 
 
 def scene_of(episode: EpisodeId) -> tuple[Family, Any]:

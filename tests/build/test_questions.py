@@ -1,0 +1,429 @@
+"""Questions about the past: fair ones, the same ones every time, with marks where things are."""
+
+import math
+import os
+import statistics
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.machine import full_disk
+from support.splits import GOLDEN
+from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
+
+from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset import questions as module
+from robomme_interference_data.build_dataset.questions import (
+    make_questions,
+    picture,
+    write_questions,
+)
+from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES, QUESTIONS_PATH
+from robomme_interference_data.encode import decode_image
+from robomme_interference_data.errors import BuildError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.simulators.tabletop.camera import SIZE
+from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
+
+GREY = np.full((SIZE, SIZE, 3), 128, np.uint8)
+EPISODES = [
+    EpisodeId(family, split, number)
+    for family in FAMILIES
+    for split in ("val", "test")
+    for number in range(50)
+]
+MANY = ("InsertPeg", "PatternLock", "RouteStick")
+"""Families of whose possible answers some are options; of the others all are."""
+
+
+def split_of(*episodes: EpisodeId, view: Any = GREY, **changes: Any) -> Any:
+    """What is asked of a split, with episodes of the suite that nobody has recorded."""
+
+    def query(episode: EpisodeId) -> Any:
+        seed = seed_of(episode)
+        known = {"simulator": "tabletop", "seed": seed, "difficulty": difficulty_of(seed)}
+        told = known | {"episode_id": episode, "frame": lambda: view} | changes
+        return SimpleNamespace(**told)
+
+    demonstrations = SimpleNamespace(identity=SimpleNamespace(revision="r"))
+    datasets = {DEMONSTRATIONS: demonstrations}
+    return SimpleNamespace(episode_ids=episodes, query=query, datasets=datasets)
+
+
+@dataclass(frozen=True)
+class Made:
+    """A question, and what was marked in its view."""
+
+    question: Question
+    marks: tuple[tuple[tuple[int, int], ...], ...]
+
+
+def make(*episodes: EpisodeId) -> Iterator[Made]:
+    """Make questions without drawing their pictures, which takes most of the time."""
+    marked: list[Any] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "picture", lambda view, marks: (marked.append(marks), view)[1])
+        patch.setattr(module, "png", lambda image: b"")
+        for question in make_questions(split_of(*episodes)):
+            yield Made(question, tuple(marked.pop()))
+
+
+@pytest.fixture(scope="module")
+def made() -> list[Made]:
+    return list(make(*EPISODES))
+
+
+def of(made: Iterable[Made], family: str) -> list[Made]:
+    return [one for one in made if one.question.episode_id.family == family]
+
+
+# --- what is asked -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_right_option_is_the_scenes_answer_and_there_once(
+    made: list[Made], family: str
+) -> None:
+    for one in of(made, family):
+        question = one.question
+        scene, answer = scene_of(question.episode_id)
+        choices = [scene.choice(scene.answers[number]) for number in question.answers]
+        assert 3 <= len(set(choices)) == len(choices) <= 5
+        assert choices[question.right] == scene.choice(answer)
+        assert choices.count(scene.choice(answer)) == 1
+        told = list(zip(question.options, one.marks, strict=True))
+        assert len(set(told)) == len(told)  # whoever looks and reads can tell them apart
+        assert question.text == scene.question() and question.revision == "r"
+        possible = {scene.choice(each) for each in scene.answers}
+        assert len(choices) == (len(possible) if len(possible) <= 5 else 4)
+        assert question.chance == 1 / len(choices)
+        assert question.letters == "ABCDE"[: len(choices)]
+
+
+def test_marks_and_their_letters_lie_inside_the_view_and_apart(made: list[Made]) -> None:
+    for one in made:
+        for y, x in (point for option in one.marks for point in option):
+            assert 14 + 7 <= y < SIZE - 7 and 7 <= x < SIZE - 7  # letters are circles of 6.3
+        if max(map(len, one.marks)) == 1:
+            for [first], [second] in combinations(one.marks, 2):
+                assert math.dist(first, second) > 2 * 6.3 + 1
+
+
+# --- nothing gives the answer away -------------------------------------------------------------
+
+
+def excess(hits: Iterable[tuple[bool, float]]) -> float:
+    """Return how many standard deviations above chance hits are: each with its chance."""
+    found = list(hits)
+    return sum(hit - chance for hit, chance in found) / math.sqrt(
+        sum(chance * (1 - chance) for _, chance in found)
+    )
+
+
+def length(option: Any) -> float:
+    return sum(math.dist(*pair) for pair in pairwise(option))
+
+
+def middle(one: Made, number: int) -> float:
+    """How far an option's points are from the middle of all options'."""
+    if not one.marks[number]:
+        return 0
+    everywhere = np.mean([point for option in one.marks for point in option], 0)
+    return math.dist(np.mean(one.marks[number], 0), everywhere)
+
+
+def shared(one: Made, number: int) -> int:
+    """How many of an option's points, and words, other options have too."""
+    others = [place for place in range(len(one.marks)) if place != number]
+    points = sum(point in one.marks[place] for point in one.marks[number] for place in others)
+    words = one.question.options[number].split()
+    return points + sum(
+        word in one.question.options[place].split() for word in words for place in others
+    )
+
+
+GUESSERS: dict[str, Callable[[Made, int], Any]] = {
+    "the first letter": lambda one, number: number,
+    "the smallest answer": lambda one, number: one.question.answers[number],
+    "the shortest words": lambda one, number: len(one.question.options[number]),
+    "the first words": lambda one, number: one.question.options[number],
+    "what is leftmost": lambda one, number: min((x for _, x in one.marks[number]), default=0),
+    "what is nearest": lambda one, number: max((y for y, _ in one.marks[number]), default=0),
+    "what is in the middle": middle,
+    "the shortest path": lambda one, number: length(one.marks[number]),
+    "what has most in common with others": shared,
+}
+
+
+@pytest.mark.parametrize("name", GUESSERS)
+def test_who_sees_no_history_is_right_by_chance(made: list[Made], name: str) -> None:
+    """By one rule and by its opposite, over all families and within each."""
+    for least in (min, max):
+        hits: dict[str, list[tuple[bool, float]]] = {"all": []}
+        for one in made:
+            places = range(len(one.question.options))
+            best = least(GUESSERS[name](one, number) for number in places)
+            equal = [number for number in places if GUESSERS[name](one, number) == best]
+            if len(equal) == len(places):
+                continue  # the rule says nothing
+            hit = one.question.right in equal, len(equal) / len(places)
+            for group in ("all", one.question.episode_id.family):
+                hits.setdefault(group, []).append(hit)
+        for group, found in hits.items():
+            assert not found or abs(excess(found)) < 3.6, (group, least)  # of 180 one in 18
+
+
+def test_letters_of_right_options_are_about_uniform(made: list[Made]) -> None:
+    for count in (3, 4, 5):
+        places = Counter(one.question.right for one in made if len(one.question.options) == count)
+        total = places.total()
+        assert total > 100 and len(places) == count
+        # Chi-squared with 2 to 4 degrees of freedom: 18.5 is exceeded in one of a thousand.
+        assert sum((n - total / count) ** 2 / (total / count) for n in places.values()) < 18.5
+
+
+@pytest.mark.parametrize("family", sorted({*FAMILIES} - {*MANY}))
+def test_with_another_answer_only_the_right_place_is_another(
+    family: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one scene, whatever its answer is."""
+    for index in range(3):
+        found = []
+        episode = EpisodeId(family, "test", index)
+        for number in range(len(scene_of(episode)[0].answers)):
+            monkeypatch.setattr(module, "turn_of", lambda seed, count, n=number: n)
+            found += make(episode)
+        rights = {one.question.right for one in found}
+        assert rights == set(range(len(found[0].question.options)))
+        assert len({replace(one.question, right=0) for one in found}) == 1
+        assert len({one.marks for one in found}) == 1
+
+
+@pytest.mark.parametrize("family", MANY)
+def test_of_many_answers_the_others_are_drawn_alike(family: str) -> None:
+    """Every answer of an easy scene is about as often among the wrong options."""
+    easy = (EpisodeId(family, "train", number) for number in range(0, 100, 3))
+    questions = [one.question for one in make(*easy)]
+    wrong = Counter(
+        number
+        for one in questions
+        for place, number in enumerate(one.answers)
+        if place != one.right
+    )
+    count = len(scene_of(questions[0].episode_id)[0].answers)
+    share = statistics.fmean([number / (count - 1) for number in wrong.elements()])
+    assert abs(share - 0.5) < 4 * math.sqrt(1 / 12 / wrong.total())
+    assert len(wrong) > min(count, wrong.total()) * 0.75
+
+
+# --- the same every time -----------------------------------------------------------------------
+
+
+def bare(questions: Iterable[Question]) -> list[Question]:
+    return [replace(one, picture=b"") for one in questions]
+
+
+def test_the_golden_questions_come_out_again() -> None:
+    split = load_split(TABLETOP)
+    kept, again = read_questions(split), list(make_questions(split))
+    assert bare(again) == bare(kept.values())
+    assert tuple(kept) == QUERIES  # in canonical order
+    for one in again:  # another Pillow may draw letters a little otherwise
+        before, now = (decode_image(each.picture) for each in (kept[one.episode_id], one))
+        assert before.shape == now.shape
+        assert np.mean(np.abs(before.astype(int) - now)) < 1
+
+
+def test_whatever_the_hash_seed_the_same_bytes(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from robomme_interference_data import load_split\n"
+        "from robomme_interference_data.build_dataset.questions import *\n"
+        "questions = list(make_questions(load_split(sys.argv[1])))\n"
+        "write_questions(reversed(questions[::-1]), Path(sys.argv[2]))\n"
+    )
+    command = [sys.executable, "-c", code, str(TABLETOP), str(tmp_path / "other")]
+    subprocess.run(command, env=os.environ | {"PYTHONHASHSEED": "4711"}, check=True, timeout=60)
+    questions = list(make_questions(load_split(TABLETOP)))
+    here = write_questions(questions, tmp_path / "here")
+    assert here.read_bytes() == (tmp_path / "other" / QUESTIONS_PATH).read_bytes()
+    assert pq.ParquetFile(here).num_row_groups == len(questions)
+
+
+def test_the_digest_is_of_all_that_is_asked() -> None:
+    first, second = list(make_questions(split_of(*QUERIES[:2])))
+    digest = digest_questions([first, second])
+    assert digest == digest_questions([second, first])
+    for changes in ({"picture": b"x"}, {"right": (first.right + 1) % 3}, {"text": "What?"}):
+        assert digest_questions([replace(first, **changes), second]) != digest  # type: ignore[arg-type]
+
+
+# --- pictures ----------------------------------------------------------------------------------
+
+
+def test_without_marks_the_view_is_enlarged() -> None:
+    view = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    found = picture(view, [(), ()])
+    assert found.shape == (4, 6, 3)
+    assert np.array_equal(found[::2, ::2], view) and np.array_equal(found[1::2, 1::2], view)
+
+
+def near(image: Any, point: tuple[int, int], way: int = 21) -> Any:
+    y, x = point
+    return image[y - way : y + way, x - way : x + way]
+
+
+def test_a_thing_has_its_letter_over_it() -> None:
+    one, other = (50, 30), (50, 70)
+    view = np.full((80, 100, 3), 200, np.uint8)
+    found, turned = (
+        picture(view, marks).copy() for marks in ([(one,), (other,)], [(other,), (one,)])
+    )
+    assert found.shape == (240, 300, 3)
+    over = [(3 * (y - 14), 3 * x) for y, x in (one, other)]
+    assert (found[150, [90, 210]] == 0).all()  # a line leads down to the thing
+    # A letter is the same wherever it stands, and A is not B.
+    assert np.array_equal(near(found, over[0]), near(turned, over[1]))
+    assert np.array_equal(near(found, over[1]), near(turned, over[0]))
+    assert not np.array_equal(near(found, over[0]), near(found, over[1]))
+    for y, x in over:
+        near(found, (y, x))[...] = 200
+        found[y:151, x - 2 : x + 3] = 200
+    assert (found == 200).all()  # and nothing else was touched
+    assert (view == 200).all()
+
+
+@pytest.mark.parametrize(("options", "shape"), [(2, (396, 792)), (3, (792, 792)), (4, (792, 792))])
+def test_paths_have_a_drawing_each(options: int, shape: tuple[int, int]) -> None:
+    # Points span 100 × 60 pixels: with 16 at either side 132, three times as large.
+    ways = [((100, 60), (100, 160)), ((160, 60), (160, 160))]
+    ways += [((100, 160), (100, 60)), ((100, 60), (160, 60), (160, 160))]
+    found = picture(GREY, ways[:options])
+    assert found.shape == (*shape, 3)
+    tiles = [found[y : y + 396, x : x + 396] for y in range(0, shape[0], 396) for x in (0, 396)]
+    # The window begins at (160 + 100 − 132) / 2 = 64 and (60 + 160 − 132) / 2 = 44.
+    upper, lower = (3 * (100 - 64), 3 * (110 - 44)), (3 * (160 - 64), 3 * (110 - 44))
+    yellow = [[tuple(tile[at]) == (255, 232, 0) for at in (upper, lower)] for tile in tiles]
+    assert yellow[:2] == [[True, False], [False, True]]
+    if options == 3:
+        assert (tiles[3] == 255).all()
+        # The arrow is where the way ends, so that its opposite is another drawing.
+        assert not np.array_equal(tiles[2][80:140], tiles[0][80:140])
+    if options == 4:
+        assert yellow[3] == [False, True]
+
+
+def test_paths_at_the_edge_of_the_view_are_whole() -> None:
+    found = picture(GREY, [((2, 3), (250, 251)), ((2, 251), (250, 3))])
+    assert found.shape == (256, 512, 3)  # the whole view, which cannot be enlarged twice
+    for tile, point in ((found[:, :256], (126, 127)), (found[:, 256:], (126, 127))):
+        assert tuple(tile[point]) == (255, 232, 0)
+
+
+def test_a_picture_is_what_the_view_shows(made: list[Made]) -> None:
+    """The pixels beside marks and letters are the view's: here each family's first question."""
+    view = np.random.default_rng(0).integers(0, 256, GREY.shape, dtype=np.uint8)
+    for family in FAMILIES:
+        episode = EpisodeId(family, "test", 0)
+        [question] = make_questions(split_of(episode, view=view))
+        image = decode_image(question.picture)
+        assert 480 < max(image.shape) <= 2 * 480
+        [one] = [each for each in made if each.question.episode_id == episode]
+        if max(map(len, one.marks)) < 2:
+            times = 3 if one.marks[0] else 2
+            assert image.shape == (times * SIZE, times * SIZE, 3)
+            same = (image[::times, ::times] == view).all(2)
+            assert same.mean() > 0.97
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"simulator": "robomme"},
+        {"simulator": None},
+        {"seed": None},
+        {"seed": -1},
+        {"difficulty": None},
+        {"difficulty": "extreme"},
+    ],
+)
+def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
+    with pytest.raises(BuildError, match="MoveCube/test/0 .* possible answers are not known"):
+        list(make_questions(split_of(EpisodeId("MoveCube", "test", 0), **changes)))
+
+
+def test_views_of_another_size_are_refused() -> None:
+    wide = np.zeros((240, 320, 3), np.uint8)
+    with pytest.raises(BuildError, match="320×240 pixels; what is marked is known in 256×256"):
+        list(make_questions(split_of(EpisodeId("MoveCube", "test", 0), view=wide)))
+
+
+# --- the command -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A copy of the golden split, without its questions."""
+    copied = copy_tabletop(tmp_path / "split")
+    (copied / QUESTIONS_PATH).unlink()
+    return copied
+
+
+def test_the_command_makes_them(root: Path, run: Any) -> None:
+    code, out, _ = run("build", "questions", root, "--json")
+    assert code == 0 and f'"questions": {len(QUERIES)}' in out
+    assert bare(read_questions(load_split(root)).values()) == bare(
+        read_questions(load_split(TABLETOP)).values()
+    )
+    code, out, err = run("build", "questions", root)
+    assert (code, out) == (0, "") and f"{len(QUERIES)} questions" in err
+
+
+def test_other_demonstrations_are_refused(run: Any) -> None:
+    code, out, err = run("build", "questions", GOLDEN)
+    assert (code, out) == (1, "")
+    assert "of the simulator 'sample'" in err and "Traceback" not in err
+    assert not (GOLDEN / QUESTIONS_PATH).exists()
+
+
+def test_where_there_is_no_folder(tmp_path: Path, run: Any) -> None:
+    """A split on the Hub is not written to, and no folder of its name is made."""
+    code, _, err = run("build", "questions", tmp_path / "somebody" / "split")
+    assert code == 1 and "robomme-interference fetch" in err
+    assert not (tmp_path / "somebody").exists()
+
+
+def test_a_full_disk_leaves_what_was_there(root: Path, run: Any) -> None:
+    (root / QUESTIONS_PATH).write_bytes(b"as it was")
+    with full_disk(50_000):
+        code, _, err = run("build", "questions", root)
+    assert code == 1 and "space left" in err and "Traceback" not in err
+    assert (root / QUESTIONS_PATH).read_bytes() == b"as it was"
+    assert len(list(root.iterdir())) == 4
+
+
+def test_stopped_it_leaves_what_was_there(
+    root: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "picture", stopped)
+    code, _, err = run("build", "questions", root)
+    assert code == 130 and f"go on with:\nrobomme-interference build questions {root}" in err
+    assert not (root / QUESTIONS_PATH).exists()

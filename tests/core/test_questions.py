@@ -1,0 +1,160 @@
+"""Questions as a split has them: how they are stored, and what is refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.splits import copy_split
+from support.tabletop import QUERIES, TABLETOP, copy_tabletop
+
+from robomme_interference_data import load_split
+from robomme_interference_data.constants import QUESTIONS_PATH
+from robomme_interference_data.encode import decode_image
+from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.questions import Question, read_questions
+
+MOVE = EpisodeId("MoveCube", "test", 0)
+COLUMNS = {
+    **{"episode_id": "string", "family": "string", "split": "string", "index": "int64"},
+    **{"revision": "string", "text": "string"},
+    "options": "list<element: string not null>",
+    "answers": "list<element: int64 not null>",
+    **{"right": "int64", "picture": "binary"},
+}
+
+
+def question(**changes: Any) -> Question:
+    known = {"options": ("", "", ""), "answers": (4, 0, 9), "right": 1}
+    told = {"revision": "r", "text": "Which?", "picture": b""} | known | changes
+    return Question(episode_id=MOVE, **told)
+
+
+def test_letters_and_chance() -> None:
+    assert (question().letters, question().chance) == ("ABC", 1 / 3)
+    assert question(options=("", ""), answers=(0, 1)).letters == "AB"
+    eight = question(options=("",) * 8, answers=tuple(range(8)))
+    assert (eight.letters, eight.chance) == ("ABCDEFGH", 0.125)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"options": ("",), "answers": (0,), "right": 0},
+        {"options": ("",) * 9, "answers": tuple(range(9))},
+        {"answers": (4, 0)},
+        {"answers": (4, 0, 4)},
+        {"answers": (4, 0, -1)},
+        {"right": 3},
+        {"right": -1},
+    ],
+)
+def test_what_is_no_question(changes: dict[str, Any]) -> None:
+    with pytest.raises(FormatError):
+        question(**changes)
+
+
+def test_the_columns_are_these() -> None:
+    schema = pq.read_schema(TABLETOP / QUESTIONS_PATH)
+    assert {field.name: str(field.type) for field in schema} == COLUMNS
+    assert list(COLUMNS) == schema.names
+    assert not any(field.nullable for field in schema)
+
+
+def test_the_golden_questions() -> None:
+    found = read_questions(load_split(TABLETOP))
+    assert tuple(found) == QUERIES
+    one, peg = found[MOVE], found[EpisodeId("InsertPeg", "test", 0)]
+    assert one.text == "In which manner was the cube moved to the target?"
+    words = ("pushes the cube with the closed gripper", "grasps the cube", "hooks the cube")
+    assert (one.options, one.answers, one.right) == (words, (0, 1, 2), 0)
+    assert decode_image(one.picture).shape == (512, 512, 3)
+    # Of two pegs, two ends and two sides: the first peg is inserted from the right.
+    assert (peg.letters, peg.answers, peg.right) == ("ABCD", (0, 7, 4, 1), 3)
+    assert peg.options[3] == "held at its head, inserted from the right"
+    assert peg.options[0] == peg.options[2]  # of different pegs, as the picture shows
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+
+def rewrite(root: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    path = root / QUESTIONS_PATH
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def put(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
+    """Another value in the first row of a column."""
+
+    def change(table: pa.Table) -> pa.Table:
+        values = table.column(name).to_pylist()
+        place, field = table.column_names.index(name), table.schema.field(name)
+        loose = pa.field(name, field.type)
+        return table.set_column(place, loose, pa.array([value, *values[1:]], field.type))
+
+    return change
+
+
+DAMAGED: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
+    "a column is missing": (lambda table: table.drop(["right"]), "right is missing"),
+    "a column is of another type": (
+        lambda table: table.set_column(8, "right", table["text"]),
+        "expected a whole number",
+    ),
+    "a query twice": (lambda table: pa.concat_tables([table, table[:1]]), "two questions"),
+    "no right option": (put("right", 7), "right option 7"),
+    "an empty value": (put("text", None), "text"),
+    "no picture": (put("picture", None), "picture"),
+    "no such episode": (put("episode_id", "MoveCube"), "MoveCube"),
+    "one option": (put("options", [""]), "1 options"),
+    "an answer twice": (put("answers", [1, 1, 2]), "of 2 answers"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damage_is_one_error(tmp_path: Path, name: str) -> None:
+    change, words = DAMAGED[name]
+    root = copy_tabletop(tmp_path / "split")
+    rewrite(root, change)
+    with pytest.raises(FormatError) as raised:
+        read_questions(load_split(root))
+    assert words in raised.value.message and str(root / QUESTIONS_PATH) in raised.value.message
+
+
+@pytest.mark.parametrize("data", [b"", b"PAR1", b"questions", b"PAR1" + b"\xff" * 100 + b"PAR1"])
+def test_what_is_no_table(tmp_path: Path, data: bytes) -> None:
+    root = copy_tabletop(tmp_path / "split")
+    (root / QUESTIONS_PATH).write_bytes(data)
+    with pytest.raises(FormatError, match=QUESTIONS_PATH):
+        read_questions(load_split(root))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [put("revision", "0" * 64), lambda table: table[1:], put("episode_id", "MoveCube/test/49")],
+)
+def test_questions_of_other_demonstrations_are_stale(tmp_path: Path, change: Any) -> None:
+    root = copy_tabletop(tmp_path / "split")
+    rewrite(root, change)
+    with pytest.raises(FormatError, match="other demonstrations") as raised:
+        read_questions(load_split(root))
+    assert raised.value.hint == f"Type: robomme-interference build questions {root}"
+
+
+def test_further_columns_are_left_aside(tmp_path: Path) -> None:
+    root = copy_tabletop(tmp_path / "split")
+    rewrite(root, lambda table: table.append_column("colour", pa.array(["red"] * len(table))))
+    assert len(read_questions(load_split(root))) == len(QUERIES)
+
+
+def test_a_split_without_questions_says_how_to_make_them(tmp_path: Path) -> None:
+    root = copy_split(tmp_path / "split")
+    with pytest.raises(MissingFileError, match="has no questions") as raised:
+        read_questions(load_split(root))
+    assert raised.value.hint == f"Type: robomme-interference build questions {root}"
+    (root / QUESTIONS_PATH).mkdir()
+    with pytest.raises(InterferenceError):
+        read_questions(load_split(root))
