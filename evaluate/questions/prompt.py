@@ -37,7 +37,9 @@ class QuestionPrompt:
     question: str
 
     def __post_init__(self) -> None:
-        for place in ("<history>", "<picture>", "{question}", "{options}"):
+        if not self.system.strip():
+            raise ValueError("its system is empty")
+        for place in ("<history>", "<picture>", "{goal}", "{question}", "{options}"):
             if place not in self.question:
                 raise ValueError(f"its question lacks {place}")
 
