@@ -1,0 +1,57 @@
+"""Questions of the golden `tabletop` split, put to whoever answers."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from support.chat_server import ChatServer, Seen
+from support.tabletop import QUERIES, TABLETOP
+
+from robomme_interference_data import load_split
+from robomme_interference_data.evaluate import RunResult
+from robomme_interference_data.evaluate.config import AskConfig
+from robomme_interference_data.evaluate.questions.ask import run_examination
+from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.questions import Question, read_questions
+
+
+@cache
+def questions() -> dict[EpisodeId, Question]:
+    """All questions of the split."""
+    return read_questions(load_split(TABLETOP))
+
+
+def right_letter(episode: EpisodeId) -> str:
+    """The letter of the right option."""
+    question = questions()[episode]
+    return question.letters[question.right]
+
+
+def ask(
+    out: Path, *, executor: Executor | None = None, listener: Any = None, **changes: Any
+) -> RunResult:
+    """Ask all questions under k0, unless told otherwise."""
+    usual: dict[str, Any] = {"model": "recall", "split": TABLETOP, "conditions": ("k0",)}
+    config = AskConfig(out=out, **usual | changes)
+    return run_examination(config, executor=executor or Serial(), listener=listener)
+
+
+def behind(server: ChatServer, **changes: Any) -> dict[str, Any]:
+    """Settings that put the questions to a server's model."""
+    return {"model": f"openai:{server.url}#tiny", "system": "tiny"} | changes
+
+
+def look(seen: Seen) -> str:
+    """Answer as somebody who knows what is right as soon as a frame shows a part of it."""
+    *history, _ = seen.images
+    for image in history:
+        _, number, part = image[0, 0]
+        if part and number < len(QUERIES):
+            return f"The answer is {right_letter(QUERIES[number])}."
+    return "I cannot tell."
+
+
+def pixels(seen: Seen) -> list[tuple[int, ...]]:
+    """The first pixel of each image of the history that was sent."""
+    return [tuple(map(int, image[0, 0])) for image in seen.images[:-1]]
