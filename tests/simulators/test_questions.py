@@ -1,0 +1,46 @@
+"""What a question marks is what the task is about, in the scene as it stands after the lesson."""
+
+import math
+from typing import Any
+
+import pytest
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+
+PLACES: dict[str, list[tuple[int, int, int]]] = {
+    "VideoRepick": [(0, 0, 0)],
+    "VideoPlaceOrder": [(1, 0, 0)],
+    "VideoPlaceButton": [(1, 0, 0)],
+    "VideoUnmask": [(0, 0, 0)],
+    "VideoUnmaskSwap": [(0, 0, 0)],
+    "MoveCube": [],
+    "InsertPeg": [(0, 0, 0), (1, 0, 1)],
+    "PatternLock": [(number, 0, number) for number in range(6)],
+    "RouteStick": [(number, -1, 2 * number) for number in range(5)],
+}
+"""Of a hard episode: the step that carries the answer out, which of its places, and which mark."""
+
+BEFORE = 0.03
+"""m: a peg goes in from so far before the box's side."""
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_right_option_alone_is_marked_where_it_is(
+    blind: TabletopSimulator, family: str
+) -> None:
+    """Also after an exchange, when a thing is no longer where it was shown."""
+    blind.reset(f"{family}/test/2", demonstration=False)
+    scene, answer = blind.env.episode, blind.env.answer
+    right = scene.choice(answer)
+    for step, at, mark in PLACES[family]:
+        place: Any = scene.step(answer, step).at[at]
+        near = 0.003 + BEFORE * ((family, step) == ("InsertPeg", 1))
+        marked = {
+            choice
+            for choice in map(scene.choice, scene.answers)
+            if math.dist(place[:2], scene.option(choice).marks[mark][:2]) < near
+        }
+        assert right in marked
+        assert len(PLACES[family]) > 1 or marked == {right}
+    assert not getattr(scene, "swaps", ()) or right != answer
