@@ -6,7 +6,7 @@ import statistics
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -21,10 +21,12 @@ from support.splits import GOLDEN
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
 from robomme_interference_data import load_split
+from robomme_interference_data.build_dataset import question_pictures
 from robomme_interference_data.build_dataset import questions as module
+from robomme_interference_data.build_dataset.question_pictures import picture
 from robomme_interference_data.build_dataset.questions import (
     make_questions,
-    picture,
+    planned_questions,
     write_questions,
 )
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES, QUESTIONS_PATH
@@ -68,19 +70,14 @@ class Made:
     marks: tuple[tuple[tuple[int, int], ...], ...]
 
 
-def make(*episodes: EpisodeId) -> Iterator[Made]:
-    """Make questions without drawing their pictures, which takes most of the time."""
-    marked: list[Any] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "picture", lambda view, marks: (marked.append(marks), view)[1])
-        patch.setattr(module, "png", lambda image: b"")
-        for question in make_questions(split_of(*episodes)):
-            yield Made(question, tuple(marked.pop()))
+def make(*episodes: EpisodeId) -> list[Made]:
+    """Make questions without their pictures."""
+    return [Made(one, tuple(marks)) for one, marks in planned_questions(split_of(*episodes))]
 
 
 @pytest.fixture(scope="module")
 def made() -> list[Made]:
-    return list(make(*EPISODES))
+    return make(*EPISODES)
 
 
 def of(made: Iterable[Made], family: str) -> list[Made]:
@@ -368,7 +365,7 @@ def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None
 
 def test_views_of_another_size_are_refused() -> None:
     wide = np.zeros((240, 320, 3), np.uint8)
-    with pytest.raises(BuildError, match="320×240 pixels; what is marked is known in 256×256"):
+    with pytest.raises(BuildError, match="320×240 pixels; where things are is known in 256×256"):
         list(make_questions(split_of(EpisodeId("MoveCube", "test", 0), view=wide)))
 
 
@@ -423,7 +420,7 @@ def test_stopped_it_leaves_what_was_there(
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "picture", stopped)
+    monkeypatch.setattr(question_pictures, "picture", stopped)
     code, _, err = run("build", "questions", root)
     assert code == 130 and f"go on with:\nrobomme-interference build questions {root}" in err
     assert not (root / QUESTIONS_PATH).exists()

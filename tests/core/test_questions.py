@@ -133,13 +133,19 @@ def test_what_is_no_table(tmp_path: Path, data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [put("revision", "0" * 64), lambda table: table[1:], put("episode_id", "MoveCube/test/49")],
+    ("change", "words"),
+    [
+        (put("revision", "0" * 64), "other demonstrations"),
+        (lambda table: table[1:], "lacks the question of VideoRepick/test/0"),
+        (put("episode_id", "MoveCube/test/49"), "lacks the question of VideoRepick/test/0"),
+    ],
 )
-def test_questions_of_other_demonstrations_are_stale(tmp_path: Path, change: Any) -> None:
+def test_questions_of_other_demonstrations_are_stale(
+    tmp_path: Path, change: Any, words: str
+) -> None:
     root = copy_tabletop(tmp_path / "split")
     rewrite(root, change)
-    with pytest.raises(FormatError, match="other demonstrations") as raised:
+    with pytest.raises(FormatError, match=words) as raised:
         read_questions(load_split(root))
     assert raised.value.hint == f"Type: robomme-interference build questions {root}"
 
