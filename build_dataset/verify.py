@@ -30,7 +30,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.dataset import Dataset
 from robomme_interference_data.digest import combine
 from robomme_interference_data.embeddings import IndexHeader, index_folder
-from robomme_interference_data.encode import CODECS, read_png
+from robomme_interference_data.encode import CODECS, decode_image
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.files import LocalFiles, all_files, sha256_file
 from robomme_interference_data.manifest import ManifestHeader
@@ -273,7 +273,7 @@ def _questions(split: Split) -> Iterator[Violation]:
             yield Violation(where, f"is {told}; the rules give {rules}")
             continue
         try:  # not compared: versions of Pillow draw letters a little otherwise
-            read_png(there.picture)
+            decode_image(there.picture)
         except FormatError as error:
             yield Violation(where, error.message)
     yield from (Violation(f"{QUESTIONS_PATH} {one}", "is of no query") for one in given)

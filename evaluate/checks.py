@@ -14,7 +14,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.evaluate.clips import check_drawing
-from robomme_interference_data.evaluate.config import RunConfig, unusual_retrieval
+from robomme_interference_data.evaluate.config import RunConfig, WorkConfig, unusual_retrieval
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
@@ -69,6 +69,20 @@ def default_system(config: RunConfig) -> str:
     return "-".join(("retrieval", name, *unusual_retrieval(config).values())).replace("/", "-")
 
 
+def check_positive(config: WorkConfig) -> None:
+    """Check numbers that have to be above 0.
+
+    Raises:
+        InvalidOptionError: One is not.
+    """
+    for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
+        value = getattr(config, name, 1)
+        if not 0 < value < math.inf:
+            raise InvalidOptionError.expected(
+                "--" + name.replace("_", "-"), value, "more than 0", "Leave it out for the default."
+            )
+
+
 def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
     """Check the settings against each other, the split and the policy.
 
@@ -80,12 +94,7 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
     """
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
-    for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
-        value = getattr(config, name)
-        if not 0 < value < math.inf:
-            raise InvalidOptionError.expected(
-                "--" + name.replace("_", "-"), value, "more than 0", "Leave it out for the default."
-            )
+    check_positive(config)
     if config.episode_split not in SPLITS:
         raise InvalidOptionError.one_of("--episode-split", config.episode_split, SPLITS)
     if policy.privileged and config.simulator == "robomme":

@@ -11,6 +11,7 @@ import numpy as np
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import FRONT, PROTOCOL_VERSION
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.evaluate.checks import check_positive
 from robomme_interference_data.evaluate.config import AskConfig, Run, unusual_retrieval
 from robomme_interference_data.evaluate.log import open_log
 from robomme_interference_data.evaluate.models.registry import (
@@ -135,10 +136,7 @@ def _check_settings(config: AskConfig) -> None:
     unusual_retrieval(config)
     if config.frames < 2:
         raise InvalidOptionError.expected("--frames", config.frames, "2 or more")
-    for name in ("workers", "max_errors", "rollout_timeout"):
-        if not getattr(config, name) > 0:
-            option = "--" + name.replace("_", "-")
-            raise InvalidOptionError.expected(option, getattr(config, name), "more than 0")
+    check_positive(config)
     if config.control not in CONTROLS:
         raise InvalidOptionError.one_of("--control", config.control, CONTROLS)
     if config.model in _OWN:
