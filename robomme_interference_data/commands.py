@@ -162,7 +162,7 @@ def show(
 def show_question(
     episode: QueryName,
     split: SplitOption = Path(),
-    out: Picture = None,
+    out: Annotated[Path | None, typer.Option(help="Picture to write, .png.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show the question about the past of one query: in words, and its picture with --out.
@@ -177,6 +177,8 @@ def show_question(
     from robomme_interference_data.questions import read_questions
 
     check_output(out)
+    if out is not None and out.suffix.lower() != ".png":
+        raise InvalidOptionError.expected("--out", str(out), "a name that ends in .png")
     opened = load_split(split)
     query = opened.query(episode)
     question = read_questions(opened)[query.episode_id]

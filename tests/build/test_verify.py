@@ -17,14 +17,17 @@ from support.damage import flipped_bits
 from support.made_up import record, write_metadata
 from support.retrieval import QUIET, TwoSums, make_index
 from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
+from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_split
 from robomme_interference_data.build_dataset.manifests import write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.files import sha256_file
+from robomme_interference_data.questions import read_questions
 from robomme_interference_data.retrieval.index import build_index
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
@@ -467,3 +470,32 @@ def test_a_header_without_a_condition_of_the_rows(own_split: Path) -> None:
     renew_header(own_split, conditions=["no-history", "k0"])
     with pytest.raises(FormatError, match="k1 is not among its conditions"):
         audit_split(load_split(own_split))
+
+
+# --- questions -----------------------------------------------------------------------------------
+
+
+def test_questions_are_planned_anew(tmp_path: Path) -> None:
+    assert found(TABLETOP, decode=False) == []
+    root = copy_tabletop(tmp_path / "split")
+    path = root / QUESTIONS_PATH
+    sound = path.read_bytes()
+    for name, value in (("right", 2), ("text", "Which?"), ("options", ["a", "b", "c"])):
+        edit(path, first_changed(name, value))
+        expect(root, rf"questions\.parquet VideoRepick/test/0: is .*{name}.*the rules give")
+        path.write_bytes(sound)
+    edit(path, first_changed("picture", b"a picture"))
+    expect(root, r"questions\.parquet VideoRepick/test/0: an image starts with the bytes")
+    edit(path, lambda table: table[1:])
+    expect(root, r"questions\.parquet.* lacks the question of VideoRepick/test/0")
+
+
+def test_a_flipped_bit_in_questions_is_told_or_changes_none(tmp_path: Path) -> None:
+    root = copy_tabletop(tmp_path / "split")
+    sound, told = read_questions(load_split(root)), 0
+    for _ in flipped_bits(root / QUESTIONS_PATH, 40):
+        try:
+            assert read_questions(load_split(root)) == sound  # statistics, say, are not read
+        except FormatError as error:
+            told += "questions.parquet" in error.message
+    assert told > 30

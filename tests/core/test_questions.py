@@ -1,5 +1,6 @@
 """Questions as a split has them: how they are stored, and what is refused."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -164,3 +165,30 @@ def test_a_split_without_questions_says_how_to_make_them(tmp_path: Path) -> None
     (root / QUESTIONS_PATH).mkdir()
     with pytest.raises(InterferenceError):
         read_questions(load_split(root))
+
+
+# --- the command `question` --------------------------------------------------------------------
+
+
+def test_a_question_is_shown_in_words_and_as_a_picture(tmp_path: Path, run: Any) -> None:
+    code, out, err = run("question", MOVE, "--split", TABLETOP, "--out", tmp_path / "q.png")
+    one = read_questions(load_split(TABLETOP))[MOVE]
+    assert code == 0 and str(tmp_path / "q.png") in err
+    assert (tmp_path / "q.png").read_bytes() == one.picture
+    assert [line[10:] for line in out.splitlines()[1:]] == [one.text, *one.lines, "A"]
+    code, out, _ = run("question", MOVE, "--split", TABLETOP, "--json")
+    assert code == 0 and json.loads(out)["options"] == list(one.lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("MoveCube/test/9",), "'MoveCube/test/9' is not in"),
+        (("MoveCube",), "is not an episode id"),
+        ((MOVE, "--out", "q.svg"), "a name that ends in .png"),
+        ((MOVE, "--out", TABLETOP / "manifests" / "q.png"), "whose files are a split's"),
+    ],
+)
+def test_what_cannot_be_shown(words: tuple[object, ...], message: str, run: Any) -> None:
+    code, out, err = run("question", *words, "--split", TABLETOP)
+    assert (code, out) == (1, "") and message in err
