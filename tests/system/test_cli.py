@@ -52,9 +52,9 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
     listed = [word for word in words if (word,) in ALL or word in GROUPS]
     assert listed == [
         *("Data", "doctor", "build", "new-split", "verify", "audit", "fetch"),
-        *("Look", "conditions", "list", "show", "simulate"),
+        *("Look", "conditions", "list", "show", "question", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
-        *("Rollouts", "ceiling", "evaluate", "merge"),
+        *("Rollouts", "ceiling", "evaluate", "ask", "merge"),
         *("Scores", "score", "compare", "power"),
         *("Publish", "card", "publish", "publish-results"),
     ]
