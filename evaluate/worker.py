@@ -158,7 +158,8 @@ def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, An
     if config.simulator == "robomme":
         # Its own limit ends a little before the worker's: its error shows what RoboMME printed.
         limit = 0.9 * config.simulator_timeout
-        return {"python": config.robomme_python, "cameras": cameras, "answer_s": limit}
+        options = {"python": config.robomme_python, "cameras": cameras, "answer_s": limit}
+        return options | {"subgoals": config.subgoals == ORACLE}
     if config.simulator == "tabletop":
         return {"cameras": cameras, "shift": config.shift}
     return {}

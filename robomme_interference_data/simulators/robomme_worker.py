@@ -35,7 +35,7 @@ def _neighbour(name: str) -> Any:
     return module
 
 
-_mends = _neighbour("robomme_mends")
+_mends, _drawing = _neighbour("robomme_mends"), _neighbour("robomme_drawing")
 
 
 def send(
@@ -148,6 +148,8 @@ class Episodes:
     def __init__(self) -> None:
         self._env: Any = None
         self._cameras: list[str] = []
+        self._subgoals = True
+        self._drawing = _drawing.Drawing()
 
     def reset(
         self,
@@ -157,11 +159,12 @@ class Episodes:
         max_steps: int,
         cameras: list[str],
         demonstration: bool,
+        subgoals: bool,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Play a demonstration; return what is known of the episode, and frames and states.
 
         The last frame and state are the first live observation; without `demonstration`, frames
-        are of that one only.
+        are of that one only. With `subgoals` these are told.
         """
         self.close()
         builder = _builder()(
@@ -172,50 +175,61 @@ class Episodes:
         if seed is None or not difficulty:
             raise UnknownEpisode(f"{family} has {builder.get_episode_num()} {split} episodes")
         self._env = builder.make_env_for_episode(index)
-        self._cameras = cameras
+        self._cameras, self._subgoals = cameras, subgoals
+        self._draw(demonstration)
         observations, info = self._env.reset()
         goals = info["task_goal"]
         about = {
             "seed": int(seed),
             "difficulty": str(difficulty),
             "goals": [goals] if isinstance(goals, str) else [str(goal) for goal in goals],
-            "subgoal": _subgoal(info),
+            "subgoal": _subgoal(info) if subgoals else None,
         }
-        return about, self._arrays(observations, slice(None) if demonstration else slice(-1, None))
+        arrays = {"states": _states(observations)}
+        if demonstration:
+            return about, arrays | self._frames(observations)
+        seen = self._drawing.see(self._env, cameras)
+        return about, arrays | {camera: [frame] for camera, frame in seen.items()}
 
     def step(self, action: list[float], observe: bool) -> tuple[dict[str, Any], dict[str, Any]]:
         """Execute an action; return status and subgoal, and one state and, if wanted, one frame."""
         import numpy as np
 
+        self._draw(observe)
         observations, _, _, _, info = self._env.step(np.array(action, np.float32))
         if info["status"] == "error":
             self.close()
             return {"status": "error", "message": str(info.get("error_message"))}, {}
-        shown = slice(-1, None) if observe else slice(0, 0)
-        arrays = self._arrays(observations, shown)
-        told = {"status": str(info["status"]), "subgoal": _subgoal(info)}
-        return told, {**arrays, "states": arrays["states"][-1:]}
+        frames = self._frames(observations) if observe else {}
+        shown = {camera: those[-1:] for camera, those in frames.items()}
+        told = {
+            "status": str(info["status"]),
+            "subgoal": _subgoal(info) if self._subgoals else None,
+        }
+        return told, {**shown, "states": _states(observations)[-1:]}
 
     def close(self) -> None:
         """Close the environment, if there is one."""
         env, self._env = self._env, None
         if env is not None:
             env.close()
+        self._drawing.forget()
 
-    def _arrays(self, observations: Any, shown: slice) -> dict[str, Any]:
+    def _draw(self, shown: bool) -> None:
+        """Have drawn what comes: what is shown, and the front view, in which subgoals are found."""
+        wanted = {*self._cameras} if shown else set()
+        wanted |= {"front"} if self._subgoals else set()
+        self._drawing.cameras = [_drawing.CAMERAS[camera] for camera in wanted]
+
+    def _frames(self, observations: Any) -> dict[str, Any]:
         import numpy as np
 
-        joints = np.stack(observations["joint_state_list"])[:, :7]
-        gripper = np.stack(observations["gripper_state_list"])[:, :1]
-        states = np.concatenate([joints, gripper], axis=1).astype(np.float32)
-        arrays: dict[str, Any] = {"states": list(states)}
+        frames = {}
         for camera in self._cameras:
-            frames = observations[LISTS[camera]]
-            if len(frames) != len(states):
-                raise ValueError(f"{len(frames)} frames of {camera}, {len(states)} states")
-            if frames[shown]:
-                arrays[camera] = [np.asarray(frame) for frame in frames[shown]]
-        return arrays
+            frames[camera] = [np.asarray(frame) for frame in observations[LISTS[camera]]]
+            if len(frames[camera]) != len(observations["joint_state_list"]):
+                raise ValueError(f"{len(frames[camera])} frames of {camera}, others of states")
+        return frames
 
 
 def serve(channel: Connection, folder: Path) -> None:
@@ -254,6 +268,15 @@ def _read(channel: Connection, requests: Any) -> None:
 
 def _builder() -> Any:
     return importlib.import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder
+
+
+def _states(observations: Any) -> list[Any]:
+    """Return states, `(8,) float32` each: seven joints and the way of a finger."""
+    import numpy as np
+
+    joints = np.stack(observations["joint_state_list"])[:, :7]
+    gripper = np.stack(observations["gripper_state_list"])[:, :1]
+    return [*np.concatenate([joints, gripper], axis=1).astype(np.float32)]
 
 
 def _subgoal(info: dict[str, Any]) -> str | None:

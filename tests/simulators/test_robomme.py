@@ -32,8 +32,8 @@ from robomme_interference_data.subgoal import Subgoal
 
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
 
-DIES, HANGS, RAISES, BREAKS, LARGE_WRIST = 40, 41, 42, 43, 44
-"""Indices of the stand-in's episodes that do so."""
+DIES, HANGS, RAISES, BREAKS, LARGE_WRIST, DRAWN = 40, 41, 42, 43, 44, 48
+"""Indices of the stand-in's episodes that do so; the last tells how often it drew each camera."""
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def told(simulator: RoboMMESimulator, episode: str) -> tuple[object, ...]:
 
 def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
     simulator.reset("MoveCube/test/3")
-    assert simulator.subgoal() == Subgoal("pick up the cube at <point>, step 0", ((0, 200),))
+    assert simulator.subgoal() == Subgoal("pick up the cube at <point>, step 0", ((5, 200),))
     for _ in range(2):
         simulator.step(HOLD, observe=False)
     assert simulator.subgoal().grounded == "pick up the cube at <2, 200>, step 2"
@@ -116,6 +116,41 @@ def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
     simulator.reset("PatternLock/test/3")
     with pytest.raises(UnknownNameError, match="tells no subgoal"):
         simulator.subgoal()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "subgoals", "drawn"),
+    [
+        # The first picture of each camera, the first live view, one of the two steps.
+        (["front", "wrist"], False, [3, 3]),
+        (["front"], False, [3, 1]),
+        ([], False, [1, 1]),
+        # All of the demonstration, 11 frames, and both steps; and once more the first live view.
+        (["front"], True, [14, 1]),
+        (["wrist"], True, [13, 3]),
+    ],
+)
+def test_what_nobody_looks_at_is_not_drawn(
+    cameras: list[str], subgoals: bool, drawn: list[int], robomme_python: Path
+) -> None:
+    with RoboMMESimulator(robomme_python, cameras=cameras, subgoals=subgoals) as simulator:
+        lesson, first, _ = simulator.reset(f"MoveCube/test/{DRAWN}", demonstration=False)
+        assert (len(lesson.states), lesson.images) == (10, {})
+        simulator.step(HOLD, observe=False)
+        seen, _ = simulator.step(HOLD)
+        assert seen.state[:2].tolist() == drawn
+        # What is drawn is what would be drawn in any case.
+        for camera, (begun, stepped) in {"front": (10, 2), "wrist": (110, 102)}.items():
+            for one, value in ((first, begun), (seen, stepped)):
+                assert (camera in one.images) == (camera in cameras)
+                assert all(
+                    (one.images[camera] == value).all() for _ in cameras if camera in cameras
+                )
+        if not subgoals:
+            with pytest.raises(InvalidOptionError, match="without subgoals"):
+                simulator.subgoal()
+        else:
+            assert simulator.subgoal().points == ((2, 200),)
 
 
 def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMESimulator) -> None:

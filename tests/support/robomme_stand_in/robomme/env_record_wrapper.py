@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 from mani_skill.agents.robots.panda import PandaStick, PandaWristCam
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.examples.motionplanning.panda.motionplanner_stick import (
     PandaStickMotionPlanningSolver,
 )
@@ -22,15 +23,19 @@ ENDS = {45: "success", 46: "fail", 47: "timeout"}
 open_environments = set()
 
 
-class Environment:
+class Environment(BaseEnv):
     def __init__(self, family, index, seed, max_steps):
-        open_environments.add(self)
         self.family, self.index, self.seed, self.max_steps = family, index, seed, max_steps
         self.resets = 0
         kind = PandaStick if family in STICKS else PandaWristCam
         self.description = ElementTree.parse(kind.urdf_path).getroot()
         arm = kind([link.get("name") for link in self.description.iter("link")])
-        self.cameras = {one.uid: one for one in arm._sensor_configs}
+        sizes = {one.uid: one.width for one in arm._sensor_configs}
+        assert sizes.keys() == {"hand_camera"}
+        if index == 44:
+            sizes["hand_camera"] = 512
+        super().__init__({"base_camera": 256, **sizes})
+        open_environments.add(self)
 
     def reset(self):
         for number in range(100):
@@ -71,17 +76,24 @@ class Environment:
         if self.steps > self.max_steps:
             status = "timeout"
         lists = self._lists([self.steps % 256], [np.float32(action[:7])], [(action[-1] + 1) / 50])
+        if self.index == 48:
+            lists["joint_state_list"][0][:2] = [*self.drawn.values()]
         return lists, 0.0, status != "ongoing", False, self._info(status)
 
     def close(self):
         open_environments.remove(self)
 
     def _lists(self, frames, joints, grippers):
-        side = 512 if self.index == 44 else self.cameras["hand_camera"].width
         stick = self.family in STICKS
+        seen = []
+        for t in frames:
+            self._shows = {"base_camera": t, "hand_camera": 100 + t % 100}
+            seen.append(self._get_obs_sensor_data())
+        # Places of subgoals are found in the front view, as the real one finds them.
+        self.place = int(seen[-1]["base_camera"]["rgb"].numpy().flat[0])
         return {
-            "front_rgb_list": [np.full((256, 256, 3), t, np.uint8) for t in frames],
-            "wrist_rgb_list": [np.full((side, side, 3), 100 + t % 100, np.uint8) for t in frames],
+            "front_rgb_list": [one["base_camera"]["rgb"][0].numpy() for one in seen],
+            "wrist_rgb_list": [one["hand_camera"]["rgb"][0].numpy() for one in seen],
             "joint_state_list": joints,
             "gripper_state_list": [
                 np.float64([0 if stick else g, 0 if stick else -1]) for g in grippers
@@ -100,7 +112,7 @@ class Environment:
         step = self.steps
         return info | {
             "simple_subgoal_online": f"pick up the cube, step {step}",
-            "grounded_subgoal_online": f"pick up the cube at <{step}, 200>, step {step}",
+            "grounded_subgoal_online": f"pick up the cube at <{self.place}, 200>, step {step}",
         }
 
 
