@@ -21,6 +21,9 @@ VIEWS = ("<history>", "<keyframes>", "<recent>", "<image>")
 
 _MOST_LETTERS = 300
 
+_SPECIAL = re.compile(r"<\|\w+\|>")
+"""Special tokens of a model, such as `<|box_start|>`: servers mostly leave them out of answers."""
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -130,7 +133,7 @@ class Prompt:
                 raise InvalidOptionError.expected(f"its {self.subgoal_key}", text, "text")
             keyframes = _places(said.get(self.keyframes_key) or [], shown)
         lines = [line.strip().strip("\"'`*").strip() for line in text.strip().splitlines()]
-        words = next(filter(None, lines), "")
+        words = _SPECIAL.sub("", next(filter(None, lines), ""))
         if not 0 < len(words) <= _MOST_LETTERS:
             raise InvalidOptionError.expected(
                 "the answer", words[:60], f"a subgoal of up to {_MOST_LETTERS} letters in a line"
@@ -143,7 +146,8 @@ class Prompt:
         """What a box or a point looks like; blanks may stand anywhere in it."""
         forms = []
         for name, form in (("b", self.box), ("p", self.point)):
-            words = [re.escape(word) for word in re.split(r"(\{\w+\})|\s+", form) if word]
+            parts = re.split(r"(\{\w+\})|\s+", _SPECIAL.sub("", form))
+            words = [re.escape(word) for word in parts if word]
             text = r"\s*".join(words)
             forms += [re.sub(r"\\\{(\w+)\\\}", rf"(?P<{name}_\1>\\d{{1,5}})", text)] * bool(text)
         return re.compile("|".join(forms))

@@ -63,6 +63,15 @@ def test_the_middle_of_a_box_counts() -> None:
     assert found == Subgoal("pick up <point>, not <point>", ((40, 20), (2, 1)))
 
 
+@pytest.mark.parametrize("said", ["<|box_start|>(500,250)<|box_end|>", "(500, 250)"])
+def test_special_tokens_may_be_missing(said: str) -> None:
+    asked = prompt(point=BOXES)
+    found = asked.read(f"pick up the cube at {said} now", SIZE).subgoal
+    assert found == Subgoal("pick up the cube at <point> now", ((128, 64),))
+    told = "pick up the cube at <|box_start|>(500,250)<|box_end|> now"
+    assert asked.write(found, SIZE) == told
+
+
 @pytest.mark.parametrize(("grid", "text"), [(1000, "go <0, 1001>"), (0, "go <256, 0>")])
 def test_a_point_outside_is_no_answer(grid: int, text: str) -> None:
     with pytest.raises(InvalidOptionError, match="a point of the answer"):
