@@ -100,6 +100,9 @@ class World:
     def subgoal(self) -> Subgoal:
         return Subgoal(f"go on from step {self.steps} to <point>", ((self.steps, 7),))
 
+    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        return self.act("obey")
+
     def close(self) -> None:
         pass
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.chat_server import ChatServer
 from support.command_lines import parse
 from support.hub import push_split, running_hub
 from support.splits import GOLDEN
@@ -80,6 +81,7 @@ ELSEWHERE = (
     " stale-k7 ",  # contradicting lessons, which a renderer plays
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
+    "transformers:",  # a model on the Hub
 )
 """What marks command lines of the pages that need what is not at hand: they are parsed alone."""
 
@@ -109,7 +111,10 @@ def test_the_commands_of_the_pages_run(
     hub: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """On the golden split, in a world without a renderer, in this process, logged in to a Hub."""
+    """On the golden split, in a world without a renderer, in this process, logged in to a Hub.
+
+    Where pages name a chat endpoint, one answers that knows one letter; prompts are the page's own.
+    """
     login("my-name")
     push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
     for name in ("my-split", "S"):
@@ -117,16 +122,21 @@ def test_the_commands_of_the_pages_run(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WORLDS_SPLIT", str(tiny_split))
     monkeypatch.setattr(run_module, "Processes", lambda workers: Serial())
+    for name, prompt in re.findall(r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S):
+        (tmp_path / name).write_text(prompt)
     lines = [line for line in command_lines(page) if not any(mark in line for mark in ELSEWHERE)]
-    for line in (*BEFORE.get(page.name, ()), *lines):
-        given = re.sub(r"--episodes [0-9-]+", "--episodes 0", line)
-        given = given.replace("RouteStick", "PatternLock").replace("VideoUnmask/", "VideoRepick/")
-        if given.startswith("evaluate "):
-            given += " --simulator support.worlds:World"
-        if given.startswith("publish") and "--dry-run" not in given:
-            given += " --yes"
-        code, out, err = run(*shlex.split(given))
-        assert code == 0, f"{line}\n{out}\n{err}"
+    with ChatServer(lambda seen: "A") as chat:
+        for line in (*BEFORE.get(page.name, ()), *lines):
+            given = re.sub(r"--episodes [0-9-]+", "--episodes 0", line)
+            given = re.sub(r"openai:\S+", f"openai:{chat.url}#tiny", given)
+            given = given.replace("RouteStick", "PatternLock")
+            given = given.replace("VideoUnmask/", "VideoRepick/")
+            if given.startswith("evaluate "):
+                given += " --simulator support.worlds:World"
+            if given.startswith("publish") and "--dry-run" not in given:
+                given += " --yes"
+            code, out, err = run(*shlex.split(given))
+            assert code == 0, f"{line}\n{out}\n{err}"
 
 
 @pytest.mark.parametrize("example", ["hub", "load"])
