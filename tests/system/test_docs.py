@@ -82,6 +82,7 @@ ELSEWHERE = (
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
     "transformers:",  # a model on the Hub
+    "--encoder siglip",  # weights
 )
 """What marks command lines of the pages that need what is not at hand: they are parsed alone."""
 
