@@ -14,8 +14,10 @@ from support.chat_server import ChatServer
 from support.command_lines import parse
 from support.hub import push_split, running_hub
 from support.splits import GOLDEN
+from support.tabletop import copy_tabletop
 
 from robomme_interference_data.evaluate import run as run_module
+from robomme_interference_data.evaluate.questions import ask as ask_module
 from robomme_interference_data.execution import Serial
 
 ROOT = Path(__file__).parents[2]
@@ -56,9 +58,11 @@ def test_the_readmes_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def _run_readme(tmp_path: Path, there: dict[str, str]) -> None:
+    copy_tabletop(tmp_path / "demo" / "tabletop")
     for line in command_lines(ROOT / "README.md"):
         given = line.replace("robomme-h5:recordings/", "sample")
-        given = given.replace("demo/tabletop", "S --simulator support.worlds:World")
+        if line.startswith("evaluate "):
+            given = given.replace("demo/tabletop", "S --simulator support.worlds:World")
         done = subprocess.run(
             [str(COMMAND), *shlex.split(given)],
             cwd=tmp_path,
@@ -112,18 +116,23 @@ def test_the_commands_of_the_pages_run(
     hub: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """On the golden split, in a world without a renderer, in this process, logged in to a Hub.
+    """On a golden split, in a world without a renderer, in this process, logged in to a Hub.
 
     Where pages name a chat endpoint, one answers that knows one letter; prompts are the page's own.
     """
     login("my-name")
     push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
+    asked = page.name == "questions.md"
+    split = copy_tabletop(tmp_path / "tabletop") if asked else own_split
     for name in ("my-split", "S"):
-        (tmp_path / name).symlink_to(own_split)
+        (tmp_path / name).symlink_to(split)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WORLDS_SPLIT", str(tiny_split))
-    monkeypatch.setattr(run_module, "Processes", lambda workers: Serial())
-    for name, prompt in re.findall(r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S):
+    for module in (run_module, ask_module):
+        monkeypatch.setattr(module, "Processes", lambda workers: Serial())
+    for name, prompt in re.findall(
+        r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S
+    ):
         (tmp_path / name).write_text(prompt)
     lines = [line for line in command_lines(page) if not any(mark in line for mark in ELSEWHERE)]
     with ChatServer(lambda seen: "A") as chat:
