@@ -12,18 +12,17 @@ from robomme_interference_data.evaluate.models.model import Message, Part, Video
 from robomme_interference_data.sampling import spread
 
 
-def within(messages: Iterable[Message], images: int, mp4: bool) -> list[Message]:
+def within(messages: Iterable[Message], images: int | None) -> list[Message]:
     """Return messages with at most so many images.
 
-    Videos give way first, the longer ones before others: their frames become evenly spread ones.
+    Videos become images, evenly spread ones, and give way first, the longer ones before others.
 
     Args:
         messages: The messages.
-        images: Images at most in all; single ones are never left out.
-        mp4: Whether videos stay videos; else they become images.
+        images: Images at most in all; single ones are never left out. None: videos stay videos.
     """
     asked = list(messages)
-    if mp4:
+    if images is None:
         return asked
     parts = [part for message in asked for part in message.parts]
     lengths = [len(part.frames) for part in parts if isinstance(part, Video)]

@@ -52,7 +52,14 @@ class Reply:
 
 
 class ChatModel(ABC):
-    """A vision-language model. It keeps nothing from one call to the next."""
+    """A vision-language model. It keeps nothing from one call to the next.
+
+    Attributes:
+        images: Images of a question at most: frames of videos, which count, too, are thinned out.
+            None if it is sent videos as such, which have no bound.
+    """
+
+    images: int | None = None
 
     @abstractmethod
     def reply(self, messages: Sequence[Message]) -> Reply:

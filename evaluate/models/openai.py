@@ -80,7 +80,8 @@ class OpenAIModel(ChatModel):
             )
         self._url, self._model = url, model
         self._settings: dict[str, Any] = {"max_tokens": max_tokens, "temperature": temperature}
-        self._images, self._mp4, self._repeats = images, video == "mp4", repeats
+        self.images = None if video == "mp4" else images
+        self._repeats = repeats
         self._client = OpenAI(
             base_url=url,
             api_key=_key(),
@@ -92,7 +93,7 @@ class OpenAIModel(ChatModel):
         """Ask, and ask again what fails for the moment; see `ChatModel.reply`."""
         asked: Any = [
             {"role": message.role, "content": _content(message.parts)}
-            for message in within(messages, self._images, self._mp4)
+            for message in within(messages, self.images)
         ]
         began, calls, why = time.perf_counter(), 0, ""
         while calls <= self._repeats:

@@ -57,7 +57,7 @@ class TransformersModel(ChatModel):
             raise InvalidOptionError(
                 f"max_tokens {max_tokens}, images {images}; expected at least 1"
             )
-        self._max_tokens, self._images = max_tokens, images
+        self._max_tokens, self.images = max_tokens, images
         try:
             self._device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
             torch.empty(0, device=self._device)
@@ -107,7 +107,7 @@ class TransformersModel(ChatModel):
                     for part in message.parts
                 ],
             }
-            for message in within(messages, self._images, mp4=False)
+            for message in within(messages, self.images)
         ]
         try:
             inputs = self._processor.apply_chat_template(

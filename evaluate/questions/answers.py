@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import FPS
 from robomme_interference_data.encode import decode_image
 from robomme_interference_data.errors import FormatError
+from robomme_interference_data.evaluate.config import AskConfig
 from robomme_interference_data.evaluate.models.model import ChatModel, Video
 from robomme_interference_data.evaluate.models.prompts import told
+from robomme_interference_data.evaluate.models.registry import make_model
 from robomme_interference_data.evaluate.questions.prompt import load_prompt, read_letter
 from robomme_interference_data.query import Query
 from robomme_interference_data.questions import Question
@@ -68,7 +70,14 @@ class Answered:
 
 
 class Answerer(ABC):
-    """Answers questions, one at a time, and keeps nothing from one to the next."""
+    """Answers questions, one at a time, and keeps nothing from one to the next.
+
+    Attributes:
+        images: Images that it can be shown with a question, the picture among them; None if there
+            is no bound.
+    """
+
+    images: int | None = None
 
     @abstractmethod
     def answer(self, asked: Asked) -> Answered:
@@ -136,6 +145,7 @@ class ModelAnswerer(Answerer):
 
     def __init__(self, model: ChatModel, prompt: str, control: str):
         self._model, self._control = model, control
+        self.images = None if control == "text" else model.images
         self._prompt, self._sha256 = load_prompt(prompt)
 
     def answer(self, asked: Asked) -> Answered:
@@ -169,3 +179,15 @@ class ModelAnswerer(Answerer):
     def close(self) -> None:
         """Close the model."""
         self._model.close()
+
+
+OWN = {"recall": Recaller, "guess": Guesser}
+"""Who answers without a model."""
+
+
+def make_answerer(config: AskConfig) -> Answerer:
+    """Make who answers, in this process; see `make_model` and `load_prompt` for errors."""
+    if config.model in OWN:
+        return OWN[config.model]()
+    model = make_model(config.model, config.model_options)
+    return ModelAnswerer(model, config.prompt, config.control)

@@ -1,61 +1,43 @@
 """Ask the questions of a split: check everything, then ask what is not answered yet."""
 
 import dataclasses
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.constants import FRONT, PROTOCOL_VERSION
+from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
 from robomme_interference_data.evaluate.checks import check_positive
 from robomme_interference_data.evaluate.config import AskConfig, Run, unusual_retrieval
 from robomme_interference_data.evaluate.log import open_log
 from robomme_interference_data.evaluate.models.registry import (
-    make_model,
     model_identity,
     parse_model,
     pin_model,
 )
-from robomme_interference_data.evaluate.plan import Plan, WorkItem, plan_work
+from robomme_interference_data.evaluate.plan import Plan, plan_work
 from robomme_interference_data.evaluate.questions.answers import (
     CONTROLS,
-    Answerer,
-    Asked,
-    Guesser,
-    ModelAnswerer,
-    Recaller,
+    OWN,
+    make_answerer,
 )
-from robomme_interference_data.evaluate.record import write_record
-from robomme_interference_data.evaluate.rollout import retrieval_columns
+from robomme_interference_data.evaluate.questions.task import AskTask
 from robomme_interference_data.evaluate.run import Listener, RunResult, run_items
 from robomme_interference_data.evaluate.start import retrieval_index, start_of
 from robomme_interference_data.evaluate.systems import known_system, name_system
-from robomme_interference_data.evaluate.worker import make_selector
-from robomme_interference_data.evidence import known_parts
-from robomme_interference_data.execution import Executor, Processes, Worker, end_if_starting
-from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.execution import Executor, Processes, end_if_starting
 from robomme_interference_data.loading import load_split
-from robomme_interference_data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.questions import digest_questions, read_questions
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.sampling import (
     MEMORIES,
-    evidence_kept,
-    lesson_frames,
-    lesson_share,
 )
 from robomme_interference_data.simulators.tabletop.families import recorded_scene
 from robomme_interference_data.split import Split
 
 if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.selector import Selector
-
-_OWN = {"recall": Recaller, "guess": Guesser}
-"""Who answers without a model."""
+    pass
 
 
 def run_examination(
@@ -90,13 +72,13 @@ def run_examination(
     questions = read_questions(split)
     config = dataclasses.replace(
         config,
-        model=config.model if config.model in _OWN else pin_model(config.model),
+        model=config.model if config.model in OWN else pin_model(config.model),
         split=Path(split.location),
     )
     name = _name(config)
     answerer = make_answerer(config)
     try:
-        said = answerer.metadata()
+        said, shown = answerer.metadata(), answerer.images
     finally:
         answerer.close()
     plan = plan_work(
@@ -117,6 +99,9 @@ def run_examination(
             )
     if config.model == "recall":
         _check_known(split, plan)
+    # How much of a history a retrieval step chooses is not known before.
+    if shown is not None and (config.retrieval is None or config.sampling != "full"):
+        _check_shown(config, split, plan, shown)
     identity = _identity(config, name, split, said) | {
         "questions": digest_questions(questions.values()),
         "retrieval_index": retrieval_index(config, split, plan),
@@ -139,7 +124,7 @@ def _check_settings(config: AskConfig) -> None:
     check_positive(config)
     if config.control not in CONTROLS:
         raise InvalidOptionError.one_of("--control", config.control, CONTROLS)
-    if config.model in _OWN:
+    if config.model in OWN:
         for name in ("model_options", "control", "prompt"):
             default = type(config).__dataclass_fields__[name].default
             if getattr(config, name) != default:
@@ -151,7 +136,7 @@ def _check_settings(config: AskConfig) -> None:
         raise UnknownNameError(
             f"there is no model {config.model!r}; expected recall, guess, openai:URL#MODEL, "
             "transformers:ID or transformers:FOLDER",
-            nearest(config.model, _OWN, more=""),
+            nearest(config.model, OWN, more=""),
         )
     else:
         parse_model(config.model)
@@ -164,6 +149,19 @@ def _check_known(split: Split, plan: Plan) -> None:
             raise InvalidOptionError(
                 f"recall knows what may have been the answer in tabletop alone, not in {episode}",
                 "Ask a model, or guess.",
+            )
+
+
+def _check_shown(config: AskConfig, split: Split, plan: Plan, images: int) -> None:
+    """Refuse frames that are kept and could not be shown, as a model takes fewer images."""
+    for item in plan.items():
+        history = split.manifest(item.episode, item.condition).history_frames
+        kept = len(MEMORIES[config.sampling](history, config.frames))
+        if kept + 1 > images:
+            raise InvalidOptionError(
+                f"{item.episode}, {item.condition}: {kept} frames are kept, and shown with the "
+                f"picture; the model takes {images} images at most",
+                f"Give --model-option images={kept + 1}, or fewer --frames.",
             )
 
 
@@ -182,7 +180,7 @@ def _default_system(config: AskConfig) -> str:
 
 def _name(config: AskConfig) -> str:
     """Return the name under which rows stand: of the table only that of who answers."""
-    own = _default_system(config) if config.model in _OWN else None
+    own = _default_system(config) if config.model in OWN else None
     name = config.system or own
     if name is None:
         raise InvalidOptionError(
@@ -198,18 +196,10 @@ def _name(config: AskConfig) -> str:
     return name
 
 
-def make_answerer(config: AskConfig) -> Answerer:
-    """Make who answers, in this process; see `make_model` and `load_prompt` for errors."""
-    if config.model in _OWN:
-        return _OWN[config.model]()
-    model = make_model(config.model, config.model_options)
-    return ModelAnswerer(model, config.prompt, config.control)
-
-
 def _identity(config: AskConfig, system: str, split: Split, said: dict[str, Any]) -> dict[str, Any]:
     """Return what makes the run the one that it is, as plain values."""
     model = said
-    if config.model not in _OWN:
+    if config.model not in OWN:
         model = model_identity(config.model, config.model_options, said["model"])
         model["prompt_sha256"] = said["prompt_sha256"]
     return {
@@ -225,90 +215,3 @@ def _identity(config: AskConfig, system: str, split: Split, said: dict[str, Any]
         "protocol_version": PROTOCOL_VERSION,
         "model": model,
     }
-
-
-class AskTask:
-    """Asks questions, as an executor's task; split, questions and model are made at the first.
-
-    What breaks is raised, and the model is made anew for the next question.
-    """
-
-    def __init__(self, run: Run[AskConfig], folder: Path):
-        self._run, self._folder = run, folder
-        self._split: Split | None = None
-        self._questions: dict[EpisodeId, Question] = {}
-        self._selector: Selector | None = None
-        self._answerer: Answerer | None = None
-
-    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
-        """Ask a question; return its row, and what befell its record, or None."""
-        try:
-            return self._ask(task)
-        except Exception:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Release who answers."""
-        if self._answerer is not None:
-            self._answerer.close()
-        self._answerer = None
-
-    def _ask(self, item: WorkItem) -> tuple[Rollout, str | None]:
-        config, began = self._run.config, time.perf_counter()
-        if self._split is None:
-            self._split = load_split(config.split, cache=config.cache, threads=1)
-            self._questions = read_questions(self._split)
-            self._selector = make_selector(config)
-        if self._answerer is None:
-            self._answerer = make_answerer(config)
-        buffer, question = (
-            self._split.load(item.episode, item.condition),
-            self._questions[item.episode],
-        )
-        given: Sequence[int] = range(len(buffer))
-        if self._selector is not None and len(buffer):
-            view = buffer.query.frame(self._selector.camera)
-            given = self._selector.select(buffer, view).tolist()
-        kept = [given[place] for place in MEMORIES[config.sampling](len(given), config.frames)]
-        evidence, camera = buffer.evidence, FRONT.rpartition(".")[2]
-
-        def frames() -> Any:
-            if not kept:
-                return np.empty((0, 1, 1, 3), np.uint8)
-            [chunk] = buffer.stream(len(kept), (camera,), kept)
-            return chunk.frames[camera]
-
-        known = None if evidence is None else known_parts(evidence, kept)
-        asked = Asked(question, buffer.query, config.model_seed, known, frames)
-        answered = self._answerer.answer(asked)
-        right = answered.letter == question.letters[question.right]
-        own = answered.calls is not None
-        row = self._run.row(
-            item,
-            seed=buffer.query.seed,
-            difficulty=buffer.query.difficulty,
-            goal=buffer.query.goal,
-            status=str(Status.SUCCESS if right else Status.FAIL),
-            success=right,
-            steps=0,
-            history_frames=len(given),
-            lesson_frames=lesson_frames(buffer.sessions, given),
-            lesson_share=lesson_share(buffer.sessions, given) if given else None,
-            evidence_kept=None if evidence is None else evidence_kept(evidence, kept),
-            **retrieval_columns(self._selector, buffer, given),
-            answer=answered.letter,
-            chance=question.chance,
-            model_calls=answered.calls,
-            model_tokens=answered.tokens,
-            model_faults=int(answered.letter is None) if own else None,
-            model_s=round(answered.seconds, 4) if answered.seconds is not None else None,
-            wall_s=round(time.perf_counter() - began, 4),
-        )
-        if not own:
-            return row, None
-        line = {
-            **{"question": question.text, "prompt": answered.prompt, "text": answered.text},
-            **{"answer": answered.letter, "right": question.letters[question.right]},
-        }
-        return row, write_record(self._folder, "answers", item, [line])

@@ -71,6 +71,7 @@ class ModelWriter(SubgoalWriter):
         places = spread(0, len(history), self._frames)
         self._history: list[Part] = [history.video(places)] if places else []
         self._goal = info.goal
+        self._subgoal = Subgoal(info.goal)
         self._earlier: list[Subgoal] = []
         self._kept: dict[int, NDArray[np.uint8]] = {}
         self._seen.clear()
@@ -100,14 +101,14 @@ class ModelWriter(SubgoalWriter):
         )
         answer, fault = self._read(reply, size, len(recent))
         if answer is not None:
-            if answer.subgoal not in self._earlier[-1:]:
-                self._earlier.append(answer.subgoal)
+            self._subgoal = answer.subgoal
+            if answer.subgoal.simple not in [one.simple for one in self._earlier[-1:]]:
+                self._earlier.append(answer.subgoal)  # not where only its points have moved
             self._keep(images, [recent[place] for place in answer.keyframes])
-        subgoal = self._earlier[-1] if self._earlier else Subgoal(self._goal)
         self.turns.append(
             Turn(
                 step,
-                subgoal.grounded,
+                self._subgoal.grounded,
                 prompt=told(asked),
                 answer=reply.text,
                 fault=fault,
@@ -117,7 +118,7 @@ class ModelWriter(SubgoalWriter):
                 seconds=round(reply.seconds, 4),
             )
         )
-        return subgoal
+        return self._subgoal
 
     def metadata(self) -> dict[str, Any]:
         """Return what the model says of itself, and the SHA-256 of the prompt's file."""

@@ -103,7 +103,7 @@ def test_a_video_as_mp4(server: ChatServer) -> None:
 def test_budgets(lengths: list[int], single: int, images: int) -> None:
     frame = np.zeros((2, 2, 3), np.uint8)
     videos = [Video(np.repeat(frame[None], length, 0), 10.0) for length in lengths]
-    [message] = within([Message("user", (*videos, *[frame] * single))], images, mp4=False)
+    [message] = within([Message("user", (*videos, *[frame] * single))], images)
     assert all(isinstance(part, np.ndarray) for part in message.parts)
     whole = sum(lengths) + single
     assert len(message.parts) <= max(images, single)

@@ -15,6 +15,7 @@ from support.tabletop import LESSON, NOBODY, QUERIES, TABLETOP, copy_tabletop, s
 from robomme_interference_data import load_split
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.encode import decode_image
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.questions.answers import Asked, Guesser
 from robomme_interference_data.execution import Processes
 
@@ -135,6 +136,18 @@ def test_the_kept_frames_and_no_others_are_sent(
     for letter, words in zip("ABC", question.options, strict=True):
         assert f"{letter}: {words}\n" in seen.text
     assert (row.history_frames, row.answer) == (len(buffer), "B")
+
+
+def test_frames_that_the_model_cannot_take_are_refused(tmp_path: Path) -> None:
+    with ChatServer(lambda seen: "B") as server:
+        for settings in ({"frames": 6}, {"sampling": "full"}):
+            options = behind(server, model_options=("images=5",), **settings)
+            with pytest.raises(InvalidOptionError, match="the model takes 5 images at most"):
+                ask(tmp_path / "run", **ONE, **options)
+        assert not (tmp_path / "run").exists()
+        for changes in ({"frames": 5}, {"frames": 9, "control": "text"}):
+            options = behind(server, model_options=("images=5",), **changes)
+            assert ask(tmp_path / str(changes["frames"]), **ONE, **options).counts["error"] == 0
 
 
 def test_who_looks_is_right_where_evidence_was_kept(tmp_path: Path) -> None:

@@ -83,10 +83,10 @@ def test_without_history_there_is_the_word_none() -> None:
 
 
 def test_earlier_subgoals_are_told_each_once_while_they_stand() -> None:
-    model = Scripted("first at <0, 0>", "first at <0, 0>", "second", "second")
+    model = Scripted("first at <0, 0>", "first at <500, 0>", "second", "second")
     writer = begun(model)
-    for number in range(4):
-        told(writer, number, 16 * number)
+    given = [told(writer, number, 16 * number) for number in range(4)]
+    assert [one.points for one in given] == [((0, 0),), ((128, 0),), (), ()]  # moved, not listed
     words = [str(parts[-1]) for parts in model.asked]
     assert "Steps so far" not in words[0]
     assert "Steps so far: 1. first at <0, 0>\n" in words[1]

@@ -1,0 +1,123 @@
+"""Questions as an executor's task: one at a time, each a row."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robomme_interference_data.constants import FRONT
+from robomme_interference_data.evaluate.config import AskConfig, Run
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.questions.answers import (
+    Answerer,
+    Asked,
+    make_answerer,
+)
+from robomme_interference_data.evaluate.record import write_record
+from robomme_interference_data.evaluate.rollout import retrieval_columns
+from robomme_interference_data.evaluate.worker import make_selector
+from robomme_interference_data.evidence import known_parts
+from robomme_interference_data.execution import Worker
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.loading import load_split
+from robomme_interference_data.questions import Question, read_questions
+from robomme_interference_data.rollouts import Rollout, Status
+from robomme_interference_data.sampling import (
+    MEMORIES,
+    evidence_kept,
+    lesson_frames,
+    lesson_share,
+)
+from robomme_interference_data.split import Split
+
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selector
+
+
+class AskTask:
+    """Asks questions, as an executor's task; split, questions and model are made at the first.
+
+    What breaks is raised, and the model is made anew for the next question.
+    """
+
+    def __init__(self, run: Run[AskConfig], folder: Path):
+        self._run, self._folder = run, folder
+        self._split: Split | None = None
+        self._questions: dict[EpisodeId, Question] = {}
+        self._selector: Selector | None = None
+        self._answerer: Answerer | None = None
+
+    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
+        """Ask a question; return its row, and what befell its record, or None."""
+        try:
+            return self._ask(task)
+        except Exception:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Release who answers."""
+        if self._answerer is not None:
+            self._answerer.close()
+        self._answerer = None
+
+    def _ask(self, item: WorkItem) -> tuple[Rollout, str | None]:
+        config, began = self._run.config, time.perf_counter()
+        if self._split is None:
+            self._split = load_split(config.split, cache=config.cache, threads=1)
+            self._questions = read_questions(self._split)
+            self._selector = make_selector(config)
+        if self._answerer is None:
+            self._answerer = make_answerer(config)
+        buffer, question = (
+            self._split.load(item.episode, item.condition),
+            self._questions[item.episode],
+        )
+        given: Sequence[int] = range(len(buffer))
+        if self._selector is not None and len(buffer):
+            view = buffer.query.frame(self._selector.camera)
+            given = self._selector.select(buffer, view).tolist()
+        kept = [given[place] for place in MEMORIES[config.sampling](len(given), config.frames)]
+        evidence, camera = buffer.evidence, FRONT.rpartition(".")[2]
+
+        def frames() -> Any:
+            if not kept:
+                return np.empty((0, 1, 1, 3), np.uint8)
+            [chunk] = buffer.stream(len(kept), (camera,), kept)
+            return chunk.frames[camera]
+
+        known = None if evidence is None else known_parts(evidence, kept)
+        asked = Asked(question, buffer.query, config.model_seed, known, frames)
+        answered = self._answerer.answer(asked)
+        right = answered.letter == question.letters[question.right]
+        own = answered.calls is not None
+        row = self._run.row(
+            item,
+            seed=buffer.query.seed,
+            difficulty=buffer.query.difficulty,
+            goal=buffer.query.goal,
+            status=str(Status.SUCCESS if right else Status.FAIL),
+            success=right,
+            steps=0,
+            history_frames=len(given),
+            lesson_frames=lesson_frames(buffer.sessions, given),
+            lesson_share=lesson_share(buffer.sessions, given) if given else None,
+            evidence_kept=None if evidence is None else evidence_kept(evidence, kept),
+            **retrieval_columns(self._selector, buffer, given),
+            answer=answered.letter,
+            chance=question.chance,
+            model_calls=answered.calls,
+            model_tokens=answered.tokens,
+            model_faults=int(answered.letter is None) if own else None,
+            model_s=round(answered.seconds, 4) if answered.seconds is not None else None,
+            wall_s=round(time.perf_counter() - began, 4),
+        )
+        if not own:
+            return row, None
+        line = {
+            **{"question": question.text, "prompt": answered.prompt, "text": answered.text},
+            **{"answer": answered.letter, "right": question.letters[question.right]},
+        }
+        return row, write_record(self._folder, "answers", item, [line])
