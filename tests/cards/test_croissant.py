@@ -14,6 +14,7 @@ from robomme_interference_data.cards.render import CROISSANT
 from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.files import sha256_file
 from robomme_interference_data.manifest import BufferManifest
+from robomme_interference_data.questions import Question
 from robomme_interference_data.records import EpisodeRecord
 from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.rows import arrow_schema
@@ -87,7 +88,7 @@ def test_the_reference_library_reads_the_rows(published: Path) -> None:
 # --- columns --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Rollout])
+@pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Question, Rollout])
 def test_every_column_is_described(record: type) -> None:
     columns = columns_of(record)
     maps = {"feature_sha256"}
