@@ -125,3 +125,11 @@ def test_ways_are_timed_in_turns_and_compared_round_by_round() -> None:
     assert "".join(calls) == "abc" + "cba" + "abc"  # the first to warm up
     times = timing.Times({"a": [2.0, 30.0, 6.0], "b": [1.0, 10.0, 4.0]})
     assert (times.median("a"), times.ratio("a", "b")) == (6.0, 2.0)  # of 2, 3 and 1.5
+
+
+@pytest.mark.slow
+def test_robomme(robomme_python: Path) -> None:
+    options = ("--python", robomme_python, "--families", "MoveCube", "--steps", "20")
+    (rows,) = printed("robomme", *options)
+    assert [row["family"] for row in rows] == ["MoveCube"] * 4
+    assert rows[0]["times as fast"] == "1.0"
