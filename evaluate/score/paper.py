@@ -22,14 +22,17 @@ _NOTE = (
     "are. 95% intervals: Wilson for rates; Newcombe's hybrid score for differences, which takes "
     "both sides as independent samples: the paper's rows are not at hand to be paired. "
     "published_best: it cannot be told from the highest published rate of its condition, by the "
-    "test of two proportions, corrected by Holm's method over the others (0.05 or more)."
+    "test of two proportions, corrected by Holm's method over the others (0.05 or more). A system "
+    "that is not the paper's stands beside all of them, if its cell is complete; that is no rank."
 )
 
 
 _FAMILIES_NOTE = (
     "By family the paper prints no rates. These are of its public repository "
     "(SoumilRathi/robomme-interference, CC BY 4.0), which is of an earlier date, where they add up "
-    "to the paper's rate over all families."
+    "to the paper's rate over all families. A system that is not the paper's stands beside all of "
+    "them, on whatever episodes it has: how many tells n, and the interval how little few say. "
+    "Families of different difficulty make no rank."
 )
 
 
@@ -110,14 +113,25 @@ def _read(name: str) -> Iterator[dict[str, str]]:
 
 
 def _comparable(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
-    """Yield cells with the published one; of retrieval also with the published one without it."""
-    every = (*published(), *by_family())
-    known = {(one.simulator, one.system, one.condition, one.part): one for one in every}
+    """Yield cells with what is published beside them.
+
+    Of a system of the paper that is its own, and with retrieval also that of the one without; of
+    any other system all of them, over the families together only if the cell is complete: rates
+    over a few families are not to be set against rates over nine.
+    """
+    known: dict[tuple[str, str, str], list[Cell]] = {}
+    for one in (*published(), *by_family()):
+        known.setdefault((one.simulator, one.condition, one.part), []).append(one)
+    papers = {one.system for one in published()}
     for cell in cells:
-        for system in (cell.system, base_of(cell.system)):
-            found = known.get((cell.simulator, system or "", cell.condition, cell.part))
-            if found is not None and cell.n:
-                yield cell, found
+        names = [name for name in (cell.system, base_of(cell.system)) if name in papers]
+        beside = known.get((cell.simulator, cell.condition, cell.part), []) if cell.n else []
+        if names:
+            beside = [one for name in names for one in beside if one.system == name]
+        elif not (cell.part or cell.complete):
+            beside = []
+        for found in beside:
+            yield cell, found
 
 
 _SIDES = (

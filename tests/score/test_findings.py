@@ -193,6 +193,22 @@ def test_where_paper_and_repository_differ_is_told(tmp_path: Path) -> None:
     assert own["difference"] == own["rate"] - own["published_rate"] and not own["complete"]
 
 
+def test_a_system_of_ones_own_stands_beside_all_of_the_papers_by_family(tmp_path: Path) -> None:
+    rows = made.changed(cells({("replay-full", "k0"): "ssf"}), simulator="robomme")
+    found = made.score(made.write_csv(tmp_path / "a.csv", rows), paper=True)
+    assert not found.tables["paper"].rows  # three episodes of one family are no rate over nine
+    beside = made.records(found, "paper_family")
+    there = [one for one in by_family() if (one.part, one.condition) == ("MoveCube", "k0")]
+    assert [(one["published_system"], one["published_rate"]) for one in beside] == [
+        (one.system, one.rate) for one in there
+    ]
+    assert len(beside) > 5 and {one["n"] for one in beside} == {3}
+    for one in beside:
+        assert one["difference"] == pytest.approx(2 / 3 - one["published_rate"])
+        assert one["difference_low"] < one["difference"] < one["difference_high"]
+        assert not one["complete"]
+
+
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
 def test_published_rates_are_in_the_papers_source() -> None:
     lines = PAPER.read_text(encoding="utf-8").splitlines()
