@@ -53,7 +53,7 @@ class Rollout:
 
     Attributes:
         system: Name of the system: a policy together with its memory mechanism.
-        simulator: `tabletop` or `robomme`.
+        simulator: `tabletop` or `robomme`; `questions` where one was answered instead.
         split: Name of the split of buffers.
         revision: Identity of that split, `Split.revision`.
         family: Task family.

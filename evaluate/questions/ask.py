@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import PROTOCOL_VERSION
@@ -30,14 +30,9 @@ from robomme_interference_data.execution import Executor, Processes, end_if_star
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.questions import digest_questions, read_questions
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.sampling import (
-    MEMORIES,
-)
+from robomme_interference_data.sampling import MEMORIES
 from robomme_interference_data.simulators.tabletop.families import recorded_scene
 from robomme_interference_data.split import Split
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_examination(
@@ -125,12 +120,13 @@ def _check_settings(config: AskConfig) -> None:
     if config.control not in CONTROLS:
         raise InvalidOptionError.one_of("--control", config.control, CONTROLS)
     if config.model in OWN:
-        for name in ("model_options", "control", "prompt"):
-            default = type(config).__dataclass_fields__[name].default
-            if getattr(config, name) != default:
-                option = "--" + name.replace("_", "-").removesuffix("s")
+        unused = {"model_options": "--model-option", "control": "--control", "prompt": "--prompt"}
+        if config.model == "guess":
+            unused |= {one: f"--{one}" for one in ("frames", "sampling", "retrieval")}
+        for name, option in unused.items():
+            if getattr(config, name) != type(config).__dataclass_fields__[name].default:
                 raise InvalidOptionError(
-                    f"{option} says nothing of {config.model}", "It is for models: leave it out."
+                    f"{option} says nothing of {config.model}", "Leave it out, or ask a model."
                 )
     elif ":" not in config.model:
         raise UnknownNameError(

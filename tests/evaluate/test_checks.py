@@ -216,7 +216,10 @@ def test_only_what_somebody_looks_at_is_drawn(monkeypatch: pytest.MonkeyPatch) -
         "python": "./py",
         "cameras": ("front",),
         "answer_s": 90.0,
+        "subgoals": False,
     }
+    oracle = {"policy": "websocket://h:1", "robomme_python": "./py", "subgoals": "oracle"}
+    assert options("robomme", "front", **oracle)["subgoals"] is True
 
 
 def test_recall_needs_evidence(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:

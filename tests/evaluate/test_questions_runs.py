@@ -268,6 +268,8 @@ def test_shards_make_the_run(tmp_path: Path) -> None:
         ({"control": "blank"}, "--control says nothing of recall"),
         ({"prompt": "choise"}, "--prompt says nothing of recall"),
         ({"model_options": ("images=3",)}, "--model-option says nothing of recall"),
+        ({"model": "guess", "frames": 8}, "--frames says nothing of guess"),
+        ({"model": "guess", "retrieval": "thumbnail"}, "--retrieval says nothing of guess"),
         ({"model": "recal"}, "there is no model 'recal'; expected recall, guess, openai:URL"),
         ({"model": ""}, "there is no model ''"),
         ({"model": "opnai:http://h/v1#m", "system": "m"}, "there is no model 'opnai:"),
