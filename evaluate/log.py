@@ -196,6 +196,8 @@ def open_log(
     """
     folder.mkdir(parents=True, exist_ok=True)
     there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    if there == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:
+        there = []  # a full disk, or a kill, came before the header
     if there and RUN_HEADER not in there:
         raise RunFolderError(
             f"{folder} holds other files ({', '.join(there[:3])}) and no {RUN_HEADER}",

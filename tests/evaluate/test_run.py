@@ -228,6 +228,18 @@ def test_folders_that_are_refused(tmp_path: Path) -> None:
     assert [path.name for path in other.iterdir()] == ["thesis.tex"]
 
 
+def test_a_run_that_stopped_before_its_header_begins_again(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "rollouts.jsonl").touch()  # what a full disk, or a kill, leaves
+    assert len(run(out).rows) == 4
+    (out / "run.json").unlink()
+    for name in ("rollouts.csv", "rollouts.parquet"):
+        (out / name).unlink()
+    with pytest.raises(RunFolderError, match="holds other files"):  # rows are never begun again
+        run(out)
+
+
 def test_the_split_may_lie_elsewhere_and_keeps_its_label(tmp_path: Path, tiny_split: Path) -> None:
     run_one(tmp_path / "run")
     moved = shutil.copytree(tiny_split, tmp_path / "moved")
