@@ -29,8 +29,8 @@ class QuestionPrompt:
 
     Attributes:
         system: What the model is told first.
-        question: What it is asked; holds `<history>`, `<picture>`, `{goal}`, `{question}` and
-            `{options}`.
+        question: What it is asked; holds `<history>`, `<picture>`, `{question}` and `{options}`,
+            and `{goal}` if it is to be told.
     """
 
     system: str
@@ -39,7 +39,7 @@ class QuestionPrompt:
     def __post_init__(self) -> None:
         if not self.system.strip():
             raise ValueError("its system is empty")
-        for place in ("<history>", "<picture>", "{goal}", "{question}", "{options}"):
+        for place in ("<history>", "<picture>", "{question}", "{options}"):
             if place not in self.question:
                 raise ValueError(f"its question lacks {place}")
 

@@ -155,6 +155,15 @@ def test_without_images_none_is_written() -> None:
     assert user.parts == ("none|none|g|Which one?|A: x\nB: y",)
 
 
+def test_the_goal_need_not_be_told(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("system = 's'\nquestion = '<history><picture>{question}{options}'")
+    _, user = load_prompt(str(path))[0].fill(
+        "secret", question("x", "y"), {"<history>": [], "<picture>": []}
+    )
+    assert user.parts == ("nonenoneWhich one?A: x\nB: y",)
+
+
 def test_our_prompt_shows_all_and_asks_for_a_letter() -> None:
     [name] = PROMPTS
     prompt, digest = load_prompt(name)
