@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import FormatError, UnknownNameError
+from robomme_interference_data.errors import FormatError, UnknownNameError, nearest
 from robomme_interference_data.evaluate.models.model import Part, Video
 
 _MOST_BYTES = 1 << 16
@@ -36,6 +36,19 @@ def fill(
         rest = match.end()
     _add(parts, text[rest:])
     return tuple(parts)
+
+
+def check_places(name: str, text: str, places: Sequence[str]) -> None:
+    """Refuse what looks like a place and is none: it would be shown to the model as it stands.
+
+    Only what is near a place is refused: a model has special words of its own, such as `<think>`.
+
+    Raises:
+        ValueError: There is such a thing in the text; quotes it.
+    """
+    for found in re.findall(r"<\w+>|\{\w+\}", text):
+        if found not in places and (hint := nearest(found, places, more="")):
+            raise ValueError(f"its {name} has {found}, which is no place. {hint}")
 
 
 def _add(parts: list[Part], part: Part) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import Part
-from robomme_interference_data.evaluate.models.prompts import fill, read_prompt
+from robomme_interference_data.evaluate.models.prompts import check_places, fill, read_prompt
 from robomme_interference_data.subgoal import Pixel, Subgoal, read_points, write_points
 
 PROMPTS = ("simple", "grounded", "memer")
@@ -68,6 +68,8 @@ class Prompt:
         for name in ("system", "first", "then", "point"):
             if not getattr(self, name).strip():
                 raise InvalidOptionError(f"{name} is empty", "Expected text.")
+        for name in ("first", "then"):
+            check_places(name, getattr(self, name), (*VIEWS, "{goal}", "{subgoals}"))
         if self.answer not in ("text", "json"):
             raise InvalidOptionError.one_of("answer", self.answer, ("text", "json"))
         if not 0 <= self.grid <= 10_000:

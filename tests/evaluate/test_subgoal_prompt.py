@@ -202,6 +202,8 @@ def test_our_prompts_show_history_and_present_and_read_their_own_examples(name: 
         ("system = 'a'\nfirst = 'b'\nthen = 'c'\nanswer = 'xml'", "answer"),
         ("system = 'a'\nfirst = 'b'\nthen = 'c'\npoint = '{y}'", "{x}"),
         ("system = ' '\nfirst = 'b'\nthen = 'c'", "system is empty"),
+        ("system = 'a'\nfirst = '<histroy>'\nthen = 'c'", "Did you mean '<history>'?"),
+        ("system = 'a'\nfirst = 'b'\nthen = '{goals}'", "its then has {goals}"),
         ("nonsense", "no prompt"),
         ("# " + "x" * (1 << 16), "at most"),
     ],
@@ -212,6 +214,11 @@ def test_what_is_no_prompt(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(FormatError) as raised:
         load_prompt(str(path))
     assert words in raised.value.message
+
+
+def test_words_that_only_look_like_places_stay() -> None:
+    text = "<think> at <|box_start|>({y},{x}) <box>: {goal} <image>"
+    assert prompt(first=text).first == text
 
 
 def test_no_such_prompt() -> None:
