@@ -37,6 +37,7 @@ def bind_options(
     fixed: Mapping[str, Any],
     texts: Iterable[str],
     what: str = "policy",
+    also: Iterable[str] = (),
 ) -> dict[str, Any]:
     """Return all options that a factory is called with, defaults included.
 
@@ -49,6 +50,7 @@ def bind_options(
         fixed: Arguments that the text gives; they are no options.
         texts: Options as they are typed, `NAME=VALUE`.
         what: What has options: `--policy-option`.
+        also: Options that something else takes from the same place, for the error.
 
     Raises:
         InvalidOptionError: A text is something else, a name comes twice, or the factory takes no
@@ -71,7 +73,7 @@ def bind_options(
     try:
         bound = signature.bind(**fixed, **given)
     except TypeError as error:
-        names = [name for name in signature.parameters if name not in fixed]
+        names = [*(name for name in signature.parameters if name not in fixed), *also]
         raise InvalidOptionError(
             f"{what} {text!r}: {error}", f"Its options: {', '.join(names) or 'none'}."
         ) from error

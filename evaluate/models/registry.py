@@ -84,13 +84,16 @@ def pin_model(text: str) -> str:
     return text
 
 
-def make_model(text: str, options: Sequence[str] = (), what: str = "model") -> ChatModel:
+def make_model(
+    text: str, options: Sequence[str] = (), what: str = "model", also: Sequence[str] = ()
+) -> ChatModel:
     """Make a model in this process. No endpoint is reached before the first question.
 
     Args:
         text: The model as it is written, see `parse_model`.
         options: Its options, each `NAME=VALUE`: see `OpenAIModel` and `TransformersModel`.
         what: What has options, for the messages: `--model-option`.
+        also: Further options that `what` has, for the messages.
 
     Raises:
         UnknownNameError: There is no such model.
@@ -100,7 +103,7 @@ def make_model(text: str, options: Sequence[str] = (), what: str = "model") -> C
     """
     spec, factory = parse_model(text), _factory(text)
     made: ChatModel = factory(
-        **spec.given, **bind_options(text, factory, spec.given, options, what)
+        **spec.given, **bind_options(text, factory, spec.given, options, what, also)
     )
     return made
 

@@ -38,7 +38,7 @@ def make_writer(config: RunConfig) -> SubgoalWriter | None:
     if config.subgoals in (None, ORACLE):
         return None if config.subgoals is None else OracleWriter()
     own, others = _parted(config.subgoal_options)
-    model = make_model(str(config.subgoals), others, _WHAT)
+    model = make_model(str(config.subgoals), others, _WHAT, _own_names())
     return ModelWriter(model, str(config.subgoal_prompt), **_bound(config.subgoals, own))
 
 
@@ -80,10 +80,14 @@ def subgoals_identity(config: RunConfig, said: Mapping[str, Any]) -> Any:
 
 def _parted(options: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the options of `ModelWriter`, and those of the model."""
-    kinds = inspect.signature(ModelWriter).parameters.values()
-    names = {one.name for one in kinds if one.kind is inspect.Parameter.KEYWORD_ONLY}
+    names = _own_names()
     own = [one for one in options if one.partition("=")[0] in names]
     return own, [one for one in options if one not in own]
+
+
+def _own_names() -> list[str]:
+    kinds = inspect.signature(ModelWriter).parameters.values()
+    return [one.name for one in kinds if one.kind is inspect.Parameter.KEYWORD_ONLY]
 
 
 def _bound(text: Any, options: Sequence[str]) -> dict[str, Any]:

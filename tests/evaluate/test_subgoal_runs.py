@@ -31,6 +31,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.checks import check_settings, default_system
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import OracleWriter
 from robomme_interference_data.subgoal import Subgoal
 
@@ -217,6 +218,14 @@ def test_what_does_not(tiny_split: Path, system: str, changes: dict[str, Any], w
     with pytest.raises(InterferenceError) as raised:
         checked(tiny_split, system, **changes)
     assert words in raised.value.message
+
+
+def test_an_unknown_option_is_told_with_those_of_model_and_prompt() -> None:
+    settings = config(policy=TOLD, subgoal_prompt="simple", **MODEL, subgoal_options=("framse=3",))
+    with pytest.raises(InvalidOptionError, match="framse") as raised:
+        make_writer(settings)
+    hint = str(raised.value.hint)
+    assert "max_tokens" in hint and "frames, recent, stride, near" in hint
 
 
 def test_rows_behind_a_model_need_a_name() -> None:
