@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -150,15 +150,26 @@ class VideoEncoder:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts = self._count
         frame.time_base = self._time_base
-        with self._errors():
+        with self._writing():
             self._container.mux(self._stream.encode(frame))
         self._count += 1
 
     def close(self) -> None:
         """Write what is pending and close the file."""
-        with self._errors():
+        with self._writing():
             self._container.mux(self._stream.encode(None))
             self._container.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            with self._errors():
+                yield
+        except BuildError:
+            # PyAV would close it when it is collected, and print what fails once more by then.
+            with suppress(av.error.FFmpegError):
+                self._container.close()
+            raise
 
     @contextmanager
     def _errors(self) -> Iterator[None]:

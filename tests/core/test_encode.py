@@ -1,6 +1,9 @@
 """The one writer of video: lossless at any size, the same bytes each time, one clear error."""
 
 import dataclasses
+import gc
+import resource
+import signal
 import tempfile
 from pathlib import Path
 
@@ -139,3 +142,23 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
         (tmp_path / "full.mp4").symlink_to("/dev/full")
         with pytest.raises(BuildError, match="No space left on device"):
             write(tmp_path / "full.mp4", images)
+
+
+def test_a_full_disk_is_one_error_and_nothing_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    encoder = VideoEncoder(tmp_path / "clip.mp4", CLIP, 10, 256, 256)
+    images = noise(0, 100, 256, 256)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # then writing fails, as on a full disk
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    try:
+        with pytest.raises(BuildError, match="cannot be written"):
+            for image in images:
+                encoder.add(image)
+        del encoder
+        gc.collect()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert capsys.readouterr().err == ""
