@@ -19,6 +19,7 @@ from robomme_interference_data.evaluate.score.sources import (
     Part,
     find_sources,
     read_part,
+    system_of,
 )
 from robomme_interference_data.evaluate.score.values import parsed, shifted, shown
 from robomme_interference_data.evaluate.systems import name_system
@@ -91,7 +92,8 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
 
     Args:
         paths: Folders of runs, and `.jsonl`, `.parquet` and `.csv` files.
-        system: Name of the system of rows that name none.
+        system: Name of the system of rows that name none; else that in the name of an exported
+            file.
         lenient: Leave bad rows out, and count them. Of equal rows of one rollout the first stays,
             of rows that contradict each other none.
 
@@ -102,11 +104,13 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
         MissingFileError: There is no such file.
         FormatError: A file cannot be read, or lacks columns; see `sources.read_part`.
     """
-    if system is not None:
-        name_system(system)
     sources = find_sources(paths)
-    parts = [read_part(path, system is not None) for path in sources]
-    rows = _Joined(parts, [run is not None for run in sources.values()], system).checked()
+    systems = [system_of(path) if system is None else system for path in sources]
+    for name in systems:
+        if name is not None:
+            name_system(name)
+    parts = [read_part(path, one is not None) for path, one in zip(sources, systems, strict=True)]
+    rows = _Joined(parts, [run is not None for run in sources.values()], systems).checked()
     if rows.refused and not lenient:
         lines = [f"{rows.refused:,} bad row{'s' * (rows.refused > 1)}:", *rows.refusals]
         if more := rows.refused - len(rows.refusals):
@@ -136,12 +140,14 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
 class _Joined:
     """The rows of files, and the first reason against each bad one."""
 
-    def __init__(self, parts: Sequence[Part], in_run: Sequence[bool], system: str | None):
-        self._parts, self._in_run = parts, in_run
+    def __init__(
+        self, parts: Sequence[Part], in_run: Sequence[bool], systems: Sequence[str | None]
+    ):
+        self._parts, self._in_run, self._systems = parts, in_run, systems
         self._starts = [0, *accumulate(part.count for part in parts)]
         self._reasons: dict[int, str] = {}
         self._default = {
-            **{"simulator": RELEASED_SIMULATOR, "system": system, "episode_split": "test"},
+            **{"simulator": RELEASED_SIMULATOR, "episode_split": "test"},
             **{"shift": NO_SHIFT, "model_seed": 0, "protocol_version": PROTOCOL_VERSION},
         }
         self._rows = Rows({}, {}, {})
@@ -156,7 +162,7 @@ class _Joined:
         """Judge the values of a column of one file, each by itself; −1 for a bad one."""
         part, start = self._parts[number], self._starts[number]
         if name not in part.columns:
-            default = self._default.get(name)
+            default = self._systems[number] if name == "system" else self._default.get(name)
             return np.full(part.count, places.setdefault(default, len(places)))
         codes, values = part.columns[name]
         known, reasons = np.full(len(values), -1, np.int64), {}

@@ -7,6 +7,7 @@ which takes seconds, to make arrays of its own or to give them away as numpy's.
 import codecs
 import csv
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -96,6 +97,12 @@ def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
     return found
 
 
+def system_of(path: Path) -> str | None:
+    """Return the system that the name of an exported file tells (see `export`), or None."""
+    found = re.fullmatch(r"(.+)-[^-]+_rollouts\.csv", path.name)
+    return found[1] if found else None
+
+
 def read_part(path: Path, with_system: bool) -> Part:
     """Read the columns of a file that scoring asks for, as far as they are there.
 
@@ -134,7 +141,8 @@ def _match(path: Path, names: Sequence[str], with_system: bool) -> dict[str, str
         )
     if "system" not in ours and not with_system:
         raise FormatError(
-            f"{path} names no system: it has no column 'system'",
+            f"{path} names no system: it has no column 'system', nor is it called "
+            "SYSTEM-SIMULATOR_rollouts.csv",
             "Say which it is, such as --system retrieval-framesamp-modul (compare: --system-a, "
             "--system-b).",
         )

@@ -187,12 +187,17 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     ]
     with exported[0].open(newline="") as lines:
         assert [row["status"] for row in csv.DictReader(lines)].count("error") == 1
-    found = made.score(exported[1], system=BASE)
+    found = made.score(exported[1])  # its name tells the system
     cells = [cell for cell in found.cells if not cell.part]
     assert [cell.counts[0] for cell in cells] == [1, 7, 5, 3, 2]
     assert cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
     # Their simulator comes back, too: they never stand beside the paper's rates.
     assert list(found.cubes) == ["tabletop"]
+    assert made.score(exported[1], system=OWN).cells[0].system == OWN  # what is given goes first
+    assert {cell.system for cell in made.score(*exported).cells} == {OWN, BASE, RETRIEVAL}
+    odd = exported[1].rename(tmp_path / "a b-tabletop_rollouts.csv")
+    with pytest.raises(InvalidIdError, match="'a b'"):
+        made.score(odd)
 
 
 def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path) -> None:
