@@ -17,7 +17,11 @@ from robomme_interference_data.evaluate.clips import check_drawing
 from robomme_interference_data.evaluate.config import RunConfig, WorkConfig, unusual_retrieval
 from robomme_interference_data.evaluate.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
-from robomme_interference_data.evaluate.policies.registry import BUILTINS, parse_policy
+from robomme_interference_data.evaluate.policies.registry import (
+    BUILTINS,
+    parse_policy,
+    policy_options,
+)
 from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
 from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import (
@@ -47,7 +51,7 @@ def default_system(config: RunConfig) -> str:
 
     That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
     step behind it, such as `retrieval-replay-window-oracle`; with the simulator's subgoals
-    `…-oracle`.
+    `…-oracle`, and of `replay` that goes on `…-go-on`.
 
     Raises:
         InvalidOptionError: It does not follow from the policy, or from what writes its subgoals.
@@ -62,6 +66,8 @@ def default_system(config: RunConfig) -> str:
             "docs/systems.md.",
         )
     name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
+    if spec.kind == "replay" and policy_options(config.policy, config.policy_options)["go_on"]:
+        name += "-go-on"
     if spec.kind == "python":
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     if config.retrieval is None:

@@ -35,6 +35,9 @@ class ReplayPolicy(Policy):
 
     Args:
         memory: `full`, `framesamp` or `window`.
+        go_on: Where the last frames that it was given are not among those that it keeps, go on for
+            as many steps as they were, as it moved last. Off by default: its rows are another
+            system's.
 
     Raises:
         UnknownNameError: There is no such memory rule.
@@ -43,9 +46,9 @@ class ReplayPolicy(Policy):
     cameras = ("front",)
     history_cameras = ("front",)
 
-    def __init__(self, memory: str = "full"):
+    def __init__(self, memory: str = "full", *, go_on: bool = False):
         check_memory(memory, "replay")
-        self.memory = memory
+        self.memory, self._go_on = memory, go_on
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget everything."""
@@ -81,7 +84,10 @@ class ReplayPolicy(Policy):
         # The first of equals: the one with most of a trajectory after it.
         nearest_view = int(np.argmin(((views - view) ** 2).mean(axis=(1, 2, 3))))
         kept = kept[nearest_view:]
-        return follow(observation.state, kept, np.concatenate(self._states)[kept])
+        states = np.concatenate(self._states)[kept]
+        if self._go_on:
+            kept, states = extrapolate(kept, states, live - 1)
+        return follow(observation.state, kept, states)
 
 
 def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -95,6 +101,24 @@ def thumbnails(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
     cut = frames[:, : tall * THUMBNAIL, : wide * THUMBNAIL]
     tiles = cut.reshape(count, THUMBNAIL, tall, THUMBNAIL, wide, 3)
     return tiles.mean(axis=(2, 4), dtype=np.float32)
+
+
+def extrapolate(
+    kept: NDArray[np.int64], states: NDArray[np.float32], last: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Add a last frame to kept ones, where its joints would be had they moved on as before.
+
+    Args:
+        kept: Indices of the frames, `(n,) int64`, ascending.
+        states: Their states, `(n, 8) float32`.
+        last: Index of the last frame; nothing is added if it is kept, or only one is.
+    """
+    if len(kept) < 2 or kept[-1] >= last:
+        return kept, states
+    speed = (states[-1] - states[-2]) / np.float32(kept[-1] - kept[-2])
+    end = states[-1] + speed * np.float32(last - kept[-1])
+    end[7] = states[-1][7]  # the gripper stays
+    return np.append(kept, last), np.vstack([states, end])
 
 
 def follow(

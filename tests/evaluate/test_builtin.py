@@ -12,6 +12,7 @@ from robomme_interference_data.evaluate.policies.builtin import (
     Privileged,
     Recall,
     ReplayPolicy,
+    extrapolate,
     follow,
 )
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
@@ -49,6 +50,32 @@ def test_a_memory_keeps_frames_that_were_there(name: str, live: int) -> None:
     kept = list(MEMORIES[name](live))
     assert kept == sorted(set(kept)) and set(kept) <= set(range(live))
     assert len(kept) == min(live, 31) or name == "full"
+
+
+def test_replay_goes_on_for_the_frames_that_it_knows_to_be_missing() -> None:
+    """Of frames 0 to 309 the last one kept is 300; from 290 to it the joints moved by 0.1."""
+    ends = {}
+    for go_on in (False, True):
+        policy = ReplayPolicy("framesamp", go_on=go_on)
+        policy.reset(RolloutInfo("goal", 310, 0))
+        joints = np.arange(310) * np.float32(0.01)
+        states = np.stack([state(joint) for joint in joints])
+        policy.add_history({"front": np.zeros((310, 32, 32, 3), np.uint8)}, states, 310)
+        plan = [policy.act(seen(0, 0.0), "")[-1] for _ in range(40)]
+        ends[go_on] = plan[-1]
+    np.testing.assert_allclose(ends[False][:7], 3.0, atol=1e-5)
+    np.testing.assert_allclose(ends[True][:7], 3.09, atol=1e-5)
+
+
+def test_nothing_is_added_where_nothing_is_missing_or_known() -> None:
+    two = np.stack([state(0.1), state(0.3, 0.02)])
+    for kept, states, last in (([4, 6], two, 6), ([4], two[:1], 9), ([], two[:0], 9)):
+        indices = np.array(kept, np.int64)
+        found, same = extrapolate(indices, states, last)
+        assert found is indices and same is states
+    found, longer = extrapolate(np.array([4, 6]), two, 9)
+    np.testing.assert_array_equal(found, [4, 6, 9])
+    np.testing.assert_allclose(longer[2], [0.6] * 7 + [0.02], rtol=1e-6)
 
 
 # --- the trajectory ---------------------------------------------------------------------------

@@ -243,6 +243,16 @@ def check_name(tiny_split: Path, system: str, **changes: Any) -> None:
     check_settings(settings, system, load_split(tiny_split), make_policy("hold"))
 
 
+def test_replay_that_goes_on_is_a_system_of_its_own(tiny_split: Path) -> None:
+    going = {"policy": "replay:framesamp", "policy_options": ("go_on=true",)}
+    assert default_system(config(**going)) == "replay-framesamp-go-on"
+    step = going | {"retrieval": "thumbnail"}
+    assert default_system(config(**step)) == "retrieval-replay-framesamp-go-on"
+    check_name(tiny_split, "replay-framesamp-go-on", **going)
+    with pytest.raises(UnknownNameError, match="is not the control replay-framesamp"):
+        check_name(tiny_split, "replay-framesamp", **going)
+
+
 @pytest.mark.parametrize(
     ("policy", "system", "words"),
     [
