@@ -249,7 +249,7 @@ def test_replay_that_goes_on_is_a_system_of_its_own(tiny_split: Path) -> None:
     step = going | {"retrieval": "thumbnail"}
     assert default_system(config(**step)) == "retrieval-replay-framesamp-go-on"
     check_name(tiny_split, "replay-framesamp-go-on", **going)
-    with pytest.raises(UnknownNameError, match="is not the control replay-framesamp"):
+    with pytest.raises(InvalidOptionError, match="is not the control replay-framesamp"):
         check_name(tiny_split, "replay-framesamp", **going)
 
 
