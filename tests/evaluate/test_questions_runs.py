@@ -175,7 +175,7 @@ def test_every_setting_is_classed() -> None:
         ({"model_seed": 1}, "model_seed is 0 there, 1 here"),
         ({"model_options": ("max_tokens=9",)}, "max_tokens is 256 there, 9 here"),
         ({"model_options": ("temperature=0.5",)}, "temperature is 0.0 there, 0.5 here"),
-        ({"model": "guess"}, "model.model is 'tiny' there, 'guess' here"),
+        ({"model": "guess", "frames": 32}, "model.model is 'tiny' there, 'guess' here"),
         ({"prompt": "own"}, "model.prompt_sha256 is"),
     ],
 )
