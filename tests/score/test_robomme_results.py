@@ -1,0 +1,85 @@
+"""What docs/robomme-results.md tells is what its rows say."""
+
+import re
+from pathlib import Path
+
+import pytest
+from support import scoring as made
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.score.scoring import Score
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "robomme-results.md").read_text(encoding="utf-8")
+FILES = sorted((ROOT / "docs" / "results").glob("*.csv"))
+
+
+@pytest.fixture(scope="module")
+def found() -> Score:
+    return made.score(*FILES, paper=True)
+
+
+def table(first: str) -> list[dict[str, str]]:
+    """The rows of the page's table that begins with a column."""
+    block = next(part for part in PAGE.split("\n\n") if part.startswith(f"| {first} |"))
+    head, _, *lines = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()
+    )
+    return [dict(zip(head, line, strict=True)) for line in lines]
+
+
+def test_successes_are_those_of_the_rows(found: Score) -> None:
+    cells = {(cell.system, cell.condition, cell.part): cell for cell in found.cells if cell.n}
+    told = set()
+    for row in table("system"):
+        system, condition = row.pop("system").strip("`"), row.pop("condition")
+        for family, text in row.items():
+            if text == "–":
+                continue
+            cell = cells[system, condition, family]
+            low, high = (round(100 * end) for end in cell.interval)
+            assert text == f"{cell.counts[0]} of {cell.n}, {low} to {high}%", (
+                system,
+                condition,
+                family,
+            )
+            told.add((system, condition, family))
+    assert told == {key for key in cells if key[2] in FAMILIES}
+    assert all(row.counts[3] == 0 for row in found.cells)  # no error
+
+
+def test_published_rates_are_the_highest_that_there_are(found: Score) -> None:
+    for row in table("family"):
+        key = {
+            "family": row["family"],
+            "condition": row["condition"],
+            "system": row["ours"].strip("`"),
+        }
+        rows = made.records(found, "paper_family", **key)
+        best = max(rows, key=lambda one: one["published_rate"])
+        told = (row["n"], row["rate"], row["rate of 50"], row["difference"])
+        ends = (best["difference"], best["difference_low"], best["difference_high"])
+        change, low, high = (f"{100 * one:+.0f}" for one in ends)
+        rates = (f"{100 * best['rate']:.0f}%", f"{100 * best['published_rate']:.0f}%")
+        assert told == (str(best["n"]), *rates, f"{change} ({low} to {high})")
+        assert row["released system with the highest rate"] == f"`{best['published_system']}`"
+
+
+def test_every_failure_is_told(found: Score) -> None:
+    """Those of MoveCube, and without history, in a line each; of the others every episode."""
+    told = {
+        (row["system"].strip("`"), row["condition"], family, int(number))
+        for row in table("system | condition | episodes")
+        for family, numbers in re.findall(r"([A-Z]\w+) ([\d, ]+)", row["episodes"])
+        for number in re.findall(r"\d+", numbers)
+        if family != "MoveCube"
+    }
+    rows = found.rows
+    names = ("system", "condition", "family", "episode", "status")
+    all_rows = zip(*(rows.list(name) for name in names), strict=True)
+    failed = {
+        (system, condition, family, episode)
+        for system, condition, family, episode, status in all_rows
+        if status != "success" and family != "MoveCube" and condition != "no-history"
+    }
+    assert told == failed
