@@ -7,6 +7,7 @@ from contextlib import ExitStack, closing, suppress
 from functools import wraps
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,7 @@ from robomme_interference_data.constants import FPS, MAX_STEPS
 from robomme_interference_data.drawing import Hue
 from robomme_interference_data.encode import CLIP, VideoEncoder
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.files import atomic_path
 from robomme_interference_data.rollouts import Status
 from robomme_interference_data.sampling import spread
 from robomme_interference_data.simulators.base import EpisodeInfo, Observation
@@ -64,7 +63,7 @@ def check_drawing() -> None:
 
 
 def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
-    """Keep what goes wrong in a method of a clip as its `problem`, and remove what was written."""
+    """Keep what goes wrong in a method of a clip as its `problem`."""
 
     @wraps(method)
     def attempt(*arguments: P.args, **named: P.kwargs) -> None:
@@ -72,10 +71,10 @@ def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
         if clip.problem is None:
             try:
                 method(*arguments, **named)
-            except Exception as error:
+            except Exception:
                 clip.problem = f"the clip failed:\n{traceback.format_exc()}"
                 with suppress(Exception):  # a full disk fails once more
-                    clip._file.__exit__(type(error), error, error.__traceback__)
+                    clip._file.close()
 
     return attempt
 
@@ -84,12 +83,16 @@ class Clip:
     """Draws a rollout as it goes, 10 pictures a second, and has them encoded at once.
 
     What goes wrong with the clip never reaches the rollout: its traceback is kept as `problem`,
-    and there is no clip. One of an earlier attempt is removed from the run's folder.
+    and there is no clip.
+
+    Attributes:
+        data: The clip, an MP4 file, once it is closed; None if there is none.
+        problem: What went wrong, or None.
     """
 
-    def __init__(self, folder: Path, item: WorkItem, system: str):
+    def __init__(self, item: WorkItem, system: str):
+        self.data: bytes | None = None
         self.problem: str | None = None
-        self._path = folder / clip_name(item)
         names = (system, str(item.episode), f"condition {item.condition}")
         self._heading = [line for name in names for line in textwrap.wrap(name, _LETTERS)]
         self._goal = self._given = ""
@@ -98,9 +101,8 @@ class Clip:
         self._subgoal: Subgoal | None = None
         self._steps = 0
         self._file = ExitStack()
+        self._path = Path()
         self._encoder: VideoEncoder | None = None
-        for left in [self._path, *self._path.parent.glob(f".{self._path.name}.*.partial")]:
-            left.unlink(missing_ok=True)
 
     @_harmless
     def begin(
@@ -112,8 +114,8 @@ class Clip:
         self._views = {"given": history_picture(buffer, given)}
         self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
         self._show(first)
-        partial = self._file.enter_context(atomic_path(self._path))
-        self._encoder = VideoEncoder(partial, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
+        self._path = Path(self._file.enter_context(TemporaryDirectory()), "clip.mp4")
+        self._encoder = VideoEncoder(self._path, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
         self._encoder.add(self._picture(Status.ONGOING))
 
     @_harmless
@@ -127,7 +129,7 @@ class Clip:
 
     @_harmless
     def close(self, status: Status, error: str | None = None) -> None:
-        """Hold the end for a second, and give the clip its name.
+        """Hold the end for a second, and end the clip.
 
         There is none of a rollout that broke before its first observation.
         """
@@ -136,6 +138,7 @@ class Clip:
             for _ in range(_LAST):
                 self._encoder.add(picture)
             self._encoder.close()
+            self.data = self._path.read_bytes()
             self._file.close()
 
     def _show(self, observation: Observation) -> None:

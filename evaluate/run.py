@@ -42,6 +42,7 @@ from robomme_interference_data.execution import (
     Task,
     end_if_starting,
 )
+from robomme_interference_data.files import atomic_path
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.simulators.registry import simulator_versions
@@ -147,8 +148,7 @@ def run_evaluation(
             run = Run(config, name, log.header.split, split.revision)
             used = ["lerobot"] if config.policy.startswith("lerobot:") else []
             log.begin(start_of(config, plan, said | written, versions, command, used))
-            task = RolloutTask(run, log.folder)
-            return run_items(run, task, items, split, log, executor, listener)
+            return run_items(run, RolloutTask(run), items, split, log, executor, listener)
 
 
 def run_items[C: RunConfig | AskConfig](
@@ -164,7 +164,8 @@ def run_items[C: RunConfig | AskConfig](
 
     Args:
         run: The run.
-        task: Makes an item's row; also returns what befell what is written beside it, or None.
+        task: Makes an item's row, and hands in what is written beside it; also returns what befell
+            that, or None.
         items: What was asked for, checked.
         split: The split.
         log: The run's folder.
@@ -213,13 +214,16 @@ def run_items[C: RunConfig | AskConfig](
 def _row[C: RunConfig | AskConfig](
     run: Run[C], outcome: Outcome, split: Split, log: RunLog
 ) -> tuple[Rollout, str | None]:
-    """Return the row of an outcome, with its attempt and time, and the traceback of what broke."""
+    """Write what an outcome's task handed in; return its row, with its attempt and time.
+
+    And what broke, with its traceback, or None.
+    """
     item: WorkItem = outcome.task
     if outcome.error is None:
         row, trace = outcome.value
     else:
         trace = outcome.trace
-        query, clip = split.query(item.episode), clip_name(item)
+        query = split.query(item.episode)
         row = run.row(
             item,
             seed=query.seed,
@@ -232,11 +236,28 @@ def _row[C: RunConfig | AskConfig](
             lesson_frames=0,
             lesson_share=None,
             error=_told(outcome.error),
-            video=clip if run.config.videos and (log.folder / clip).exists() else None,
         )
-    before = log.rows[item].attempt if item in log.rows else 0
-    row = dataclasses.replace(row, attempt=before + outcome.attempts, finished_at=now())
-    return row, trace
+    clip = clip_name(item)
+    (log.folder / clip).unlink(missing_ok=True)  # of an earlier attempt
+    # Rows matter more than what is to be looked at beside them: a full disk costs a clip.
+    lost = [problem for one in outcome.files.items() if (problem := _write(log.folder, *one))]
+    row = dataclasses.replace(
+        row,
+        video=clip if (log.folder / clip).exists() else None,
+        attempt=(log.rows[item].attempt if item in log.rows else 0) + outcome.attempts,
+        finished_at=now(),
+    )
+    return row, "\n".join(filter(None, (trace, *lost))) or None
+
+
+def _write(folder: Path, path: str, data: bytes) -> str | None:
+    """Write a file that a task handed in, whole or not at all; return what went wrong, or None."""
+    try:
+        with atomic_path(folder / path) as partial:
+            partial.write_bytes(data)
+    except OSError as error:
+        return f"{path} could not be written: {error}"
+    return None
 
 
 def _told(error: BaseException) -> str:

@@ -2,8 +2,6 @@
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.console import say
@@ -20,7 +18,7 @@ from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.record import write_record
+from robomme_interference_data.evaluate.record import record_file
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
@@ -40,11 +38,11 @@ class RolloutTask:
     """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.
 
     What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
-    that broke is used again. Clips go into the run's folder.
+    that broke is used again. Clips and subgoals are handed in.
     """
 
-    def __init__(self, run: Run[RunConfig], folder: Path):
-        self._run, self._folder = run, folder
+    def __init__(self, run: Run[RunConfig]):
+        self._run = run
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._writer: SubgoalWriter | None = None
@@ -52,22 +50,18 @@ class RolloutTask:
         self._selector: Selector | None = None
 
     def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
-        """Run a rollout; return its row, and what befell its clip or its subgoals' file, or None.
+        """Run a rollout; return its row, and what befell its clip, or None.
 
         Raises:
             WorkerRetiredError: The policy's server is gone.
             Exception: Whatever broke in the rollout.
         """
-        clip = None
-        if self._run.config.videos:
-            clip = Clip(self._folder, task, self._run.system)
+        clip = Clip(task, self._run.system) if self._run.config.videos else None
         try:
             row = self._roll(task, worker, clip)
-            problem = self._record(task)
         except Exception as error:
-            self._record(task)
-            if clip is not None:
-                clip.close(Status.ERROR, f"{type(error).__name__}: {first_line(error)}")
+            what = f"{type(error).__name__}: {first_line(error)}"
+            self._hand_in(task, worker, clip, Status.ERROR, what)
             self.close()
             if isinstance(error, ServerKeepaliveError):
                 say(f"{task}: {error.message}. A rollout that ends so is begun again, once.")
@@ -75,11 +69,8 @@ class RolloutTask:
                 self._check_server(worker)
             raise
         # Whatever became of what is to be looked at, the rollout ended as it did.
-        if clip is not None:
-            clip.close(Status(row.status))
-            row = replace(row, video=None if clip.problem else clip_name(task))
-            problem = "\n".join(filter(None, (problem, clip.problem)))
-        return row, problem or None
+        self._hand_in(task, worker, clip, Status(row.status))
+        return row, clip.problem if clip else None
 
     def _roll(self, item: WorkItem, worker: Worker, clip: Clip | None) -> Rollout:
         config = self._run.config
@@ -115,11 +106,21 @@ class RolloutTask:
                     thing.close()
         self._policy = self._simulator = self._writer = None
 
-    def _record(self, item: WorkItem) -> str | None:
-        """Write the subgoals of a rollout; return what went wrong with that, or None."""
-        if self._writer is None:
-            return None
-        return write_record(self._folder, "subgoals", item, map(to_dict, self._writer.turns))
+    def _hand_in(
+        self,
+        item: WorkItem,
+        worker: Worker,
+        clip: Clip | None,
+        status: Status,
+        error: str | None = None,
+    ) -> None:
+        """Hand in the subgoals of a rollout, and its clip."""
+        if self._writer is not None:
+            worker.hand_in(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
+        if clip is not None:
+            clip.close(status, error)
+            if clip.data is not None:
+                worker.hand_in(clip_name(item), clip.data)
 
     def _check_server(self, worker: Worker) -> None:
         """Retire the worker unless the policy's server is still there."""

@@ -8,6 +8,7 @@ tries it again, nor ends what the task had started, nor tells where it hung.
 from collections import deque
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, TypedDict, Unpack
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
@@ -78,11 +79,13 @@ class Serial:
         self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
     ) -> Generator[Outcome]:
         """Call a function on every task; see `Executor.run`."""
-        worker, attempts = Worker(0), limits.get("attempts", _ATTEMPTS)
+        attempts = limits.get("attempts", _ATTEMPTS)
         try:
             for task in tasks:
                 for number in range(1, attempts + 1):
-                    outcome = Outcome(task, *attempt(function, task, worker), number)
+                    files: dict[str, bytes] = {}
+                    worker = Worker(0, partial(_take_file, files))
+                    outcome = Outcome(task, *attempt(function, task, worker), number, files)
                     if isinstance(outcome.error, WorkerRetiredError):
                         raise outcome.error
                     if not isinstance(outcome.error, limits.get("again", ())):
@@ -90,6 +93,12 @@ class Serial:
                 yield outcome
         finally:
             getattr(function, "close", lambda: None)()
+
+
+def _take_file(files: dict[str, bytes], message: tuple[Any, ...]) -> None:
+    """Keep what a task hands in of what it tells."""
+    if message[0] == "file":
+        files.update([message[1:]])
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
@@ -31,15 +31,22 @@ _STARTED_AGAIN = 97
 
 
 class Worker:
-    """Which worker runs a task, and how the task says how long a part of it may take.
+    """Which worker runs a task, and how the task talks to the caller while it runs.
 
     Attributes:
         number: From 0; a worker that takes the place of one that died has its number.
     """
 
-    def __init__(self, number: int, tell: Callable[[Any], None] = lambda message: None):
+    def __init__(self, number: int, tell: Callable[[Any], None]):
         self.number = number
         self._tell = tell
+
+    def hand_in(self, path: str, data: bytes) -> None:
+        """Hand a file to the caller, who alone writes: a worker may be on another machine.
+
+        What a task has handed in arrives however it ends; of one path the last counts.
+        """
+        self._tell(("file", path, data))
 
     @contextmanager
     def limit(self, seconds: float, what: str) -> Iterator[None]:
@@ -78,6 +85,7 @@ class Outcome:
             is a `TimeoutError`.
         trace: Where it was raised, or where the worker hung; None if not known.
         attempts: How often the task was started.
+        files: What it handed in, see `Worker.hand_in`: path to bytes.
     """
 
     task: Any
@@ -85,6 +93,7 @@ class Outcome:
     error: BaseException | None = None
     trace: str | None = None
     attempts: int = 1
+    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def attempt(
@@ -142,11 +151,12 @@ class WorkerProcess:
         self._task: Any = None
         self._attempts = 0
         self._limits: dict[str, tuple[float, float]] = {}
+        self._files: dict[str, bytes] = {}
 
     def give(self, task: Any, attempts: int, time_limit: float | None) -> None:
         """Let it work on a task; `attempts` counts this one."""
         self._task, self._attempts, self.busy = task, attempts, True
-        self._limits = {}
+        self._limits, self._files = {}, {}
         if time_limit is not None:
             self._limit("the task", time_limit)
         with suppress(OSError):  # it died while idle: `settle` finds out
@@ -172,6 +182,8 @@ class WorkerProcess:
                     self._limit(what, seconds)
             elif kind == "limit":
                 self._limit(*rest)
+            elif kind == "file":
+                self._files.update([rest])
             else:
                 self.busy = False
                 return self._outcome(*rest)
@@ -187,7 +199,7 @@ class WorkerProcess:
         self._words.close()
 
     def _outcome(self, value: Any, error: BaseException | None, trace: str | None) -> Outcome:
-        return Outcome(self._task, value, error, trace, self._attempts)
+        return Outcome(self._task, value, error, trace, self._attempts, self._files)
 
     def _limit(self, what: str, seconds: float | None) -> None:
         if seconds is None:

@@ -105,7 +105,7 @@ def run_examination(
         run = Run(config, name, log.header.split, split.revision)
         log.begin(start_of(config, plan, said, {}, command))
         executor = executor or Processes(config.workers)
-        return run_items(run, AskTask(run, log.folder), items, split, log, executor, listener)
+        return run_items(run, AskTask(run), items, split, log, executor, listener)
 
 
 def _check_settings(config: AskConfig) -> None:

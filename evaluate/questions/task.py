@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from robomme_interference_data.evaluate.questions.answers import (
     Asked,
     make_answerer,
 )
-from robomme_interference_data.evaluate.record import write_record
+from robomme_interference_data.evaluate.record import record_file
 from robomme_interference_data.evaluate.rollout import retrieval_columns
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.evidence import known_parts
@@ -42,17 +41,17 @@ class AskTask:
     What breaks is raised, and the model is made anew for the next question.
     """
 
-    def __init__(self, run: Run[AskConfig], folder: Path):
-        self._run, self._folder = run, folder
+    def __init__(self, run: Run[AskConfig]):
+        self._run = run
         self._split: Split | None = None
         self._questions: dict[EpisodeId, Question] = {}
         self._selector: Selector | None = None
         self._answerer: Answerer | None = None
 
-    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
-        """Ask a question; return its row, and what befell its record, or None."""
+    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, None]:
+        """Ask a question, and hand in what was asked and answered; return its row."""
         try:
-            return self._ask(task)
+            return self._ask(task, worker), None
         except Exception:
             self.close()
             raise
@@ -63,7 +62,7 @@ class AskTask:
             self._answerer.close()
         self._answerer = None
 
-    def _ask(self, item: WorkItem) -> tuple[Rollout, str | None]:
+    def _ask(self, item: WorkItem, worker: Worker) -> Rollout:
         config, began = self._run.config, time.perf_counter()
         if self._split is None:
             self._split = load_split(config.split, cache=config.cache, threads=1)
@@ -114,10 +113,10 @@ class AskTask:
             model_s=round(answered.seconds, 4) if answered.seconds is not None else None,
             wall_s=round(time.perf_counter() - began, 4),
         )
-        if not own:
-            return row, None
-        line = {
-            **{"question": question.text, "prompt": answered.prompt, "text": answered.text},
-            **{"answer": answered.letter, "right": question.letters[question.right]},
-        }
-        return row, write_record(self._folder, "answers", item, [line])
+        if own:
+            line = {
+                **{"question": question.text, "prompt": answered.prompt, "text": answered.text},
+                **{"answer": answered.letter, "right": question.letters[question.right]},
+            }
+            worker.hand_in(*record_file("answers", item, [line]))
+        return row

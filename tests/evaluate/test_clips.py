@@ -6,17 +6,15 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from support.runs import EPISODE, config
+from support.runs import EPISODE, run_one
 from support.worlds import World
 
-from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data import Buffer, load_buffer
 from robomme_interference_data.encode import VideoEncoder
 from robomme_interference_data.evaluate.clips import history_picture
-from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.worker import RolloutTask
-from robomme_interference_data.execution import Outcome, Serial
+from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.strip import session_colors
 
 pytestmark = pytest.mark.usefixtures("trouble")
@@ -27,15 +25,6 @@ K1 = WorkItem("k1", EPISODE)
 @pytest.fixture
 def buffer(tiny_split: Path) -> Buffer:
     return load_buffer(EPISODE, "k1", split=tiny_split)
-
-
-def rolled(out: Path, item: WorkItem = K1, policy: str = "hold") -> Outcome:
-    """What a worker makes of a rollout with a clip."""
-    settings = config(videos=True, policy=policy)
-    split = load_split(settings.split)
-    task = RolloutTask(Run(settings, "my-memory", split.name, split.revision), out)
-    (outcome,) = Serial().run(task, [item])
-    return outcome
 
 
 def frames(path: Path) -> list[np.ndarray]:
@@ -50,10 +39,10 @@ def banner(picture: np.ndarray) -> list[float]:
 
 
 def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
-    row, problem = rolled(tmp_path).value
-    assert (row.status, row.steps, row.video, problem) == ("fail", 40, clip_name(K1), None)
-    assert clip_name(K1) == "videos/MoveCube_test_0_k1.mp4"
-    shown = frames(tmp_path / row.video)
+    [row] = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True).rows
+    assert (row.status, row.steps, row.video) == ("fail", 40, "videos/MoveCube_test_0_k1.mp4")
+    assert not (tmp_path / "run" / "errors.log").exists()
+    shown = frames(tmp_path / "run" / row.video)
     assert len(shown) == 1 + 40 + 10  # the first view, one a step, the end held
     assert shown[0].shape == (280, 1280, 3)
     assert banner(shown[0]) == pytest.approx([0x55] * 3, abs=12)
@@ -65,7 +54,7 @@ def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
         taught = buffer.frame(step)
         seen = image[24 : 24 + len(taught), : taught.shape[1]]
         assert np.abs(seen.astype(int) - taught).mean() < 10
-    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["MoveCube_test_0_k1.mp4"]
+    assert [path.name for path in (tmp_path / "run" / "videos").iterdir()] == ["MoveCube_test_0_k1.mp4"]
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 48), (48, 80), (40, 57), (3, 3)])
@@ -89,23 +78,33 @@ def test_the_history_is_what_was_given(start: int, stop: int, buffer: Buffer) ->
 def test_a_rollout_that_breaks_leaves_its_clip_too_unless_it_had_not_begun(
     tmp_path: Path, trouble: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def roll() -> Rollout:
+        [row] = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True).rows
+        return row
+
     (trouble / "MoveCube-0").write_text("raise")
-    outcome = rolled(tmp_path)
-    assert "the world fell apart" in str(outcome.error)
-    shown = frames(tmp_path / clip_name(K1))
+    row = roll()
+    assert "the world fell apart" in str(row.error) and row.video == clip_name(K1)
+    shown = frames(tmp_path / "run" / row.video)
     assert len(shown) == 1 + 4 + 10  # it broke in its fifth step
     assert banner(shown[-1]) == pytest.approx([0, 0, 0], abs=12)
-    left = tmp_path / "videos" / ".MoveCube_test_0_k1.mp4.abc.partial"
-    other = tmp_path / "videos" / ".MoveCube_test_0_k3.mp4.abc.partial"
-    for path in (left, other):
-        path.write_bytes(b"x")  # of a process that was killed
 
     def fall(*_: Any, **__: Any) -> Any:
         raise OSError("no world")
 
     monkeypatch.setattr(World, "reset", fall)
-    assert str(rolled(tmp_path).error) == "OSError: no world"
-    assert list((tmp_path / "videos").iterdir()) == [other]  # the old one is gone
+    row = roll()
+    assert (row.error, row.video) == ("OSError: no world", None)
+    assert not list((tmp_path / "run" / "videos").iterdir())  # the old one is gone
+
+
+def test_a_clip_that_cannot_be_written_leaves_the_row_as_it_is(tmp_path: Path) -> None:
+    run_one(tmp_path / "run", conditions=("k0",), policy="hold")
+    (tmp_path / "run" / "videos").symlink_to(tmp_path / "gone" / "videos")  # a disk taken out
+    result = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True)
+    assert [(row.status, row.video) for row in result.rows] == [("fail", None)]
+    told = (tmp_path / "run" / "errors.log").read_text()
+    assert "videos/MoveCube_test_0_k1.mp4 could not be written" in told
 
 
 @pytest.mark.parametrize("when", [0, 7, 45])
@@ -121,8 +120,9 @@ def test_a_clip_that_fails_leaves_the_row_as_it_is(
         add(self, picture)
 
     monkeypatch.setattr(VideoEncoder, "add", fail)
-    row, problem = rolled(tmp_path).value
+    [row] = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True).rows
     assert (row.status, row.steps, row.video) == ("fail", 40, None)
-    assert problem.startswith("the clip failed:\n")
-    assert problem.rstrip().endswith("No space left on device")
-    assert not list((tmp_path / "videos").iterdir())
+    told = (tmp_path / "run" / "errors.log").read_text()
+    assert "the clip failed:\n" in told
+    assert told.rstrip().endswith("No space left on device")
+    assert not (tmp_path / "run" / "videos").exists()
