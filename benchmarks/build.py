@@ -129,7 +129,7 @@ def measure(source: Source, folder: Path, options: argparse.Namespace) -> str:
         return BuildPlan(DEMONSTRATIONS, (source,), tasks, cameras, codec.name)
 
     def stage(source: Source) -> None:
-        task = StageTask(plan(source), place())
+        task = StageTask(plan(source))
         for episode in episodes:
             task((0, episode), Worker(0))
 

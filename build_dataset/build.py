@@ -22,7 +22,14 @@ from robomme_interference_data.build_dataset.lerobot_writer import (
     require_lerobot,
     write_lerobot,
 )
-from robomme_interference_data.build_dataset.stage import Staged, StageTask, Task, read_staged
+from robomme_interference_data.build_dataset.stage import (
+    Staged,
+    StageTask,
+    Task,
+    keep_staged,
+    read_staged,
+    staged_name,
+)
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH
 from robomme_interference_data.encode import get_codec
 from robomme_interference_data.errors import (
@@ -151,30 +158,33 @@ def _stage(
     progress: WorkProgress,
 ) -> None:
     """Stage episodes, and add each to those that are stored, which it must fit, or skipped."""
-    task = StageTask(plan, work / "episodes")
     limit = plan.time_limit or max(source.time_limit for source in plan.sources)
+
+    def place(one: Task) -> Path:
+        return work / "episodes" / staged_name(plan, one)
 
     def take(one: Task, staged: Staged, *, before: bool) -> None:
         progress.advance(1, before=before)
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
-            stored.append(staged.stored(task.place(one)))
+            stored.append(staged.stored(place(one)))
             _check_alike(stored[0], stored[-1])
 
     missing = []
     progress.start("Reading and encoding", len(todo))
     for one in todo:
-        done = read_staged(task.place(one))
+        done = read_staged(place(one))
         if done is None:
             missing.append(one)
         else:
             take(one, done, before=True)
     failures: list[Outcome] = []
     # Closed before anybody looks at what is staged: an error would keep the workers running.
-    with closing(executor.run(task, missing, time_limit=limit)) as outcomes:
+    with closing(executor.run(StageTask(plan), missing, time_limit=limit)) as outcomes:
         for outcome in outcomes:
             if outcome.error is None:
+                keep_staged(place(outcome.task), outcome.value, outcome.files)
                 take(outcome.task, outcome.value, before=False)
                 continue
             failures.append(outcome)

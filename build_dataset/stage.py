@@ -1,14 +1,14 @@
 """Stage one episode: cut and encode it while it is read, decode it again, record its hashes.
 
-A staged episode is a folder that appears under its final name only when it is complete and
-checked, so an interrupted build goes on from the folders that it finds.
+A staged episode is handed to the build, which keeps it in a folder that appears under its final
+name only when it is complete: an interrupted build goes on from the folders that it finds.
 """
 
 import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,60 +74,51 @@ class Staged:
         )
 
 
+def staged_name(plan: BuildPlan, task: Task) -> str:
+    """Return the name of a staged episode's folder: a hash of all that decides it."""
+    number, episode = task
+    codec = get_codec(plan.codec)
+    content = {
+        "kind": plan.kind,
+        "source": plan.sources[number].provenance,
+        "episode": [str(episode.id), repr(episode.key)],
+        "cameras": plan.cameras,
+        "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
+        "layout": _LAYOUT,
+    }
+    return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
+
+
 @dataclass(frozen=True)
 class StageTask:
     """Stages one episode after the other, as a task of an executor.
 
     Attributes:
         plan: What to build.
-        folder: Where staged episodes appear.
     """
 
     plan: BuildPlan
-    folder: Path
-
-    def place(self, task: Task) -> Path:
-        """Return the folder of a staged episode: named by a hash of all that decides it."""
-        number, episode = task
-        codec = get_codec(self.plan.codec)
-        content = {
-            "kind": self.plan.kind,
-            "source": self.plan.sources[number].provenance,
-            "episode": [str(episode.id), repr(episode.key)],
-            "cameras": self.plan.cameras,
-            "codec": [codec.vcodec, codec.pix_fmt, dict(codec.options)],
-            "layout": _LAYOUT,
-        }
-        return self.folder / hashlib.sha256(canonical_json(content).encode()).hexdigest()[:24]
 
     def __call__(self, task: Task, worker: Worker) -> Staged:
-        """Cut, encode, check and record one episode.
+        """Cut, encode and check one episode, hand in its files, and return what is known of it.
 
         Raises:
             InvalidOptionError: It has no such camera.
             SourceError: The recording breaks off, or holds what cannot be stored.
             BuildError: A video does not decode to what went in.
         """
-        place = self.place(task)
-        done = read_staged(place)
-        if done is not None:
-            return done
         number, episode = task
-        place.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(dir=place.parent, prefix=f".{place.name}."))
-        try:
-            recording = self.plan.sources[number].read(episode, self.plan.cameras)
-            with closing(recording.frames):
-                staged = self._write(episode.id, recording, partial)
-            write_json(partial / _RECORD, to_dict(staged))
-            for path in partial.iterdir():  # the data must reach the disk before the name does
-                with path.open("rb") as file:
-                    os.fsync(file.fileno())
-            partial.rename(place)
-        except InterferenceError as error:
-            raise error.about(episode.id) from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            try:
+                recording = self.plan.sources[number].read(episode, self.plan.cameras)
+                with closing(recording.frames):
+                    staged = self._write(episode.id, recording, folder)
+            except InterferenceError as error:
+                raise error.about(episode.id) from error
+            if staged.skipped is None:
+                for path in sorted(folder.iterdir()):
+                    worker.hand_in(path.name, path.read_bytes())
         return staged
 
     def close(self) -> None:
@@ -175,6 +166,22 @@ class StageTask:
             for feature, one in writer.stats.items()
         }
         return Staged(episode, None, record, writer.features, stats)
+
+
+def keep_staged(folder: Path, staged: Staged, files: Mapping[str, bytes]) -> None:
+    """Write a staged episode and its files into a folder, which appears when it is complete."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    try:
+        for name, data in files.items():
+            (partial / name).write_bytes(data)
+        write_json(partial / _RECORD, to_dict(staged))
+        for path in partial.iterdir():  # the data must reach the disk before the name does
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def read_staged(folder: Path) -> Staged | None:

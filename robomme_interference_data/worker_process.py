@@ -37,7 +37,7 @@ class Worker:
         number: From 0; a worker that takes the place of one that died has its number.
     """
 
-    def __init__(self, number: int, tell: Callable[[Any], None]):
+    def __init__(self, number: int, tell: Callable[[Any], None] = lambda message: None):
         self.number = number
         self._tell = tell
 

@@ -54,7 +54,9 @@ def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
         taught = buffer.frame(step)
         seen = image[24 : 24 + len(taught), : taught.shape[1]]
         assert np.abs(seen.astype(int) - taught).mean() < 10
-    assert [path.name for path in (tmp_path / "run" / "videos").iterdir()] == ["MoveCube_test_0_k1.mp4"]
+    assert [path.name for path in (tmp_path / "run" / "videos").iterdir()] == [
+        "MoveCube_test_0_k1.mp4"
+    ]
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 48), (48, 80), (40, 57), (3, 3)])

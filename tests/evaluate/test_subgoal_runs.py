@@ -242,4 +242,5 @@ def test_subgoals_that_cannot_be_written_are_told_and_cost_nothing(tmp_path: Pat
     (tmp_path / "subgoals").write_text("a file")
     result = run(tmp_path, policy=TOLD, subgoals="oracle")
     assert result.counts["fail"] == 4
-    assert "subgoals could not be written" in (tmp_path / "errors.log").read_text()
+    told = (tmp_path / "errors.log").read_text()
+    assert "subgoals/MoveCube_test_0_k0.jsonl could not be written" in told
