@@ -163,8 +163,8 @@ def _stage(
     def place(one: Task) -> Path:
         return work / "episodes" / staged_name(plan, one)
 
-    def take(one: Task, staged: Staged, *, before: bool) -> None:
-        progress.advance(1, before=before)
+    def take(one: Task, staged: Staged, *, before: bool, node: str | None = None) -> None:
+        progress.advance(1, before=before, node=node)
         if staged.skipped is not None:
             skipped[str(staged.episode_id)] = staged.skipped
         else:
@@ -185,7 +185,7 @@ def _stage(
         for outcome in outcomes:
             if outcome.error is None:
                 keep_staged(place(outcome.task), outcome.value, outcome.files)
-                take(outcome.task, outcome.value, before=False)
+                take(outcome.task, outcome.value, before=False, node=outcome.node)
                 continue
             failures.append(outcome)
             if isinstance(outcome.error, InvalidOptionError | MissingExtraError):

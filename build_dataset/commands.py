@@ -34,6 +34,7 @@ from robomme_interference_data.constants import (
     SHIFTED,
 )
 from robomme_interference_data.errors import MissingFileError, visible
+from robomme_interference_data.execution import WorkersConfig, make_executor
 from robomme_interference_data.settings import with_settings
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def demonstrations(config: BuildConfig, as_json: AsJson = False) -> None:
     ```
     """
     with stoppable(_KEPT):
-        _build(plan_build(DEMONSTRATIONS, config), config.out, config.workers, as_json=as_json)
+        _build(plan_build(DEMONSTRATIONS, config), config.out, config, as_json=as_json)
 
 
 @app.command()
@@ -104,7 +105,7 @@ def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
     ```
     """
     with stoppable(_KEPT):
-        _build(plan_build(DISTRACTORS, config), config.out, config.workers, as_json=as_json)
+        _build(plan_build(DISTRACTORS, config), config.out, config, as_json=as_json)
 
 
 @app.command(name=RAW_DISTRACTORS)
@@ -120,7 +121,7 @@ def raw_distractors(config: BuildConfig, as_json: AsJson = False) -> None:
     ```
     """
     with stoppable(_KEPT):
-        _build(plan_build(RAW_DISTRACTORS, config), config.out, config.workers, as_json=as_json)
+        _build(plan_build(RAW_DISTRACTORS, config), config.out, config, as_json=as_json)
 
 
 @app.command()
@@ -137,7 +138,7 @@ def contradictions(config: BuildConfig, as_json: AsJson = False) -> None:
     ```
     """
     with stoppable(_KEPT):
-        _build(plan_build(CONTRADICTIONS, config), config.out, config.workers, as_json=as_json)
+        _build(plan_build(CONTRADICTIONS, config), config.out, config, as_json=as_json)
 
 
 @app.command()
@@ -155,7 +156,7 @@ def shifted(config: BuildConfig, as_json: AsJson = False) -> None:
     ```
     """
     with stoppable(_KEPT):
-        _build(plan_build(SHIFTED, config), config.out, config.workers, as_json=as_json)
+        _build(plan_build(SHIFTED, config), config.out, config, as_json=as_json)
 
 
 @app.command()
@@ -235,7 +236,7 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
         taken = " and ".join(f"{kind} of {len(step.tasks):,}" for kind, step in steps.items())
         say(f"Recorded episodes to take: {taken}")
         for kind, step in steps.items():
-            _build(step, config.out / kind, config.workers, as_json=False)
+            _build(step, config.out / kind, config, as_json=False)
         _plan(config.out, plan, as_json=as_json)
     say(f"Next: robomme-interference verify {config.out}")
 
@@ -257,19 +258,18 @@ def new_split(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> N
     with stoppable(_KEPT):
         base, units = plan_new(config, plan)
         say(f"Demonstrations: {base.files.describe()}; episodes to take: {len(units.tasks):,}")
-        _build(units, config.out / DISTRACTORS, config.workers, as_json=False)
+        _build(units, config.out / DISTRACTORS, config, as_json=False)
         _plan(config.out, plan, as_json=as_json, base=base.files)
         audit(config.out)
     say(f"Next: robomme-interference publish {config.out} --repo-id NAMESPACE/NAME")
 
 
-def _build(plan: BuildPlan, out: Path, workers: int, *, as_json: bool) -> None:
+def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool) -> None:
     from robomme_interference_data.build_dataset.build import build_dataset
-    from robomme_interference_data.execution import Processes
     from robomme_interference_data.work_progress import WorkProgress
 
     with WorkProgress(unit="episodes") as progress:
-        result = build_dataset(plan, out, Processes(workers), progress)
+        result = build_dataset(plan, out, make_executor(workers), progress)
     done = f"{result.added} added" if result.added else "was built before"
     say(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
     for name, why in sorted(result.skipped.items())[:_TOLD]:

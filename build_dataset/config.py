@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +20,7 @@ from robomme_interference_data.constants import (
     UNITS,
 )
 from robomme_interference_data.errors import InvalidOptionError, SourceError
+from robomme_interference_data.execution import WorkersConfig, make_executor
 from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.manifest import SessionEntry
 from robomme_interference_data.settings import setting
@@ -33,7 +34,7 @@ _CPUS = os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
-class BuildConfig:
+class BuildConfig(WorkersConfig):
     """What to build of which recordings, and how."""
 
     source: tuple[str, ...] = setting(
@@ -51,7 +52,6 @@ class BuildConfig:
         "av1-lossless", help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy)."
     )
     version: str = setting("1.0.0", help="Version that the dataset carries.")
-    workers: int = setting(_CPUS, help="Worker processes.", shown="all processors")
     time_limit: float | None = setting(
         None,
         help="Seconds that one episode may take before it is tried once more.",
@@ -66,6 +66,8 @@ class BuildConfig:
     robomme_python: str | None = setting(
         None, help="Source robomme: interpreter that has RoboMME.", env="ROBOMME_PYTHON"
     )
+    _: KW_ONLY
+    workers: int = setting(_CPUS, help="Worker processes.", shown="all processors")
 
 
 @dataclass(frozen=True)
@@ -227,12 +229,11 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
     """
     from robomme_interference_data.build_dataset.sources import open_source
     from robomme_interference_data.encode import get_codec
-    from robomme_interference_data.execution import Processes
 
     get_codec(config.codec)
     if config.time_limit is not None and not config.time_limit > 0:
         raise InvalidOptionError.expected("--time-limit", config.time_limit, "seconds, above 0")
-    Processes(config.workers)
+    make_executor(config)  # refuses what it may not be
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
     pairs = [text.partition("=") for text in config.columns]
     if not all(name and equals and column for name, equals, column in pairs):

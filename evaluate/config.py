@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 from robomme_interference_data.constants import PROTOCOL_VERSION, SAMPLE_FRAMES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.execution import WorkersConfig
 from robomme_interference_data.rollouts import Rollout
 from robomme_interference_data.settings import setting
 from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP
@@ -24,7 +25,7 @@ class RetrievalConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkConfig(RetrievalConfig):
+class WorkConfig(WorkersConfig, RetrievalConfig):
     """Which episodes and conditions, under which name, and how the work is done."""
 
     conditions: tuple[str, ...] = setting(
@@ -36,7 +37,6 @@ class WorkConfig(RetrievalConfig):
     shard: str = setting("1/1", help="Part of the plan to run, such as 2/8; see merge.")
     system: str | None = setting(None, help="Name for the rows; see docs/systems.md.")
     model_seed: int = setting(0, help="Seed for what is drawn at random.")
-    workers: int = setting(1, help="Worker processes.", metavar="N")
     rollout_timeout: float = setting(
         3600.0, help="Seconds that a rollout, or a question, may take."
     )

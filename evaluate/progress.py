@@ -7,7 +7,7 @@ from typing import Self
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
 from robomme_interference_data.conditions import parse_condition
@@ -38,6 +38,7 @@ class RunProgress:
             console=self._console,
         )
         self._task = self._bar.add_task("evaluate", total=None, left="")
+        self._nodes: dict[str, TaskID] = {}
         self._items: tuple[WorkItem, ...] = ()
         self._rows: list[Rollout] = []
         self._before = 0  # rows of an earlier run
@@ -61,9 +62,13 @@ class RunProgress:
         if done and not self._console.is_terminal:
             self._console.print(f"{len(done)} of {len(items)} {self._unit} are done already")
 
-    def row(self, row: Rollout) -> None:
-        """Count a row."""
+    def row(self, row: Rollout, node: str | None = None) -> None:
+        """Count a row, and which node of a cluster it is from."""
         self._rows.append(row)
+        if node is not None:
+            if node not in self._nodes:
+                self._nodes[node] = self._bar.add_task("", total=len(self._items), left=node)
+            self._bar.advance(self._nodes[node])
         self._last = time.monotonic()
         self._bar.advance(self._task)
         if not is_done(row):

@@ -38,9 +38,9 @@ from robomme_interference_data.evaluate.worker import RolloutTask
 from robomme_interference_data.execution import (
     Executor,
     Outcome,
-    Processes,
     Task,
     end_if_starting,
+    make_executor,
 )
 from robomme_interference_data.files import atomic_path
 from robomme_interference_data.loading import load_split
@@ -76,8 +76,8 @@ class Listener(Protocol):
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Take what was asked for, and the rows that an earlier run finished."""
 
-    def row(self, row: Rollout) -> None:
-        """Take a row that has just been written."""
+    def row(self, row: Rollout, node: str | None) -> None:
+        """Take a row that has just been written, and the node of a cluster that it is from."""
 
 
 def run_evaluation(
@@ -96,7 +96,7 @@ def run_evaluation(
 
     Args:
         config: What to roll out, and how.
-        executor: Who runs the rollouts; `config.workers` processes by default.
+        executor: Who runs the rollouts; by default what `config` says.
         listener: Hears how the run goes.
         command: The command line, for the record.
 
@@ -136,7 +136,7 @@ def run_evaluation(
             shard=config.shard,
         )
         items = check_plan(config, system, split, policy, plan)
-        executor = executor or Processes(config.workers)
+        executor = executor or make_executor(config)
         there = read_record(folder)
         if any(item not in there or not is_done(there[item]) for item in items):
             check_simulator(config, policy.cameras, executor)
@@ -146,8 +146,7 @@ def run_evaluation(
         with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
             # The same split may be in another folder by now: rows keep one label for it.
             run = Run(config, name, log.header.split, split.revision)
-            used = ["lerobot"] if config.policy.startswith("lerobot:") else []
-            log.begin(start_of(config, plan, said | written, versions, command, used))
+            log.begin(start_of(config, plan, said | written, versions, command))
             return run_items(run, RolloutTask(run), items, split, log, executor, listener)
 
 
@@ -188,7 +187,7 @@ def run_items[C: RunConfig | AskConfig](
             row, trace = _row(run, outcome, split, log)
             log.append(row, trace)
             if listener is not None:
-                listener.row(row)
+                listener.row(row, outcome.node)
             errors = 0 if is_done(row) else errors + 1
             if errors >= run.config.max_errors:
                 stopped = f"{errors} in a row broke; the last: {row.error}"

@@ -4,8 +4,7 @@ import dataclasses
 import datetime
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
-from importlib import metadata
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,9 @@ from robomme_interference_data.evaluate.log import Start
 from robomme_interference_data.evaluate.plan import Plan
 from robomme_interference_data.evaluate.policies.identity import plain, policy_identity
 from robomme_interference_data.evaluate.subgoals.registry import subgoals_identity
+from robomme_interference_data.evaluate.versions import package_versions
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.split import Split
-
-_PACKAGES = ("robomme-interference-data", "numpy", "av", "torch")
 
 
 def run_identity(
@@ -76,24 +74,13 @@ def start_of(
     said: Mapping[str, Any],
     versions: Mapping[str, str],
     command: Sequence[str],
-    used: Iterable[str] = (),
 ) -> Start:
-    """Return what is recorded of a start that begins now; `used` are further packages."""
-    names = [*_PACKAGES, *used]
-    names += ["transformers"] if config.retrieval is not None else []
-    # RoboMME's interpreter has others, which `versions` tells.
-    names += ["mani-skill", "sapien"] if config.simulator == "tabletop" else []
-    installed = {"python": platform.python_version()}
-    for name in names:
-        try:
-            installed[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
+    """Return what is recorded of a start that begins now."""
     return Start(
         command=tuple(map(plain, command)),
         settings=plain(dataclasses.asdict(config)),
         plan=plan,
-        versions=installed | dict(versions),
+        versions=package_versions(config) | dict(versions),
         git=_git(),
         machine=platform.machine(),
         policy=dict(said),

@@ -22,12 +22,13 @@ from robomme_interference_data.evaluate.record import record_file
 from robomme_interference_data.evaluate.rollout import run_rollout
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
+from robomme_interference_data.evaluate.versions import package_versions
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.rows import to_dict
 from robomme_interference_data.simulators.base import CAMERAS, Simulator
-from robomme_interference_data.simulators.registry import make_simulator
+from robomme_interference_data.simulators.registry import make_simulator, simulator_versions
 from robomme_interference_data.split import Split
 
 if TYPE_CHECKING:
@@ -96,6 +97,13 @@ class RolloutTask:
             clip=clip,
             worker=worker,
         )
+
+    def describe(self) -> dict[str, str]:
+        """Return the split's revision and all versions, where it would run."""
+        config = self._run.config
+        versions = simulator_versions(config.simulator, config.robomme_python)
+        revision = load_split(config.split).revision
+        return package_versions(config) | versions | {"the split's revision": revision}
 
     def close(self) -> None:
         """Release simulator, policy and what writes subgoals."""

@@ -20,6 +20,8 @@ from robomme_interference_data.console import (
 )
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.execution import Serial, WorkersConfig, make_executor
+from robomme_interference_data.settings import with_settings
 from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ EncoderName = Annotated[
 Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
 
 
+@with_settings
 def index(
     split: Annotated[Path, typer.Argument(help="Folder of a split, or of one of its datasets.")],
     encoder: EncoderName = "thumbnail",
@@ -49,9 +52,8 @@ def index(
     threads: Annotated[
         int | None, typer.Option(help="Threads that decode.", show_default="all processors")
     ] = None,
-    workers: Annotated[
-        int, typer.Option(help="Processes that embed, each with a model of its own.")
-    ] = 1,
+    *,
+    workers: WorkersConfig,
     force: Annotated[bool, typer.Option("--force", help="Make it again from nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -67,7 +69,6 @@ def index(
     robomme-interference index my-split --encoder siglip --device cuda
     ```
     """
-    from robomme_interference_data.execution import Processes, Serial
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval.encoders import make_encoder
     from robomme_interference_data.retrieval.index import build_index, look_on_hub
@@ -91,7 +92,7 @@ def index(
             camera=camera,
             threads=(os.cpu_count() or 1) if threads is None else threads,
             force=force,
-            executor=Serial() if workers == 1 else Processes(workers),
+            executor=Serial() if workers == WorkersConfig() else make_executor(workers),
         )
     for told in look_on_hub(planned, made, camera) if planned else ():
         say(told)

@@ -251,7 +251,7 @@ class _Work:
                 )
             with atomic_path(self.features[outcome.task]) as partial:
                 write_array(partial, outcome.value)
-            progress.advance(len(outcome.value))
+            progress.advance(len(outcome.value), node=outcome.node)
         return sum(self.lengths[episode] for episode in missing)
 
     def write(self) -> IndexHeader:

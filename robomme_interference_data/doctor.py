@@ -68,6 +68,7 @@ def checks() -> list[Check]:
         check_robomme(),
         check_packages("Evaluate", "evaluate"),
         check_packages("Vision-language models", "vlm"),
+        check_packages("Clusters", "cluster"),
         check_packages("Retrieval", "retrieval"),
         check_packages("Score", "score"),
         check_hub_token(),

@@ -189,6 +189,10 @@ class WorkerError(InterferenceError, RuntimeError):
     """Worker processes that cannot be started."""
 
 
+class ClusterError(InterferenceError, RuntimeError):
+    """A cluster that cannot be reached, or whose nodes are not what they should be."""
+
+
 class WorkerRetiredError(InterferenceError, RuntimeError):
     """A worker that can do no further task: what it had to do is left to the others."""
 

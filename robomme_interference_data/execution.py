@@ -5,13 +5,17 @@ up on all work when one process dies and cannot stop a hung task; pebble stops o
 tries it again, nor ends what the task had started, nor tells where it hung.
 """
 
+import platform
 from collections import deque
 from collections.abc import Generator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
+from importlib import metadata
 from typing import Any, Protocol, TypedDict, Unpack
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
+from robomme_interference_data.lazy import load_extra
+from robomme_interference_data.settings import setting
 from robomme_interference_data.worker_process import (
     Outcome,
     Task,
@@ -26,7 +30,7 @@ from robomme_interference_data.worker_process import (
 __all__ = ["Executor", "Outcome", "Processes", "Serial", "Task", "Worker", "end_if_starting"]
 
 
-_ATTEMPTS = 2
+ATTEMPTS = 2
 
 
 class Limits(TypedDict, total=False):
@@ -42,6 +46,53 @@ class Limits(TypedDict, total=False):
     time_limit: float | None
     attempts: int
     again: tuple[type[Exception], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkersConfig:
+    """Who does the work."""
+
+    workers: int = setting(1, help="Worker processes.", metavar="N")
+    executor: str = setting("processes", help="processes, on this machine, or ray, on a cluster.")
+    ray_address: str = setting(
+        "auto", metavar="ADDRESS", help="ray: auto, local or HOST:PORT; see docs/cluster.md."
+    )
+    cpus_per_worker: float = setting(1.0, help="ray: processors that each worker takes.")
+    gpus_per_worker: float = setting(0.0, help="ray: share of a GPU that each worker takes.")
+
+
+def make_executor(config: WorkersConfig) -> "Executor":
+    """Make who does the work.
+
+    Raises:
+        InvalidOptionError: A setting is not what it may be, or says nothing of the others.
+        MissingExtraError: Ray is not installed.
+    """
+    if config.executor == "processes":
+        for one in fields(WorkersConfig)[2:]:
+            if getattr(config, one.name) != one.default:
+                raise InvalidOptionError(
+                    f"--{one.name.replace('_', '-')} says nothing of --executor processes",
+                    "Add --executor ray, or leave it out.",
+                )
+        return Processes(config.workers)
+    if config.executor != "ray":
+        raise InvalidOptionError.one_of("--executor", config.executor, ("processes", "ray"))
+    make = load_extra(f"{__package__}.cluster", "RayWorkers", "--executor ray", "cluster")
+    executor: Executor = make(
+        config.workers, config.ray_address, config.cpus_per_worker, config.gpus_per_worker
+    )
+    return executor
+
+
+def describe(function: Task) -> dict[str, str]:
+    """Return what has to be the same wherever a function does tasks, as text by name.
+
+    Versions of Python and this package, and what its method `describe` returns, if it has one.
+    """
+    package = "robomme-interference-data"
+    versions = {"python": platform.python_version(), package: metadata.version(package)}
+    return versions | getattr(function, "describe", dict)()
 
 
 class Executor(Protocol):
@@ -79,7 +130,7 @@ class Serial:
         self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
     ) -> Generator[Outcome]:
         """Call a function on every task; see `Executor.run`."""
-        attempts = limits.get("attempts", _ATTEMPTS)
+        attempts = limits.get("attempts", ATTEMPTS)
         try:
             for task in tasks:
                 for number in range(1, attempts + 1):
@@ -152,7 +203,7 @@ class Processes:
                         waiting.appendleft((outcome.task, outcome.attempts))
                         if not running and not to_start:
                             raise outcome.error
-                    elif outcome.attempts < limits.get("attempts", _ATTEMPTS) and (
+                    elif outcome.attempts < limits.get("attempts", ATTEMPTS) and (
                         worker.over or isinstance(outcome.error, again)
                     ):
                         waiting.append((outcome.task, outcome.attempts + 1))

@@ -48,6 +48,7 @@ class WorkProgress:
             speed_estimate_period=3600,  # s; one piece of work may take half of it
         )
         self._task: TaskID | None = None
+        self._nodes: dict[str, TaskID] = {}
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -58,18 +59,24 @@ class WorkProgress:
 
     def start(self, description: str, frames: int) -> None:
         """Begin a new bar of so many frames."""
-        self._task = self._progress.add_task(description, total=frames)
+        self._task, self._nodes = self._progress.add_task(description, total=frames), {}
         self._progress.advance(self._task, 0)  # the speed is since then
 
-    def advance(self, frames: int, *, before: bool = False) -> None:
+    def advance(self, frames: int, *, before: bool = False, node: str | None = None) -> None:
         """Count frames as done.
 
         Args:
             frames: How many.
             before: They were done by an earlier run, and do not count for the speed.
+            node: The node of a cluster that did them; each has a bar of its own.
         """
         if self._task is None:
             return
+        if node is not None:
+            if node not in self._nodes:
+                total = self._progress.tasks[-1].total
+                self._nodes[node] = self._progress.add_task(f"  {node}", total=total)
+            self._progress.advance(self._nodes[node], frames)
         if before:
             task = next(task for task in self._progress.tasks if task.id == self._task)
             self._progress.reset(self._task, completed=int(task.completed) + frames)

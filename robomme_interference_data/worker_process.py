@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from robomme_interference_data.errors import InterferenceError, WorkerError
 
-_CLOSE_S = 10.0
+CLOSE_S = 10.0
 """Seconds that workers without work have to close what they hold."""
 
 _LOOK_S = 5.0
@@ -65,7 +65,8 @@ class Worker:
 class Task(Protocol):
     """What is done of each task: a picklable function, which workers get a copy of.
 
-    If it has a method `close`, a worker that ends in peace calls it.
+    If it has a method `close`, a worker that ends in peace calls it. If it has a method `describe`,
+    what that returns, text by name, has to be the same wherever it runs (see `describe`).
     """
 
     def __call__(self, task: Any, worker: Worker) -> Any:
@@ -86,6 +87,7 @@ class Outcome:
         trace: Where it was raised, or where the worker hung; None if not known.
         attempts: How often the task was started.
         files: What it handed in, see `Worker.hand_in`: path to bytes.
+        node: Where in a cluster it was done; None on this machine.
     """
 
     task: Any
@@ -94,6 +96,7 @@ class Outcome:
     trace: str | None = None
     attempts: int = 1
     files: Mapping[str, bytes] = field(default_factory=dict)
+    node: str | None = None
 
 
 def attempt(
@@ -268,7 +271,7 @@ def end_workers(workers: Sequence[WorkerProcess]) -> None:
             worker.stop()
         else:
             worker._pipe.close()
-    deadline = time.monotonic() + _CLOSE_S
+    deadline = time.monotonic() + CLOSE_S
     for worker in workers:
         worker._process.join(max(0.0, deadline - time.monotonic()))
         worker.stop()

@@ -26,7 +26,7 @@ from robomme_interference_data.evaluate.questions.task import AskTask
 from robomme_interference_data.evaluate.run import Listener, RunResult, run_items
 from robomme_interference_data.evaluate.start import retrieval_index, start_of
 from robomme_interference_data.evaluate.systems import known_system, name_system
-from robomme_interference_data.execution import Executor, Processes, end_if_starting
+from robomme_interference_data.execution import Executor, end_if_starting, make_executor
 from robomme_interference_data.loading import load_split
 from robomme_interference_data.questions import digest_questions, read_questions
 from robomme_interference_data.retrieval.select import Rule
@@ -50,7 +50,7 @@ def run_examination(
 
     Args:
         config: What is asked, and of whom.
-        executor: Who asks; `config.workers` processes by default.
+        executor: Who asks; by default what `config` says.
         listener: Hears how it goes.
         command: The command line, for the record.
 
@@ -104,7 +104,7 @@ def run_examination(
     with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
         run = Run(config, name, log.header.split, split.revision)
         log.begin(start_of(config, plan, said, {}, command))
-        executor = executor or Processes(config.workers)
+        executor = executor or make_executor(config)
         return run_items(run, AskTask(run), items, split, log, executor, listener)
 
 

@@ -16,12 +16,13 @@ from robomme_interference_data.evaluate.questions.answers import (
 )
 from robomme_interference_data.evaluate.record import record_file
 from robomme_interference_data.evaluate.rollout import retrieval_columns
+from robomme_interference_data.evaluate.versions import package_versions
 from robomme_interference_data.evaluate.worker import make_selector
 from robomme_interference_data.evidence import known_parts
 from robomme_interference_data.execution import Worker
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.loading import load_split
-from robomme_interference_data.questions import Question, read_questions
+from robomme_interference_data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.sampling import (
     MEMORIES,
@@ -55,6 +56,13 @@ class AskTask:
         except Exception:
             self.close()
             raise
+
+    def describe(self) -> dict[str, str]:
+        """Return the split's revision, its questions' digest and versions, where it would run."""
+        split = load_split(self._run.config.split)
+        questions = digest_questions(read_questions(split).values())
+        told = {"the split's revision": split.revision, "the questions' digest": questions}
+        return package_versions(self._run.config) | told
 
     def close(self) -> None:
         """Release who answers."""

@@ -1,5 +1,7 @@
 """What every executor does, shown by the one in this process."""
 
+import re
+import sys
 import threading
 from typing import Any
 
@@ -8,10 +10,18 @@ import pytest
 from robomme_interference_data.errors import (
     InvalidIdError,
     InvalidOptionError,
+    MissingExtraError,
     SimulatorCrashError,
     WorkerRetiredError,
 )
-from robomme_interference_data.execution import Processes, Serial, Worker
+from robomme_interference_data.execution import (
+    Processes,
+    Serial,
+    Worker,
+    WorkersConfig,
+    describe,
+    make_executor,
+)
 from robomme_interference_data.ids import EpisodeId
 
 
@@ -96,3 +106,69 @@ def test_work_that_is_given_up_closes_what_it_holds() -> None:
 def test_workers_must_be_positive(workers: int) -> None:
     with pytest.raises(InvalidOptionError, match=f"workers {workers}"):
         Processes(workers)
+
+
+def test_what_is_handed_in_comes_with_the_outcome_however_the_task_ends() -> None:
+    def write(task: str, worker: Worker) -> None:
+        worker.hand_in("a.txt", b"first")
+        worker.hand_in("a.txt", task.encode())
+        if task == "bad":
+            raise ValueError("no")
+
+    good, bad = Serial().run(write, ["good", "bad"])
+    assert (good.files, bad.files) == ({"a.txt": b"good"}, {"a.txt": b"bad"})
+
+
+def test_of_a_task_that_is_tried_again_only_the_last_files_count() -> None:
+    left = [1]
+
+    def write(task: str, worker: Worker) -> None:
+        if left:
+            worker.hand_in("early.txt", b"")
+            raise SimulatorCrashError(str(left.pop()))
+
+    (outcome,) = Serial().run(write, ["x"], again=(SimulatorCrashError,))
+    assert (outcome.error, outcome.attempts, outcome.files) == (None, 2, {})
+
+
+# --- who does the work ---------------------------------------------------------------------------
+
+
+def test_the_executor_that_is_asked_for() -> None:
+    assert make_executor(WorkersConfig(workers=3)) == Processes(3)
+    executor = make_executor(WorkersConfig(workers=8, executor="ray", gpus_per_worker=0.25))
+    assert vars(executor) == {"workers": 8, "address": "auto", "cpus": 1.0, "gpus": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"executor": "rey"}, "'rey' is none of processes, ray"),
+        ({"workers": 0}, "workers 0"),
+        ({"gpus_per_worker": 0.5}, "--gpus-per-worker says nothing of --executor processes"),
+        ({"ray_address": "local"}, "--ray-address says nothing of --executor processes"),
+        ({"executor": "ray", "workers": 0}, "workers 0"),
+        ({"executor": "ray", "gpus_per_worker": -1.0}, "--gpus-per-worker -1"),
+        ({"executor": "ray", "cpus_per_worker": float("nan")}, "--cpus-per-worker nan"),
+    ],
+)
+def test_settings_of_workers_are_checked(settings: dict[str, Any], told: str) -> None:
+    with pytest.raises(InvalidOptionError, match=re.escape(told)):
+        make_executor(WorkersConfig(**settings))
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "robomme_interference_data.cluster", raising=False)
+    with pytest.raises(MissingExtraError) as raised:
+        make_executor(WorkersConfig(executor="ray"))
+    assert "[cluster]" in str(raised.value.hint)
+
+
+def test_a_function_says_what_has_to_be_the_same_everywhere() -> None:
+    class Told(Noted):
+        def describe(self) -> dict[str, str]:
+            return {"the split's revision": "abc"}
+
+    assert {"python", "robomme-interference-data"} == describe(Noted()).keys()
+    assert describe(Told())["the split's revision"] == "abc"

@@ -95,7 +95,7 @@ class Impatient:
     def start(self, items: Any, done: Any) -> None:
         self.seen = header(self.out)
 
-    def row(self, row: Any) -> None:
+    def row(self, row: Any, node: Any) -> None:
         raise KeyboardInterrupt
 
 

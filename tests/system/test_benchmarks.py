@@ -133,3 +133,14 @@ def test_robomme(robomme_python: Path) -> None:
     (rows,) = printed("robomme", *options)
     assert [row["family"] for row in rows] == ["MoveCube"] * 4
     assert rows[0]["times as fast"] == "1.0"
+
+
+@pytest.mark.slow
+def test_cluster() -> None:
+    options = ("--rollouts", "30", "--tasks", "2", "--seconds", "0.01", "--workers", "1")
+    ((cost,), overhead, grid) = printed("cluster", *options)
+    assert cost["rollouts"] == "30"
+    assert [row["executor"] for row in overhead] == ["processes", "ray", "ratio, median"]
+    assert [row["workers"] for row in grid] == ["8", "64", "512"]
+    # What is simulated is the same everywhere, and no order beats the ideal.
+    assert all(1 <= float(row["longest first / ideal"]) < 1.1 for row in grid)

@@ -185,7 +185,7 @@ class Stopper:
 
     def start(self, items: Any, done: Any) -> None: ...
 
-    def row(self, row: Any) -> None:
+    def row(self, row: Any, node: Any) -> None:
         while self.stops:
             self.stops.pop().close()
 

@@ -5,13 +5,16 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.ray_cluster import running_cluster
 from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
 
+from robomme_interference_data.cluster import RayWorkers
 from robomme_interference_data.errors import SimulatorCrashError, WorkerRetiredError
 from robomme_interference_data.execution import Outcome, Processes
 
@@ -19,9 +22,25 @@ pytestmark = pytest.mark.timeout(150)
 
 TESTS = Path(__file__).parent.parent
 
+Run = Callable[..., list[Outcome]]
 
-def run(tasks: list[Any], workers: int = 1, **options: Any) -> list[Outcome]:
-    return list(Processes(workers).run(behave, tasks, **options))
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    with running_cluster(3) as made:
+        yield made
+
+
+@pytest.fixture(params=["processes", pytest.param("ray", marks=pytest.mark.slow)])
+def run(request: pytest.FixtureRequest) -> Run:
+    """The same holds of workers on this machine and on three nodes of a cluster."""
+    cluster = request.getfixturevalue("cluster") if request.param == "ray" else None
+
+    def all_of(tasks: list[Any], workers: int = 1, **options: Any) -> list[Outcome]:
+        executor = Processes(workers) if cluster is None else RayWorkers(workers, cluster.address)
+        return list(executor.run(behave, tasks, **options))
+
+    return all_of
 
 
 def script(folder: Path, text: str) -> tuple[list[str], dict[str, str]]:
@@ -31,7 +50,7 @@ def script(folder: Path, text: str) -> tuple[list[str], dict[str, str]]:
     return [sys.executable, str(path)], {**os.environ, "PYTHONPATH": str(TESTS)}
 
 
-def test_every_task_once_in_other_processes() -> None:
+def test_every_task_once_in_other_processes(run: Run) -> None:
     """More tasks than workers; outcomes come in any order."""
     outcomes = run([*[("value", number) for number in range(30)], *[("pid", 0)] * 10], workers=2)
     values = [outcome.value for outcome in outcomes if outcome.task[0] == "value"]
@@ -43,7 +62,7 @@ def test_every_task_once_in_other_processes() -> None:
     assert run([]) == []
 
 
-def test_whatever_a_task_does_the_others_are_done(tmp_path: Path) -> None:
+def test_whatever_a_task_does_the_others_are_done(tmp_path: Path, run: Run) -> None:
     """Two workers meet every kind of trouble; what raised is final, what died is tried again."""
     tasks = [
         ("value", b"much" * 5_000_000),
@@ -76,14 +95,14 @@ def test_whatever_a_task_does_the_others_are_done(tmp_path: Path) -> None:
         assert found[key].attempts == 2
 
 
-def test_a_task_that_hangs_is_tried_again_and_given_up(tmp_path: Path) -> None:
+def test_a_task_that_hangs_is_tried_again_and_given_up(tmp_path: Path, run: Run) -> None:
     (hung,) = run([("hang", str(tmp_path))], time_limit=3)
     assert isinstance(hung.error, TimeoutError)
     assert (str(hung.error), hung.attempts) == ("the task took more than 3 s", 2)
     wait_until_gone(pids_in(tmp_path, 0), seconds=5)
 
 
-def test_a_part_of_a_task_has_a_limit_of_its_own() -> None:
+def test_a_part_of_a_task_has_a_limit_of_its_own(run: Run) -> None:
     """Though it holds the interpreter's lock, in C, so that nothing in the worker could end it."""
     hung, fine = run([("hang in a part", 0), ("parts", 0)], attempts=1)
     assert (type(hung.error), str(hung.error)) == (TimeoutError, "a part took more than 1 s")
@@ -91,12 +110,12 @@ def test_a_part_of_a_task_has_a_limit_of_its_own() -> None:
     assert fine.error is None
 
 
-def test_errors_after_which_a_task_is_started_again() -> None:
+def test_errors_after_which_a_task_is_started_again(run: Run) -> None:
     (outcome,) = run([("crash", 0)], attempts=3, again=(SimulatorCrashError,))
     assert (type(outcome.error), outcome.attempts) == (SimulatorCrashError, 3)
 
 
-def test_a_worker_that_retires_leaves_its_task_to_the_others() -> None:
+def test_a_worker_that_retires_leaves_its_task_to_the_others(run: Run) -> None:
     outcomes = run([("retire", (0,))] * 5, workers=2)
     assert [(o.value, o.error, o.attempts) for o in outcomes] == [(1, None, 1)] * 5
     with pytest.raises(WorkerRetiredError, match=r"worker [01] is gone") as raised:
@@ -140,7 +159,7 @@ def test_workers_and_what_they_started_end_with_their_parent(
     wait_until_gone(pids, seconds=20)
 
 
-def test_processes_of_a_dead_worker_end_though_they_hold_its_pipe(tmp_path: Path) -> None:
+def test_processes_of_a_dead_worker_end_though_they_hold_its_pipe(tmp_path: Path, run: Run) -> None:
     (outcome,) = run([("start", (str(tmp_path), 3))], attempts=1)
     assert str(outcome.error) == "the worker process died (exit code 3)"
     wait_until_gone(pids_in(tmp_path, 2), seconds=5)

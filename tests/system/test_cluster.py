@@ -1,0 +1,139 @@
+"""Work on a Ray cluster: nodes and drivers that are lost, and the bytes of one process."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import runs, worlds
+from support.made_up import MadeUpSource
+from support.ray_cluster import add_node, running_cluster
+from support.splits import GOLDEN, contents
+from support.worker_calls import Placed, behave
+
+from robomme_interference_data.build_dataset.build import build_dataset
+from robomme_interference_data.build_dataset.config import BuildPlan
+from robomme_interference_data.cluster import RayWorkers
+from robomme_interference_data.errors import ClusterError
+from robomme_interference_data.evaluate.log import read_record
+from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.rollouts import TIMING_COLUMNS
+from robomme_interference_data.rows import to_dict
+from robomme_interference_data.work_progress import WorkProgress
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+
+CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
+ROLLOUTS = 2 * len(CONDITIONS)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A cluster of one's own, for nodes are taken away; its workers know the tests' world."""
+    own = {worlds.SPLIT: str(GOLDEN), worlds.PAUSE: "0.03"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in own.items():
+            patch.setenv(name, value)
+        with running_cluster(3) as made:
+            yield made
+
+
+def ended(out: Path) -> list[dict[str, Any]]:
+    rows, own = read_record(out), {*TIMING_COLUMNS, "attempt"}
+    return [
+        {name: value for name, value in to_dict(rows[item]).items() if name not in own}
+        for item in sorted(rows)
+    ]
+
+
+def driver(out: Path, address: str) -> subprocess.Popen[str]:
+    """The command, as a user runs it."""
+    words = f"evaluate --policy {runs.CHEAT} --simulator {runs.WORLD} --system mine --workers 3"
+    words += f" --families VideoRepick MoveCube --executor ray --ray-address {address} --json"
+    command = [sys.executable, "-m", "robomme_interference_data.cli", *words.split()]
+    return subprocess.Popen(
+        [*command, "--split", str(GOLDEN), "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:
+    log, end = out / "rollouts.jsonl", time.monotonic() + 200
+    while not log.exists() or log.read_bytes().count(b"\n") < count:
+        assert time.monotonic() < end and running.poll() is None, running.communicate()
+        time.sleep(0.02)
+
+
+def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The paper's five conditions; in the end, the rows of one process."""
+    monkeypatch.setenv(worlds.PAUSE, "0")
+    runs.run(tmp_path / "one", conditions=CONDITIONS, videos=True)
+    out = tmp_path / "run"
+    first = driver(out, cluster.address)
+    wait_for_rows(out, 1, first)
+    first.kill()
+    first.communicate(timeout=60)
+    before = read_record(out)
+    assert 1 <= len(before) < ROLLOUTS
+    second = driver(out, cluster.address)
+    wait_for_rows(out, len(before) + 1, second)
+    cluster.remove_node(cluster.list_all_nodes()[1], allow_graceful=False)
+    add_node(cluster)
+    answer, err = second.communicate(timeout=300)
+    assert second.returncode == 0, err
+    assert len(json.loads(answer)) == ROLLOUTS
+    after = read_record(out)  # refuses a second row of a finished rollout
+    assert all(after[item] == row for item, row in before.items())
+    assert [row | {"video": None} for row in ended(tmp_path / "one")] == ended(out)
+
+
+def test_nodes_that_differ_are_refused_before_the_first_task(cluster: Any) -> None:
+    with pytest.raises(ClusterError) as raised:
+        list(RayWorkers(3, cluster.address).run(Placed(), range(3)))
+    assert raised.value.message.count("node is ") == 3  # the driver is on the head
+
+
+def test_a_cluster_that_is_not_there() -> None:
+    """In a process of its own: this one is a driver already."""
+    code = (
+        "from robomme_interference_data.cluster import RayWorkers\n"
+        "list(RayWorkers(1, '127.0.0.1:1').run(print, [1]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert "ClusterError: no Ray cluster can be reached at '127.0.0.1:1'" in done.stderr
+
+
+def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
+    source = MadeUpSource({f"MoveCube/test/{number}": (40, 20) for number in range(4)})
+    tasks = tuple((0, episode) for episode in source.episodes())
+    plan = BuildPlan("demonstrations", (source,), tasks)
+
+    def built(name: str, executor: Executor) -> dict[str, bytes]:
+        with WorkProgress(quiet=True) as progress:
+            build_dataset(plan, tmp_path / name, executor, progress)
+        return contents(tmp_path / name)
+
+    assert built("cluster", RayWorkers(3, cluster.address)) == built("one", Serial())
+
+
+def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
+    """A worker begins when a node with room for it joins."""
+    work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7)])
+    node = None
+    try:
+        node = add_node(cluster, cpus=2)
+        assert [outcome.value for outcome in work] == [7]
+    finally:
+        work.close()
+        if node is not None:
+            cluster.remove_node(node, allow_graceful=False)
