@@ -27,7 +27,7 @@ USUAL = "--simulator support.worlds:World --system mine --episodes 0"
 
 @pytest.fixture
 def _serial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_module, "Processes", lambda workers: Serial())
+    monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
 
 
 def type_in(line: str) -> Any:

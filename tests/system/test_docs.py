@@ -129,7 +129,7 @@ def test_the_commands_of_the_pages_run(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WORLDS_SPLIT", str(tiny_split))
     for module in (run_module, ask_module):
-        monkeypatch.setattr(module, "Processes", lambda workers: Serial())
+        monkeypatch.setattr(module, "make_executor", lambda config: Serial())
     for name, prompt in re.findall(
         r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S
     ):
