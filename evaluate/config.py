@@ -51,8 +51,8 @@ class RunConfig(WorkConfig):
 
     policy: str = setting(
         help="replay, recall (both also with :framesamp or :window), oracle, guess, obey, hold, "
-        "websocket://HOST:PORT (several with commas), lerobot:REPO[@REVISION], lerobot:FOLDER or "
-        "python:module:factory."
+        "websocket://HOST:PORT (several with commas), websocket with --serve, "
+        "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
     )
     split: Path = setting(help="Folder of the split of buffers.")
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
@@ -64,6 +64,11 @@ class RunConfig(WorkConfig):
         whole=True,
         metavar="NAME=VALUE…",
         help="Options of the policy, such as device=cpu or response_s=60.",
+    )
+    serve: str | None = setting(
+        None,
+        metavar="COMMAND",
+        help="Starts the server of --policy websocket, beside each worker: a command with {port}.",
     )
     subgoals: str | None = setting(
         None,

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from robomme_interference_data.errors import (
     InterferenceError,
+    ServerDiedError,
     ServerKeepaliveError,
     SimulatorCrashError,
 )
@@ -28,8 +29,12 @@ from robomme_interference_data.evaluate.log import (
     read_record,
 )
 from robomme_interference_data.evaluate.plan import WorkItem, plan_work, shuffle_work
-from robomme_interference_data.evaluate.policies.identity import describe_policy, plain
-from robomme_interference_data.evaluate.policies.registry import pin_policy
+from robomme_interference_data.evaluate.policies.identity import (
+    describe_policy,
+    describe_served,
+    plain,
+)
+from robomme_interference_data.evaluate.policies.registry import pin_policy, served_policy
 from robomme_interference_data.evaluate.policies.servers import check_kind, hold_servers
 from robomme_interference_data.evaluate.start import now, run_identity, start_of
 from robomme_interference_data.evaluate.subgoals.registry import describe_subgoals, pin_subgoals
@@ -114,6 +119,7 @@ def run_evaluation(
     """
     end_if_starting()
     split, folder = load_split(config.split), Path(config.out)
+    config = dataclasses.replace(config, policy=served_policy(config.policy, config.serve))
     name = config.system or default_system(config)
     # One commit for all workers: of the split, if it is on the Hub, and of models.
     config = dataclasses.replace(
@@ -141,13 +147,15 @@ def run_evaluation(
         if any(item not in there or not is_done(there[item]) for item in items):
             check_simulator(config, policy.cameras, executor)
             check_kind(config.policy, config.policy_options, system)
+        if config.serve is not None:
+            said = describe_served(config.policy, config.policy_options, system, executor)
         versions = simulator_versions(config.simulator, config.robomme_python)
         identity = run_identity(config, name, split, plan, said, written, versions)
         with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
             # The same split may be in another folder by now: rows keep one label for it.
             run = Run(config, name, log.header.split, split.revision)
             log.begin(start_of(config, plan, said | written, versions, command))
-            return run_items(run, RolloutTask(run), items, split, log, executor, listener)
+            return run_items(run, RolloutTask(run, said), items, split, log, executor, listener)
 
 
 def run_items[C: RunConfig | AskConfig](
@@ -178,7 +186,7 @@ def run_items[C: RunConfig | AskConfig](
         task,
         shuffle_work(item for item in items if item not in done),
         time_limit=run.config.rollout_timeout,
-        again=(SimulatorCrashError, ServerKeepaliveError),
+        again=(SimulatorCrashError, ServerKeepaliveError, ServerDiedError),
     )
     stopped: str | None = "interrupted"
     errors, full = 0, False

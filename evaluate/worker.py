@@ -1,6 +1,6 @@
 """What a worker of a run does: one rollout after the other."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from robomme_interference_data.evaluate.clips import Clip
 from robomme_interference_data.evaluate.config import RetrievalConfig, Run, RunConfig
 from robomme_interference_data.evaluate.log import clip_name
 from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.evaluate.policies.identity import plain
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.record import record_file
@@ -39,11 +40,16 @@ class RolloutTask:
     """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.
 
     What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
-    that broke is used again. Clips and subgoals are handed in.
+    that broke is used again. Clips, subgoals and the log of a server that it started are handed
+    in.
+
+    Args:
+        run: The run.
+        said: What the policy said of itself when the run began.
     """
 
-    def __init__(self, run: Run[RunConfig]):
-        self._run = run
+    def __init__(self, run: Run[RunConfig], said: Mapping[str, Any]):
+        self._run, self._said = run, said
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
         self._writer: SubgoalWriter | None = None
@@ -54,7 +60,7 @@ class RolloutTask:
         """Run a rollout; return its row, and what befell its clip, or None.
 
         Raises:
-            WorkerRetiredError: The policy's server is gone.
+            WorkerRetiredError: The policy's server is gone, or serves something else here.
             Exception: Whatever broke in the rollout.
         """
         clip = Clip(task, self._run.system) if self._run.config.videos else None
@@ -66,7 +72,7 @@ class RolloutTask:
             self.close()
             if isinstance(error, ServerKeepaliveError):
                 say(f"{task}: {error.message}. A rollout that ends so is begun again, once.")
-            if isinstance(error, PolicyServerError):
+            if isinstance(error, PolicyServerError) and self._run.config.serve is None:
                 self._check_server(worker)
             raise
         # Whatever became of what is to be looked at, the rollout ended as it did.
@@ -80,6 +86,7 @@ class RolloutTask:
             self._selector = make_selector(config)
         if self._policy is None:
             self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
+            self._check_served(self._policy)
         if self._writer is None:
             self._writer = make_writer(config)
         if self._simulator is None:
@@ -122,13 +129,28 @@ class RolloutTask:
         status: Status,
         error: str | None = None,
     ) -> None:
-        """Hand in the subgoals of a rollout, and its clip."""
+        """Hand in the subgoals of a rollout, its clip, and what the server printed so far."""
+        server: Any = self._policy
+        if self._run.config.serve is not None and server is not None:
+            worker.hand_in(f"servers/{server.started}-{worker.number}.log", server.log())
         if self._writer is not None:
             worker.hand_in(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
         if clip is not None:
             clip.close(status, error)
             if clip.data is not None:
                 worker.hand_in(clip_name(item), clip.data)
+
+    def _check_served(self, policy: Policy) -> None:
+        """Retire the worker if the server that it starts is not that of the other workers."""
+        if self._run.config.serve is None:
+            return
+        said, first = (one["server_metadata"] for one in (plain(policy.metadata()), self._said))
+        if said != first:
+            raise WorkerRetiredError(
+                f"the policy server that a worker started says {said} of itself; the first said "
+                f"{first}",
+                "Let --serve start the same checkpoint everywhere.",
+            )
 
     def _check_server(self, worker: Worker) -> None:
         """Retire the worker unless the policy's server is still there."""

@@ -6,7 +6,7 @@ constructor of the type.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Any, Self
 
@@ -15,6 +15,11 @@ _LONGEST_MESSAGE = 4000
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 """What a terminal would obey instead of showing it; line breaks and tabs are none of these."""
+
+_COLOUR = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
+
+PRINTED_LINES = 20
+"""How many of the last lines that a process printed are shown when it breaks."""
 
 
 class InterferenceError(Exception):
@@ -169,6 +174,10 @@ class ServerKeepaliveError(PolicyServerError):
     """A policy server that closed its own connection, over a call that kept it for too long."""
 
 
+class ServerDiedError(PolicyServerError):
+    """A policy server that a worker had started, and that ended."""
+
+
 class ModelError(InterferenceError, ConnectionError):
     """A vision-language model that cannot be reached, is not there, or gives no usable answer."""
 
@@ -222,6 +231,13 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
 def visible(text: str) -> str:
     """Return text with control characters by their number: a terminal would obey them."""
     return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+
+
+def printed_last(lines: Sequence[bytes]) -> str | None:
+    """Return the last of what a process printed, as a hint; None if that is nothing."""
+    told = [line.decode(errors="replace").rstrip() for line in lines[-PRINTED_LINES:]]
+    text = _COLOUR.sub("", "\n".join(["It printed last:", *told]))
+    return _CONTROL.sub("", text) if told else None
 
 
 def first_line(error: BaseException) -> str:

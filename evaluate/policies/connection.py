@@ -67,17 +67,26 @@ class ServerConnection:
         port: Its port.
         connect_s: Most seconds to wait until it can be used.
         response_s: Most seconds from a message to its answer.
+        check: Called where no answer came; raises where it is known why none will.
 
     Attributes:
         name: `host:port`.
         metadata: What the server said of itself when it was last connected; None before.
     """
 
-    def __init__(self, host: str, port: int, *, connect_s: float, response_s: float):
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        connect_s: float,
+        response_s: float,
+        check: Callable[[], None] = lambda: None,
+    ):
         self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self._address = host, port
         self.metadata: dict[str, Any] | None = None
-        self._connect_s, self._response_s = connect_s, response_s
+        self._connect_s, self._response_s, self._check = connect_s, response_s, check
         self._connection: ClientConnection | None = None
         self._stack = ExitStack()
         self._sent = b""
@@ -123,6 +132,7 @@ class ServerConnection:
                     until = 0.0
             except InvalidHandshake as error:
                 raise self._refusal(error) from error
+            self._check()
             if time.monotonic() + pause > until:
                 raise PolicyServerError(
                     f"policy server {self.name} cannot be reached: {reason}"
@@ -226,6 +236,7 @@ class ServerConnection:
                 return connection.recv()
         except (ConnectionClosed, OSError) as error:
             self.close()
+            self._check()
             late = f"did not answer within {seconds:.3g} s"
             why = late if expired.is_set() else f"closed the connection: {error}"
             kind = ServerKeepaliveError if _is_keepalive(error) else PolicyServerError

@@ -5,14 +5,15 @@ import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout, suppress
-from typing import Any
+from contextlib import closing, redirect_stdout, suppress
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
 from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.console import say
-from robomme_interference_data.errors import PolicyError
+from robomme_interference_data.errors import InterferenceError, PolicyError, PolicyServerError
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     BUILTINS,
@@ -21,7 +22,9 @@ from robomme_interference_data.evaluate.policies.registry import (
     parse_policy,
     policy_options,
 )
-from robomme_interference_data.evaluate.policies.servers import check_metadata
+from robomme_interference_data.evaluate.policies.servers import check_keeps, check_metadata
+from robomme_interference_data.evaluate.systems import System
+from robomme_interference_data.execution import Executor, Worker
 
 _WITHOUT_EFFECT = {
     "websocket": ("server", "connect_s", "response_s"),
@@ -37,7 +40,8 @@ def describe_policy(
     """Make a policy once, ask what it is, and release it; of several servers ask each.
 
     Returns:
-        The policy, closed, for its attributes; and what it says of itself, as plain values.
+        The policy, closed, for its attributes; and what it says of itself, as plain values:
+        nothing, of a server that workers start, see `describe_served`.
 
     Raises:
         InterferenceError: It cannot be made, a server cannot be reached, servers say different
@@ -46,6 +50,9 @@ def describe_policy(
     """
     spec = parse_policy(text)
     check_workers(spec, workers)
+    if spec.serves:
+        with closing(make_policy(text, options)) as policy:
+            return policy, {}
     with redirect_stdout(sys.stderr):  # stdout is for the rows
         policies = [
             make_policy(text, options, worker=worker) for worker in range(len(spec.servers) or 1)
@@ -63,6 +70,37 @@ def describe_policy(
                 f"condition, {NO_HISTORY} too; run.json says so."
             )
     return policy, metadata
+
+
+def describe_served(
+    text: str, options: Sequence[str], system: System, executor: Executor
+) -> dict[str, Any]:
+    """Have a worker start the policy's server, and return what that says of itself.
+
+    Raises:
+        PolicyServerError: It ends, cannot be reached, or is not what the system's is.
+        InvalidOptionError: It cannot be started, or nobody says which checkpoint it serves.
+    """
+    ask = partial(_ask_served, text, tuple(options))
+    (outcome,) = executor.run(ask, [system.keeps_frames is not None], attempts=1)
+    if isinstance(outcome.error, InterferenceError):
+        raise outcome.error
+    if outcome.error is not None:
+        raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
+    said, keeps = outcome.value
+    check_metadata([said], policy_options(text, options)["checkpoint"])
+    if keeps is not None:
+        check_keeps(keeps, said["server"], system)
+    return dict(said)
+
+
+def _ask_served(
+    text: str, options: Sequence[str], kind: bool, worker: Worker
+) -> tuple[dict[str, Any], bool | None]:
+    """Return what a server says of itself, and whether it keeps frames, if that is asked."""
+    with closing(make_policy(text, options)) as policy:
+        keeps = cast("Any", policy).keeps_frames() if kind else None
+        return _metadata(text, policy), keeps
 
 
 def _metadata(text: str, policy: Policy) -> dict[str, Any]:

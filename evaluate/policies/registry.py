@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -29,8 +30,9 @@ _KINDS = {
         for name in ("replay", "recall")
     },
     "websocket": (
-        rf"//{_SERVER}(?:,{_SERVER})*",
-        "websocket://host:port, with commas between several servers, each once",
+        rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
+        "websocket://host:port, with commas between several servers, each once, or websocket with "
+        "--serve 'COMMAND with {port}'",
     ),
     "lerobot": (r".+", "lerobot:namespace/name[@revision] or lerobot:folder"),
     "python": (r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", "python:module:factory"),
@@ -45,7 +47,7 @@ class PolicySpec:
     Attributes:
         kind: `websocket`, `lerobot`, `python`, or a built-in's name.
         target: What follows it; of `replay` and `recall` the memory rule, of other built-ins
-            nothing.
+            nothing; of `websocket` servers, or the command that starts one.
     """
 
     kind: str
@@ -53,11 +55,16 @@ class PolicySpec:
 
     @property
     def servers(self) -> tuple[tuple[str, int], ...]:
-        """Host and port of each server, in order; empty unless the kind is `websocket`."""
-        if self.kind != "websocket":
+        """Host and port of each server, in order; empty where none runs yet, or is needed."""
+        if self.kind != "websocket" or self.serves:
             return ()
         pairs = (one.rpartition(":") for one in self.target.removeprefix("//").split(","))
         return tuple((host.strip("[]"), int(port)) for host, _, port in pairs)
+
+    @property
+    def serves(self) -> bool:
+        """Whether each worker starts a server, with the command that the target is."""
+        return self.kind == "websocket" and not self.target.startswith("//")
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.target}" if self.target else self.kind
@@ -90,10 +97,11 @@ def parse_policy(text: str) -> PolicySpec:
 
 def check_workers(spec: PolicySpec, workers: int) -> None:
     """Refuse more workers than there are servers: a server holds the memory of one rollout."""
-    if spec.kind == "websocket" and len(spec.servers) < workers:
+    if spec.kind == "websocket" and not spec.serves and len(spec.servers) < workers:
         raise InvalidOptionError(
             f"{workers} workers need {workers} policy servers; {spec} names {len(spec.servers)}",
-            f"Start more servers, one for each worker, or take --workers {len(spec.servers)}.",
+            f"Take --workers {len(spec.servers)}, start more, or have each worker start its own: "
+            "--serve.",
         )
 
 
@@ -126,6 +134,34 @@ def policy_options(text: str, options: Sequence[str] = ()) -> dict[str, Any]:
     return bind_options(text, factory, fixed, options)
 
 
+def served_policy(text: str, serve: str | None) -> str:
+    """Return a policy as it is written, and with it the command that serves it, if there is one.
+
+    Args:
+        text: The policy as it is written.
+        serve: The command with which each worker starts its server, `{port}` in it.
+
+    Raises:
+        InvalidOptionError: There is no place for the port, or the policy has no server to start.
+    """
+    if serve is None:
+        return text
+    if text != "websocket":
+        raise InvalidOptionError(
+            f"--serve starts the server of a policy, and {text} has none to start",
+            "Give --policy websocket with it, or leave it out.",
+        )
+    try:
+        whole = shlex.split(serve)
+    except ValueError:  # a quote is not closed
+        whole = []
+    if not any("{port}" in word for word in whole):
+        raise InvalidOptionError.expected(
+            "--serve", serve, "a command with {port}, the port that it is to listen at"
+        )
+    return f"websocket:{serve}"
+
+
 def pin_policy(text: str) -> str:
     """Return the one text of a policy: a model on the Hub has its commit.
 
@@ -151,15 +187,21 @@ def _factory(text: str, worker: int) -> tuple[Callable[..., Policy], dict[str, A
     if spec.kind == "lerobot":
         return _load("lerobot", "LeRobotPolicy", "build"), {"path": spec.target}
     if spec.kind == "websocket":
-        check_workers(spec, worker + 1)
-        host, port = spec.servers[worker]
-        return _load("websocket", "WebsocketPolicy"), {"host": host, "port": port}
+        return _server(spec, worker)
     if spec.kind in ("replay", "recall"):
         name = {"replay": "ReplayPolicy", "recall": "Recall"}[spec.kind]
         return _load("builtin", name), {"memory": spec.target}
     if spec.kind in ("hold", "obey"):
         return _load("builtin", spec.kind.capitalize()), {}
     return _load("builtin", "Privileged"), {"name": spec.kind}
+
+
+def _server(spec: PolicySpec, worker: int) -> tuple[Callable[..., Policy], dict[str, Any]]:
+    if spec.serves:
+        return _load("served", "ServedPolicy"), {"command": spec.target}
+    check_workers(spec, worker + 1)
+    host, port = spec.servers[worker]
+    return _load("websocket", "WebsocketPolicy"), {"host": host, "port": port}
 
 
 def _load(module: str, name: str, extra: str = "evaluate") -> Callable[..., Any]:

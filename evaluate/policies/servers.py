@@ -16,6 +16,9 @@ from robomme_interference_data.files import hold
 
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1", "0.0.0.0")
 
+_PORTS = range(18000, 19000)
+"""Where servers listen that workers start."""
+
 
 @contextmanager
 def hold_servers(text: str, out: Path) -> Iterator[None]:
@@ -31,26 +34,58 @@ def hold_servers(text: str, out: Path) -> Iterator[None]:
     Raises:
         PolicyServerError: Another run drives one of them; says which.
     """
-    folder = default_cache_folder().parent / "servers"
     with ExitStack() as stack:
         for host, port in parse_policy(text).servers:
-            machine = socket.gethostname() if host in _THIS_MACHINE else host
-            lock = folder / f"{machine.replace(':', '_')}_{port}.lock"
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-                lock.touch()
-                holder = lock.read_text(encoding="utf-8", errors="replace")
-            except OSError as error:
-                say(f"Nothing keeps other runs from the policy server {host}:{port}: {error}")
-                continue
-            busy = PolicyServerError(
-                f"the policy server {host}:{port} is driven by {holder or 'another run'}; two runs "
-                "spoil each other, as a server holds one memory",
-                "Wait for that run to end, or start another server, on another port.",
+            stack.enter_context(_hold_server(host, port, f"the run in {out.resolve()}"))
+        yield
+
+
+@contextmanager
+def hold_port() -> Iterator[int]:
+    """Choose a port for a server on this machine, and keep it from all others until the block ends.
+
+    A server listens only when its model is loaded. Were the port free until then, two that load at
+    once might get the same, and one of them both rollouts.
+
+    Raises:
+        PolicyServerError: All are taken.
+    """
+    with ExitStack() as stack:
+        for port in _PORTS:
+            with suppress(PolicyServerError, OSError):
+                with socket.socket() as free:
+                    free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
+                    free.bind(("", port))
+                stack.enter_context(_hold_server("localhost", port, "a worker"))
+                break
+        else:
+            raise PolicyServerError(
+                f"none of the ports {_PORTS[0]} to {_PORTS[-1]} is free on this machine"
             )
-            stack.enter_context(hold(lock, busy))
-            with suppress(OSError):  # such as a full disk: the lock holds all the same
-                lock.write_text(f"the run in {out.resolve()} (process {os.getpid()})", "utf-8")
+        yield port
+
+
+@contextmanager
+def _hold_server(host: str, port: int, holder: str) -> Iterator[None]:
+    folder = default_cache_folder().parent / "servers"
+    machine = socket.gethostname() if host in _THIS_MACHINE else host
+    lock = folder / f"{machine.replace(':', '_')}_{port}.lock"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.touch()
+        other = lock.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        say(f"Nothing keeps other runs from the policy server {host}:{port}: {error}")
+        yield
+        return
+    busy = PolicyServerError(
+        f"the policy server {host}:{port} is driven by {other or 'another run'}; two runs "
+        "spoil each other, as a server holds one memory",
+        "Wait for that run to end, or start another server, on another port.",
+    )
+    with hold(lock, busy):
+        with suppress(OSError):  # such as a full disk: the lock holds all the same
+            lock.write_text(f"{holder} (process {os.getpid()})", "utf-8")
         yield
 
 
@@ -104,16 +139,25 @@ def check_kind(text: str, options: Sequence[str], system: System) -> None:
     for worker, (host, port) in enumerate(parse_policy(text).servers):
         policy: Any = make_policy(text, options, worker=worker)
         try:
-            keeps = policy.keeps_frames()
+            check_keeps(policy.keeps_frames(), f"{host}:{port}", system)
         finally:
             policy.close()
-        if keeps != system.keeps_frames:
-            found, wanted = "acts without any frame", "refuses to"
-            if keeps:
-                found, wanted = "refuses to act without frames", "acts"
-            raise PolicyServerError(
-                f"the policy server {host}:{port} {found}, and that of {system.name} {wanted}: it "
-                "serves another kind of model",
-                f"Start it with the checkpoint of {system.name} (docs/systems.md has a table), "
-                "beside which history_config.txt lies, or give --system a name of your own.",
-            )
+
+
+def check_keeps(keeps: bool, server: str, system: System) -> None:
+    """Check whether a server keeps frames against whether the system's does.
+
+    Raises:
+        PolicyServerError: It is of the other kind.
+    """
+    if keeps == system.keeps_frames:
+        return
+    found, wanted = "acts without any frame", "refuses to"
+    if keeps:
+        found, wanted = "refuses to act without frames", "acts"
+    raise PolicyServerError(
+        f"the policy server {server} {found}, and that of {system.name} {wanted}: it serves "
+        "another kind of model",
+        f"Start it with the checkpoint of {system.name} (docs/systems.md has a table), beside "
+        "which history_config.txt lies, or give --system a name of your own.",
+    )

@@ -66,10 +66,15 @@ class WebsocketPolicy(Policy):
                 "expected positive numbers"
             )
         self._chunk = chunk_frames
-        self._server = ServerConnection(host, port, connect_s=connect_s, response_s=response_s)
+        self._server = ServerConnection(
+            host, port, connect_s=connect_s, response_s=response_s, check=self._check
+        )
         self._history = 0  # frames that were announced
         self._live = False  # whether the first live observation came
         self._held: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
+
+    def _check(self) -> None:
+        """Raise if it is known that the server will not answer."""
 
     def reset(self, info: RolloutInfo) -> None:
         """Empty the server's memory, connecting first, or again if the connection was lost."""

@@ -1,7 +1,6 @@
 """RoboMME's process: its own interpreter, which answers on a pipe."""
 
 import os
-import re
 import shutil
 import subprocess
 import threading
@@ -14,18 +13,17 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.cache import default_cache_folder
 from robomme_interference_data.errors import (
+    PRINTED_LINES,
     InvalidOptionError,
     MissingExtraError,
     SimulatorCrashError,
     UnknownNameError,
+    printed_last,
 )
 from robomme_interference_data.simulators import robomme_worker
 
 PYTHON_VARIABLE = "ROBOMME_PYTHON"
 """Environment variable with the path of RoboMME's interpreter."""
-
-_LOG_LINES = 20
-"""How much of what a process printed last is kept, and shown when it breaks."""
 
 _ENVIRONMENT = {
     "PYTHONFAULTHANDLER": "1",  # a crash in a library leaves a traceback
@@ -37,9 +35,6 @@ _INSTALL = (
     "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into an environment of its own "
     f"and give its Python: --robomme-python PATH, or export {PYTHON_VARIABLE}=PATH."
 )
-
-_CONTROL = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]|[\x00-\x08\x0b-\x1f\x7f]")
-"""Colours and what else only a terminal should obey."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -54,7 +49,7 @@ class Process:
 
     def __init__(self, python: str, answer_s: float):
         self._python, self._answer_s = python, answer_s
-        self._log: deque[bytes] = deque(maxlen=_LOG_LINES)
+        self._log: deque[bytes] = deque(maxlen=PRINTED_LINES)
         self._channel, theirs = Pipe()
         mends = default_cache_folder().parent / "robomme"
         try:
@@ -118,10 +113,8 @@ class Process:
         """Return an error that shows what was printed last, without a terminal's escapes."""
         if self.pid is None:
             self._logger.join(5)  # until it has read all
-        lines = [line.decode(errors="replace").rstrip() for line in list(self._log)]
         return SimulatorCrashError(
-            f"the robomme simulator in {self._python} {what}",
-            _CONTROL.sub("", "\n".join(["It printed last:", *lines])) if lines else None,
+            f"the robomme simulator in {self._python} {what}", printed_last(list(self._log))
         )
 
     def end(self, *, now: bool = False) -> None:

@@ -30,7 +30,7 @@ def test_every_setting_is_classed() -> None:
     may_differ = {
         *("out", "no_resume", "robomme_python", "workers", "videos", "check_lesson", "cache"),
         *("rollout_timeout", "simulator_timeout", "history_chunk", "max_errors"),
-        *("executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
+        *("serve", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"),
     }
     fields = {field.name for field in dataclasses.fields(RunConfig)}
     assert makes_the_run | plan | may_differ == fields

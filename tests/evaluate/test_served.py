@@ -1,0 +1,136 @@
+"""Policy servers that workers start themselves."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from support import runs
+
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    PolicyServerError,
+    ServerDiedError,
+    WorkerRetiredError,
+)
+from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.policies.servers import hold_port
+
+pytestmark = pytest.mark.usefixtures("world")
+
+PROGRAM = Path(__file__).parents[1] / "support" / "serve_policy.py"
+
+
+@pytest.fixture(autouse=True)
+def _modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(PROGRAM.parents[1]))
+
+
+def command(*words: object) -> str:
+    return shlex.join([sys.executable, str(PROGRAM), "--port", "{port}", *map(str, words)])
+
+
+def serve(out: Path, *words: object, **changes: Any) -> Any:
+    return runs.run(out, policy="websocket", serve=command(*words), **changes)
+
+
+def test_a_worker_starts_its_server_and_ends_it(tmp_path: Path) -> None:
+    result = serve(tmp_path / "run", "--pids", tmp_path / "pids")
+    assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * 4
+    pids = (tmp_path / "pids").read_text().split()
+    assert len(pids) == 2  # one to be asked what it is, and the worker's
+    assert not any(psutil.pid_exists(int(pid)) for pid in pids)
+    (log,) = (tmp_path / "run" / "servers").iterdir()
+    assert log.name.endswith("-0.log") and log.read_text().startswith("serving at 18")
+    header = runs.header(tmp_path / "run")
+    (start,) = header["starts"]
+    assert (
+        start["settings"]["serve"]
+        == start["policy"]["server"]
+        == command("--pids", tmp_path / "pids")
+    )
+    identity = header["identity"]
+    assert identity["policy"] == "websocket"  # whoever starts the server, the run is the same
+    assert identity["policy_metadata"]["server_metadata"] == {"checkpoint": "tiny/1"}
+
+
+def test_a_server_that_dies_is_started_again(tmp_path: Path) -> None:
+    result = serve(tmp_path / "run", "--dies", tmp_path / "died")
+    assert sorted(row.attempt for row in result.rows) == [1, 1, 1, 2]
+    assert result.counts["fail"] == 4
+    first, second = sorted((tmp_path / "run" / "servers").iterdir())
+    assert "out of memory" in first.read_text() and "out of memory" not in second.read_text()
+
+
+@pytest.mark.parametrize("words", [("--port",), ("--metadata", "no JSON")])
+def test_one_that_cannot_start_is_told_with_its_last_words(tmp_path: Path, words: Any) -> None:
+    with pytest.raises(ServerDiedError, match="ended, exit code [12]") as raised:
+        serve(tmp_path / "run", *words)
+    assert "rror" in str(raised.value.hint)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"policy": "websocket"}, "websocket with --serve"),
+        ({"policy": "replay", "serve": "serve {port}"}, "has none to start"),
+        ({"policy": "websocket", "serve": "serve 8000"}, "a command with {port}"),
+        ({"policy": "websocket", "serve": "serve '{port}"}, "a command with {port}"),
+        ({"policy": "websocket", "serve": "no-such-program {port}"}, "cannot be run"),
+        ({"policy": "websocket", "serve": "serve {port}", "system": None}, "need a name"),
+    ],
+)
+def test_what_cannot_be_served_is_refused(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(InvalidOptionError) as raised:
+        runs.run(tmp_path / "run", **changes)
+    assert words in raised.value.message
+    assert not (tmp_path / "run").exists()
+
+
+def test_it_has_to_say_what_it_serves(tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptionError, match="does not say which checkpoint"):
+        serve(tmp_path / "run", "--metadata", "{}")
+    said = {"policy_options": ("checkpoint=mine",)}
+    assert serve(tmp_path / "run", "--metadata", "{}", **said).counts["fail"] == 4
+    with pytest.raises(PolicyServerError, match="serves the checkpoint 'tiny/1', not 'mine'"):
+        serve(tmp_path / "other", **said)
+
+
+def test_a_server_of_another_kind_than_the_systems_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PolicyServerError, match="refuses to act without frames"):
+        serve(tmp_path / "run", system="pi05_baseline", conditions=("no-history",))
+
+
+def test_a_worker_whose_server_says_something_else_does_no_rollout(tmp_path: Path) -> None:
+    with pytest.raises(WorkerRetiredError, match="'other'"):
+        serve(tmp_path / "run", "--differs", tmp_path / "asked")
+    assert (tmp_path / "run" / "rollouts.jsonl").read_text() == ""
+
+
+def test_two_servers_of_one_machine_have_two_ports() -> None:
+    with hold_port() as first, hold_port() as second:
+        assert first != second
+    policy = make_policy(f"websocket:{command()}")
+    with hold_port() as other:
+        policy.close()
+        with hold_port() as again:
+            assert len({other, again}) == 2
+
+
+def test_the_end_of_a_long_log_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    from robomme_interference_data.evaluate.policies import served
+
+    monkeypatch.setattr(served, "_LOG_BYTES", 5)
+    policy: Any = make_policy("websocket:echo {port} is the port")
+    try:
+        with pytest.raises(InterferenceError, match="ended"):
+            policy.metadata()
+        assert policy.log() == b"port\n"
+    finally:
+        policy.close()

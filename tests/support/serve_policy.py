@@ -1,0 +1,43 @@
+"""A program that serves a policy, for --serve."""
+
+import argparse
+import asyncio
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from support.policy_server import Memory, PolicyServer
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--metadata", default='{"checkpoint": "tiny/1"}')
+    parser.add_argument("--pids", type=Path, help="where its process id is written")
+    parser.add_argument("--dies", type=Path, help="ends at once when asked, until that is there")
+    parser.add_argument("--differs", type=Path, help="says something else once that is there")
+    given: Any = parser.parse_args()
+    server = PolicyServer(Memory(keep=False), port=given.port)
+    server.metadata = json.loads(given.metadata)
+    if given.differs is not None and given.differs.exists():
+        server.metadata["checkpoint"] = "other"
+    if given.differs is not None:
+        given.differs.touch()
+
+    def before(message: dict[str, Any]) -> None:
+        if given.dies is not None and "prompt" in message and not given.dies.exists():
+            given.dies.touch()
+            print("out of memory", flush=True)
+            os._exit(3)
+
+    server.before = before
+    print(f"serving at {given.port}", flush=True)
+    if given.pids is not None:
+        with given.pids.open("a") as file:
+            file.write(f"{os.getpid()}\n")
+    asyncio.run(server.serve(lambda: None))
+
+
+if __name__ == "__main__":
+    main()
