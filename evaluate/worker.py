@@ -54,6 +54,7 @@ class RolloutTask:
         self._policy: Policy | None = None
         self._writer: SubgoalWriter | None = None
         self._split: Split | None = None
+        self._logs: dict[str, bytes] = {}
         self._selector: Selector | None = None
 
     def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
@@ -129,10 +130,12 @@ class RolloutTask:
         status: Status,
         error: str | None = None,
     ) -> None:
-        """Hand in the subgoals of a rollout, its clip, and what the server printed so far."""
+        """Hand in the subgoals of a rollout, its clip, and logs of servers that it started."""
         server: Any = self._policy
         if self._run.config.serve is not None and server is not None:
-            worker.hand_in(f"servers/{server.started}-{worker.number}.log", server.log())
+            self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
+        for log in self._logs.items():  # earlier ones too: files of an attempt that broke are lost
+            worker.hand_in(*log)
         if self._writer is not None:
             worker.hand_in(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
         if clip is not None:

@@ -123,6 +123,8 @@ class RayWorkers:
     def _check_nodes(self, shared: Any, own: Mapping[str, str]) -> set[str]:
         """Compare all nodes that have room for a worker with this process; return their ids.
 
+        One that is lost meanwhile is left out.
+
         Raises:
             ClusterError: Some differ.
         """
@@ -133,21 +135,24 @@ class RayWorkers:
                 there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 call = _describe.options(num_cpus=0, scheduling_strategy=there)
                 asked[node["NodeID"]] = call.remote(shared)
-        wrong = []
+        wrong, known = [], set()
         for node_id, answer in asked.items():
             name = _name(node_id)
             try:
                 wrong += _differences(name, ray.get(answer), own)
+                known.add(node_id)
             except InterferenceError as error:
                 wrong.append(f"{name}: {error.message}")
-            except RayError as error:
+            except RayTaskError as error:
                 wrong.append(f"{name}: {_cause(error)}")
+            except RayError:  # Ray learns late that a node is gone
+                continue
         if wrong:
             raise ClusterError(
                 "nodes of the cluster are not as this process is:\n  " + "\n  ".join(wrong),
                 "Install the same on all nodes, and give a split that all of them see.",
             )
-        return {*asked}
+        return known
 
 
 @ray.remote

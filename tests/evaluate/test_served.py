@@ -1,13 +1,12 @@
 """Policy servers that workers start themselves."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 from support import runs
+from support.serve_policy import command
 
 from robomme_interference_data.errors import (
     InterferenceError,
@@ -21,16 +20,10 @@ from robomme_interference_data.evaluate.policies.servers import hold_port
 
 pytestmark = pytest.mark.usefixtures("world")
 
-PROGRAM = Path(__file__).parents[1] / "support" / "serve_policy.py"
-
 
 @pytest.fixture(autouse=True)
 def _modules(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(PROGRAM.parents[1]))
-
-
-def command(*words: object) -> str:
-    return shlex.join([sys.executable, str(PROGRAM), "--port", "{port}", *map(str, words)])
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
 
 
 def serve(out: Path, *words: object, **changes: Any) -> Any:

@@ -4,10 +4,18 @@ import argparse
 import asyncio
 import json
 import os
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
 from support.policy_server import Memory, PolicyServer
+
+
+def command(*words: object) -> str:
+    """What --serve is given; the tests' modules have to be on PYTHONPATH."""
+    program = [sys.executable, "-m", "support.serve_policy", "--port", "{port}"]
+    return shlex.join([*program, *map(str, words)])
 
 
 def main() -> None:
@@ -28,11 +36,11 @@ def main() -> None:
     def before(message: dict[str, Any]) -> None:
         if given.dies is not None and "prompt" in message and not given.dies.exists():
             given.dies.touch()
-            print("out of memory", flush=True)
+            sys.stderr.write("out of memory\n")
             os._exit(3)
 
     server.before = before
-    print(f"serving at {given.port}", flush=True)
+    sys.stderr.write(f"serving at {given.port}\n")
     if given.pids is not None:
         with given.pids.open("a") as file:
             file.write(f"{os.getpid()}\n")

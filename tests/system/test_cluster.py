@@ -12,8 +12,9 @@ import pytest
 from support import runs, worlds
 from support.made_up import MadeUpSource
 from support.ray_cluster import add_node, running_cluster
+from support.serve_policy import command
 from support.splits import GOLDEN, contents
-from support.worker_calls import Placed, behave
+from support.worker_calls import Placed, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan
@@ -93,6 +94,18 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     after = read_record(out)  # refuses a second row of a finished rollout
     assert all(after[item] == row for item, row in before.items())
     assert [row | {"video": None} for row in ended(tmp_path / "one")] == ended(out)
+
+
+def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -> None:
+    served = {"policy": "websocket", "serve": command("--pids", tmp_path / "pids")}
+    there = RayWorkers(2, cluster.address)
+    result = runs.run(tmp_path / "run", there, conditions=CONDITIONS, **served)
+    assert result.counts["fail"] == ROLLOUTS
+    pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
+    assert len(pids) == 3  # one was asked what it is
+    wait_until_gone(pids)
+    logs = [path.read_text() for path in (tmp_path / "run" / "servers").iterdir()]
+    assert len({log.split()[2] for log in logs}) == 2  # a port for each
 
 
 def test_nodes_that_differ_are_refused_before_the_first_task(cluster: Any) -> None:

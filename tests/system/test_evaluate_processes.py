@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from support import runs, worlds
 from support.policy_server import Memory, PolicyServer
+from support.serve_policy import command
 from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import WorkerRetiredError
@@ -35,12 +36,14 @@ def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
 
 
-def start(out: Path, pause: float = 0.0, policy: str = runs.CHEAT) -> subprocess.Popen[str]:
-    words = f"evaluate --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
-    words += " --families VideoRepick MoveCube --json"
-    command = [sys.executable, "-m", "robomme_interference_data.cli", *words.split()]
+def start(
+    out: Path, pause: float = 0.0, policy: str = runs.CHEAT, words: Sequence[str] = ()
+) -> subprocess.Popen[str]:
+    usual = f"evaluate --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
+    usual += " --families VideoRepick MoveCube --json"
+    called = [sys.executable, "-m", "robomme_interference_data.cli", *usual.split(), *words]
     return subprocess.Popen(
-        [*command, "--split", os.environ[worlds.SPLIT], "--out", str(out)],
+        [*called, "--split", os.environ[worlds.SPLIT], "--out", str(out)],
         env=os.environ | {worlds.PAUSE: str(pause)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -209,6 +212,22 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
     with servers(2) as (_, urls):
         monkeypatch.setenv("SERVERS", urls)
         assert runs.run(tmp_path / "two", Processes(2), **served).counts["fail"] == ROLLOUTS
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_servers_that_workers_start_end_with_the_command(
+    tmp_path: Path, sent: signal.Signals
+) -> None:
+    words = ["--serve", command("--pids", tmp_path / "pids")]
+    running = start(tmp_path / "run", 0.05, policy="websocket", words=words)
+    wait_for_rows(tmp_path / "run", 2, running)
+    pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
+    assert len(pids) == 3  # one was asked what it is; then one beside each worker
+    os.killpg(running.pid, sent)
+    running.communicate(timeout=60)
+    wait_until_gone(pids)
+    numbers = {path.stem.rpartition("-")[2] for path in (tmp_path / "run" / "servers").iterdir()}
+    assert {"0"} <= numbers <= {"0", "1"}
 
 
 # --- scripts -----------------------------------------------------------------------------------
