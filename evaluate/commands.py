@@ -71,6 +71,9 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
       --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999 \
       --conditions k0 k7 --families MoveCube RouteStick
 
+    robomme-interference evaluate --policy websocket --workers 2 \
+      --serve 'python serve.py --port {port}' --system mine --split S --out runs/served
+
     robomme-interference evaluate --policy lerobot:me/act@v1 \
       --system act-v1 --policy-option device=cpu --split S --out runs/act
 

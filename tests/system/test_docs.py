@@ -76,7 +76,7 @@ def _run_readme(tmp_path: Path, there: dict[str, str]) -> None:
 
 
 ELSEWHERE = (
-    "websocket://",  # a policy server
+    "--policy websocket",  # a policy server
     "--simulator robomme",  # the official simulator
     "simulate ",  # a renderer
     "--source ",  # recordings, or a renderer
