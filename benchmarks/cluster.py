@@ -3,11 +3,11 @@
     python benchmarks/cluster.py --rollouts 100000
 
 - *driver*: rollouts that do nothing, their rows written as in a run; what they cost the driver.
-- *overhead*: tasks that compute, by worker processes and by as many workers of a cluster, both
-  started before the clock.
+- *overhead*: rollouts of `replay` on the embedded simulator, by worker processes and by as many
+  workers of a cluster, from when all of them have started.
 - *grid*: the paper's 25,200 rollouts on more and more workers, by a simulation of the queue: every
-  worker takes the next one when it is done. How long each takes is given (`--reset`, `--steps-s`)
-  or drawn from it.
+  worker takes the next one when it is done. How long each takes is drawn from `--reset` and
+  `--steps-s`.
 """
 
 import argparse
@@ -22,16 +22,17 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
-from timing import interleave, machine, positive, table
+from nothing import Nothing
+from timing import Times, machine, positive, table
 
+from evaluate import seconds_a_rollout
 from robomme_interference_data.cluster import RayWorkers
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 from robomme_interference_data.evaluate.config import Run, RunConfig
 from robomme_interference_data.evaluate.log import open_log
 from robomme_interference_data.evaluate.plan import WorkItem, shuffle_work
-from robomme_interference_data.execution import Executor, Processes, Worker
+from robomme_interference_data.execution import Processes
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Rollout
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 CELLS = 56
@@ -41,31 +42,6 @@ EPISODES = 50
 WORKERS = (8, 64, 512)
 NEEDED = 1000 / 60
 """Rows a second of 1,000 workers with a rollout a minute each."""
-
-
-class Nothing:
-    """Ends a rollout at once."""
-
-    def __init__(self, run: Run[RunConfig]):
-        self._run = run
-
-    def __call__(self, task: WorkItem, worker: Worker) -> Rollout:
-        """Return its row."""
-        return self._run.row(
-            task,
-            **{"seed": 0, "difficulty": "easy", "goal": "", "status": "fail", "success": False},
-            **{"steps": 0, "history_frames": 0, "lesson_frames": 0, "lesson_share": None},
-        )
-
-
-class Compute:
-    """Keeps a processor busy."""
-
-    def __call__(self, task: float, worker: Worker) -> None:
-        """Compute for so many seconds of processor time."""
-        end = time.process_time() + task
-        while time.process_time() < end:
-            pass
 
 
 def items(count: int) -> list[WorkItem]:
@@ -98,19 +74,11 @@ def drive(rollouts: int, workers: int) -> list[str]:
     ]
 
 
-def started(executor: Executor, seconds: float, tasks: int, workers: int) -> float:
-    """Return the seconds that tasks took, from when all workers had done one."""
-    ended: list[float] = []
-    for _ in executor.run(Compute(), [seconds] * (tasks + workers)):
-        ended.append(time.perf_counter())
-    return ended[-1] - ended[workers - 1]
-
-
-def durations(reset: tuple[float, float], steps_s: float) -> dict[WorkItem, float]:
+def durations(reset: tuple[float, float], steps_s: tuple[float, float]) -> dict[WorkItem, float]:
     """Return how long each rollout of a system takes: reset and steps, drawn by a fixed seed."""
     drawn = random.Random(0)
     return {
-        item: drawn.uniform(*reset) + drawn.uniform(100, MAX_STEPS) / steps_s
+        item: drawn.uniform(*reset) + drawn.uniform(100, MAX_STEPS) / drawn.uniform(*steps_s)
         for item in items(len(FAMILIES) * EPISODES * len(CONDITIONS))
     }
 
@@ -128,10 +96,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rollouts", type=positive, default=100_000)
     parser.add_argument("--workers", type=positive, default=2)
-    parser.add_argument("--tasks", type=positive, default=48)
-    parser.add_argument("--seconds", type=float, default=1.0, help="of a task that computes")
+    parser.add_argument("--split", type=Path, default=Path("demo/tabletop"))
+    parser.add_argument("--replayed", type=positive, default=48, help="rollouts of replay")
     parser.add_argument("--reset", type=float, nargs=2, default=(5.0, 27.0), help="s, least, most")
-    parser.add_argument("--steps-s", type=float, default=10.0, help="steps a second")
+    parser.add_argument("--steps-s", type=float, nargs=2, default=(9.0, 13.0), help="the same")
     parser.add_argument("--rounds", type=positive, default=3)
     given: Any = parser.parse_args()
     print(machine("ray"))
@@ -140,23 +108,24 @@ def main() -> None:
     title = f"Rollouts that do nothing, {given.workers} workers"
     print(f"\n{table(title, columns, [drive(given.rollouts, given.workers)])}")
 
-    taken: dict[str, list[float]] = {"processes": [], "ray": []}
-    made = {"processes": Processes(given.workers), "ray": RayWorkers(given.workers, "local")}
-    ways = {
-        name: lambda name=name, executor=executor: taken[name].append(
-            started(executor, given.seconds, given.tasks, given.workers)
-        )
-        for name, executor in made.items()
-    }
-    interleave(ways, given.rounds)
-    both = zip(taken["ray"], taken["processes"], strict=True)
-    ratio = sorted(one / other for one, other in both)[len(taken["ray"]) // 2]
-    rows = [[name, f"{min(seconds):.1f}"] for name, seconds in taken.items()]
-    rows.append(["ratio, median", f"{ratio:.2f}"])
-    title = f"{given.tasks} tasks of {given.seconds:g} s, {given.workers} workers, once started"
-    print(f"\n{table(title, ['<executor', '>s'], rows)}")
+    ways = {"processes": Processes(given.workers), "ray": RayWorkers(given.workers, "local")}
+    taken: dict[str, list[float]] = {name: [] for name in ways}
+    for number in range(given.rounds):
+        for name, executor in list(ways.items())[:: 1 if number % 2 else -1]:
+            seconds = seconds_a_rollout(given.split, given.replayed, given.workers, executor)
+            taken[name].append(seconds)
+    times = Times(taken)
+    rows = [
+        [name, f"{times.median(name):.2f}", f"{times.ratio(name, 'processes'):.2f}"]
+        for name in ways
+    ]
+    title = (
+        f"`replay`, {given.replayed} rollouts, {given.workers} workers, once started; "
+        f"medians of {given.rounds} rounds, aim ≤ 1.1"
+    )
+    print(f"\n{table(title, ['<executor', '>s a rollout', '>ratio'], rows)}")
 
-    each = durations(tuple(given.reset), given.steps_s)
+    each = durations(tuple(given.reset), tuple(given.steps_s))
     rollouts = CELLS * len(FAMILIES) * EPISODES
     plan = list(islice(cycle(each[item] for item in shuffle_work(each)), rollouts))
     rows = []

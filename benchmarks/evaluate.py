@@ -25,6 +25,7 @@ from robomme_interference_data.evaluate.config import Run
 from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout import run_rollout
+from robomme_interference_data.execution import Executor
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.rollouts import Rollout, Status
 from robomme_interference_data.simulators.base import Observation
@@ -68,7 +69,7 @@ class Clock:
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Take the plan."""
 
-    def row(self, row: Rollout) -> None:
+    def row(self, row: Rollout, node: str | None) -> None:
         """Note the time."""
         self.times.append(time.perf_counter())
 
@@ -165,32 +166,33 @@ def oracle_actions(episode: EpisodeId, simulator: TabletopSimulator) -> NDArray[
     return np.stack(actions)
 
 
-def workers(split: Path, rollouts: int) -> list[list[str]]:
-    """Time a run with one worker and with two; return the lines."""
-    seconds = []
+def seconds_a_rollout(
+    split: Path, rollouts: int, workers: int, executor: Executor | None = None
+) -> float:
+    """Return what a rollout of `replay` takes, from the row by which all workers have started."""
     opened = load_split(split)
     conditions = tuple(name for name in opened.conditions if name != NO_HISTORY)
     families = opened.families[: max(1, rollouts // len(conditions))]
-    for count in (1, 2):
-        clock = Clock()
-        with tempfile.TemporaryDirectory() as folder:
-            config = RunConfig(
-                "replay",
-                split,
-                Path(folder),
-                conditions=conditions,
-                families=families,
-                episodes="0",
-                workers=count,
-            )
-            run_evaluation(config, listener=clock)
-        # By the row of number `count`, every worker has most likely started.
-        counted = clock.times[count - 1 :]
-        seconds.append((counted[-1] - counted[0]) / (len(counted) - 1))
-    return [
-        ["1", f"{seconds[0]:.2f}", "1.00"],
-        ["2", f"{seconds[1]:.2f}", f"{seconds[0] / seconds[1]:.2f}"],
-    ]
+    clock = Clock()
+    with tempfile.TemporaryDirectory() as folder:
+        config = RunConfig(
+            "replay",
+            split,
+            Path(folder),
+            conditions=conditions,
+            families=families,
+            episodes="0",
+            workers=workers,
+        )
+        run_evaluation(config, listener=clock, executor=executor)
+    counted = clock.times[workers - 1 :]  # most likely
+    return (counted[-1] - counted[0]) / (len(counted) - 1)
+
+
+def workers(split: Path, rollouts: int) -> list[list[str]]:
+    """Time a run with one worker and with two; return the lines."""
+    one, two = (seconds_a_rollout(split, rollouts, count) for count in (1, 2))
+    return [["1", f"{one:.2f}", "1.00"], ["2", f"{two:.2f}", f"{one / two:.2f}"]]
 
 
 if __name__ == "__main__":

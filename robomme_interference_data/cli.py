@@ -4,6 +4,7 @@ Each area has its own commands file; only this one sees all of them.
 """
 
 import os
+import signal
 import sys
 from importlib import metadata
 from typing import Annotated, Any
@@ -140,6 +141,8 @@ def main() -> None:
         _keep_lines(typer.main.get_command(app))(prog_name="robomme-interference")
     except InterferenceError as error:
         _fail(error.message, error.hint)
+    except KeyboardInterrupt:  # before the command itself has begun, see `stoppable`
+        sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)

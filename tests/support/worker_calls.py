@@ -59,6 +59,10 @@ def behave(task: tuple[str, Any], worker: Worker) -> Any:
         case "die once":
             if once(more):
                 os._exit(7)
+        case "end the parent once":
+            if once(more):
+                os.kill(os.getppid(), signal.SIGKILL)
+                time.sleep(FOREVER)
         case "hang":
             Path(more, str(os.getpid())).touch()
             time.sleep(FOREVER)

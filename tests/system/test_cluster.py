@@ -1,6 +1,7 @@
 """Work on a Ray cluster: nodes and drivers that are lost, and the bytes of one process."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -10,8 +11,10 @@ from typing import Any
 
 import pytest
 from support import runs, worlds
+from support.asking import ask
 from support.made_up import MadeUpSource
 from support.ray_cluster import add_node, running_cluster
+from support.retrieval import QUIET
 from support.serve_policy import command
 from support.splits import GOLDEN, contents
 from support.worker_calls import Placed, behave, wait_until_gone
@@ -22,6 +25,8 @@ from robomme_interference_data.cluster import RayWorkers
 from robomme_interference_data.errors import ClusterError
 from robomme_interference_data.evaluate.log import read_record
 from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.rollouts import TIMING_COLUMNS
 from robomme_interference_data.rows import to_dict
 from robomme_interference_data.work_progress import WorkProgress
@@ -99,8 +104,9 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
 def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -> None:
     served = {"policy": "websocket", "serve": command("--pids", tmp_path / "pids")}
     there = RayWorkers(2, cluster.address)
-    result = runs.run(tmp_path / "run", there, conditions=CONDITIONS, **served)
+    result = runs.run(tmp_path / "run", there, conditions=CONDITIONS, videos=True, **served)
     assert result.counts["fail"] == ROLLOUTS
+    assert all((tmp_path / "run" / str(row.video)).stat().st_size for row in result.rows)
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 3  # one was asked what it is
     wait_until_gone(pids)
@@ -137,6 +143,29 @@ def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> N
         return contents(tmp_path / name)
 
     assert built("cluster", RayWorkers(3, cluster.address)) == built("one", Serial())
+
+
+def test_an_index_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
+    for name, executor in (("one", Serial()), ("cluster", RayWorkers(3, cluster.address))):
+        units = shutil.copytree(GOLDEN / "distractors", tmp_path / name / "distractors")
+        build_index([units], Thumbnail(), QUIET, executor=executor)
+    assert contents(tmp_path / "cluster") == contents(tmp_path / "one")
+
+
+def test_answers_are_those_of_one_process(cluster: Any, tmp_path: Path) -> None:
+    one = ask(tmp_path / "one", frames=3)
+    there = ask(tmp_path / "cluster", executor=RayWorkers(3, cluster.address), frames=3)
+    assert runs.untimed(there.rows) == runs.untimed(one.rows)
+
+
+def test_a_worker_that_is_killed_for_memory_costs_no_task(cluster: Any, tmp_path: Path) -> None:
+    """Ray kills its own worker, and with it goes ours."""
+    tasks = [("end the parent once", str(tmp_path / "killed")), ("value", 7)]
+    outcomes = list(RayWorkers(1, cluster.address).run(behave, tasks))
+    assert {(one.value, one.error, one.attempts) for one in outcomes} == {
+        (None, None, 2),
+        (7, None, 1),
+    }
 
 
 def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:

@@ -92,6 +92,7 @@ ELSEWHERE = (
 
 BEFORE = {
     "evaluate.md": ["evaluate --policy replay --split my-split --out runs/shard-1 --shard 1/8"],
+    "cluster.md": ["evaluate --policy replay --split my-split --out runs/part-2 --shard 2/8"],
     "score.md": [
         f"evaluate --policy replay:{memory} --split my-split --out runs/{name}"
         for name, memory in (
@@ -124,6 +125,7 @@ def test_the_commands_of_the_pages_run(
     push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
     asked = page.name == "questions.md"
     split = copy_tabletop(tmp_path / "tabletop") if asked else own_split
+    (tmp_path / "docs").symlink_to(ROOT / "docs")  # rows that a page scores
     for name in ("my-split", "S"):
         (tmp_path / name).symlink_to(split)
     monkeypatch.chdir(tmp_path)

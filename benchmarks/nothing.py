@@ -1,0 +1,21 @@
+"""A rollout that does nothing, in a module of its own: workers import it."""
+
+from robomme_interference_data.evaluate.config import Run, RunConfig
+from robomme_interference_data.evaluate.plan import WorkItem
+from robomme_interference_data.execution import Worker
+from robomme_interference_data.rollouts import Rollout
+
+
+class Nothing:
+    """Ends a rollout at once."""
+
+    def __init__(self, run: Run[RunConfig]):
+        self._run = run
+
+    def __call__(self, task: WorkItem, worker: Worker) -> Rollout:
+        """Return its row."""
+        return self._run.row(
+            task,
+            **{"seed": 0, "difficulty": "easy", "goal": "", "status": "fail", "success": False},
+            **{"steps": 0, "history_frames": 0, "lesson_frames": 0, "lesson_share": None},
+        )
