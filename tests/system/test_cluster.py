@@ -1,7 +1,9 @@
 """Work on a Ray cluster: nodes and drivers that are lost, and the bytes of one process."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -9,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from support import runs, worlds
 from support.asking import ask
@@ -179,3 +182,25 @@ def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
         work.close()
         if node is not None:
             cluster.remove_node(node, allow_graceful=False)
+
+
+def test_a_node_that_stalls_is_given_up(cluster: Any) -> None:
+    """As when its network does: nothing of it answers, and nothing ends."""
+    node = add_node(cluster, cpus=2)
+    work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7), ("value", 8)])
+    first = next(work)
+    stalled = [one.process.pid for one in node.all_processes["raylet"]]
+    stalled += [child.pid for pid in stalled for child in psutil.Process(pid).children(True)]
+    for pid in stalled:
+        os.kill(pid, signal.SIGSTOP)
+    other = add_node(cluster, cpus=2)
+    try:
+        (second,) = work  # Ray takes a minute
+        assert {first.value, second.value} == {7, 8}
+        assert (first.attempts, second.attempts) == (1, 2) and first.node != second.node
+    finally:
+        work.close()
+        for pid in stalled:
+            os.kill(pid, signal.SIGCONT)
+        for one in (node, other):
+            cluster.remove_node(one, allow_graceful=False)
