@@ -108,7 +108,7 @@ class StageTask:
             BuildError: A video does not decode to what went in.
         """
         number, episode = task
-        with tempfile.TemporaryDirectory() as name:
+        with tempfile.TemporaryDirectory(dir=worker.folder) as name:
             folder = Path(name)
             try:
                 recording = self.plan.sources[number].read(episode, self.plan.cameras)

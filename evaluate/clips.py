@@ -90,7 +90,8 @@ class Clip:
         problem: What went wrong, or None.
     """
 
-    def __init__(self, item: WorkItem, system: str):
+    def __init__(self, item: WorkItem, system: str, folder: str | None = None):
+        self._folder = folder
         self.data: bytes | None = None
         self.problem: str | None = None
         names = (system, str(item.episode), f"condition {item.condition}")
@@ -114,7 +115,9 @@ class Clip:
         self._views = {"given": history_picture(buffer, given)}
         self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
         self._show(first)
-        self._path = Path(self._file.enter_context(TemporaryDirectory()), "clip.mp4")
+        self._path = Path(
+            self._file.enter_context(TemporaryDirectory(dir=self._folder)), "clip.mp4"
+        )
         self._encoder = VideoEncoder(self._path, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
         self._encoder.add(self._picture(Status.ONGOING))
 

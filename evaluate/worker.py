@@ -61,10 +61,10 @@ class RolloutTask:
         """Run a rollout; return its row, and what befell its clip, or None.
 
         Raises:
-            WorkerRetiredError: The policy's server is gone, or serves something else here.
+            WorkerRetiredError: The policy's server is gone, or another than when the run began.
             Exception: Whatever broke in the rollout.
         """
-        clip = Clip(task, self._run.system) if self._run.config.videos else None
+        clip = Clip(task, self._run.system, worker.folder) if self._run.config.videos else None
         try:
             row = self._roll(task, worker, clip)
         except Exception as error:
@@ -88,6 +88,7 @@ class RolloutTask:
         if self._policy is None:
             self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
             self._check_served(self._policy)
+            self._hand_in_logs(worker)
         if self._writer is None:
             self._writer = make_writer(config)
         if self._simulator is None:
@@ -131,11 +132,9 @@ class RolloutTask:
         error: str | None = None,
     ) -> None:
         """Hand in the subgoals of a rollout, its clip, and logs of servers that it started."""
-        server: Any = self._policy
-        if self._run.config.serve is not None and server is not None:
-            self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
-        for log in self._logs.items():  # earlier ones too: files of an attempt that broke are lost
-            worker.hand_in(*log)
+        self._hand_in_logs(worker)
+        if status is not Status.ERROR:
+            self._logs.clear()
         if self._writer is not None:
             worker.hand_in(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
         if clip is not None:
@@ -143,16 +142,26 @@ class RolloutTask:
             if clip.data is not None:
                 worker.hand_in(clip_name(item), clip.data)
 
+    def _hand_in_logs(self, worker: Worker) -> None:
+        """Hand in what servers that the worker started have printed.
+
+        Of one that broke again with the next rollout: what an attempt hands in may be lost.
+        """
+        server: Any = self._policy
+        if self._run.config.serve is not None and server is not None:
+            self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
+        for log in self._logs.items():
+            worker.hand_in(*log)
+
     def _check_served(self, policy: Policy) -> None:
-        """Retire the worker if the server that it starts is not that of the other workers."""
-        if self._run.config.serve is None:
+        """Retire the worker if the server that it reaches is not what the run began with."""
+        if "server_metadata" not in self._said:
             return
         said, first = (one["server_metadata"] for one in (plain(policy.metadata()), self._said))
         if said != first:
             raise WorkerRetiredError(
-                f"the policy server that a worker started says {said} of itself; the first said "
-                f"{first}",
-                "Let --serve start the same checkpoint everywhere.",
+                f"a worker's policy server says {said} of itself; the run began with {first}",
+                "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
             )
 
     def _check_server(self, worker: Worker) -> None:

@@ -9,11 +9,14 @@ import logging
 import os
 import socket
 import sys
+import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Mapping, Set
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Set
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Unpack
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
 
@@ -47,7 +50,7 @@ _CONNECT_S = 10.0
 """Seconds to wait for a cluster's head."""
 
 _LOSSES = 5
-"""How often a task is started at most when its nodes are lost, which is no fault of the task."""
+"""How often a task's worker may be lost, with its node or to Ray's watch over memory."""
 
 _LOOK_S = 30.0
 """Seconds after which it is told that no worker could begin yet."""
@@ -59,7 +62,8 @@ class RayWorkers:
 
     Every node that has room for a worker is asked first what it has installed, and what the tasks
     say of themselves there (`Task.describe`): a difference to this process is an error. A node
-    that comes later is asked too, and left alone if it differs.
+    that comes later is asked too, and left alone if it differs. Workers are in the folder that
+    this process is in, where a node has it.
 
     Attributes:
         workers: How many, at most; those for which there is no room start when a node comes.
@@ -94,23 +98,21 @@ class RayWorkers:
         task ran.
 
         Raises:
-            ClusterError: There is no cluster, nodes differ from this process, or no worker can
-                begin on any of them.
+            ClusterError: There is no cluster, it is this machine and has no room, nodes differ
+                from this process, or workers cannot be made.
         """
         end_if_starting()
         todo = list(tasks)
         if not todo:
             return
         with _connected(self.address):
-            own, shared = describe(function), ray.put(function)
-            known = self._check_nodes(shared, own)
+            # As a value of each call: what lies in Ray's store is lost with its node.
+            own, folder = describe(function), str(Path.cwd())
+            known = self._check_nodes(function, own, folder)
             options = {"num_cpus": self.cpus, "num_gpus": self.gpus, "max_restarts": -1}
-            made: Any = _Host
-            hosts = [
-                made.options(**options).remote(shared, number)
-                for number in range(min(self.workers, len(todo)))
-            ]
-            work = _Work(hosts, limits, own, known)
+            host: Any = _Host
+            make = partial(host.options(**options).remote, function, folder)
+            work = _Work(make, min(self.workers, len(todo)), limits, own, known)
             try:
                 yield from work.run(todo, self._wanted)
             finally:
@@ -120,13 +122,13 @@ class RayWorkers:
     def _wanted(self) -> str:
         return f"{self.cpus:g} CPUs" + (f" and {self.gpus:g} GPUs" if self.gpus else "")
 
-    def _check_nodes(self, shared: Any, own: Mapping[str, str]) -> set[str]:
+    def _check_nodes(self, function: Task, own: Mapping[str, str], folder: str) -> set[str]:
         """Compare all nodes that have room for a worker with this process; return their ids.
 
         One that is lost meanwhile is left out.
 
         Raises:
-            ClusterError: Some differ.
+            ClusterError: Some differ; or there is none, and none can come.
         """
         asked: dict[str, Any] = {}
         for node in _nodes():
@@ -134,7 +136,12 @@ class RayWorkers:
             if node["Alive"] and has.get("CPU", 0) >= self.cpus and has.get("GPU", 0) >= self.gpus:
                 there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 call = _describe.options(num_cpus=0, scheduling_strategy=there)
-                asked[node["NodeID"]] = call.remote(shared)
+                asked[node["NodeID"]] = call.remote(function, folder)
+        if not asked and self.address == "local":
+            raise ClusterError(
+                f"this machine does not have {self._wanted} for a worker",
+                "Give less with --cpus-per-worker and --gpus-per-worker.",
+            )
         wrong, known = [], set()
         for node_id, answer in asked.items():
             name = _name(node_id)
@@ -143,10 +150,9 @@ class RayWorkers:
                 known.add(node_id)
             except InterferenceError as error:
                 wrong.append(f"{name}: {error.message}")
-            except RayTaskError as error:
-                wrong.append(f"{name}: {_cause(error)}")
-            except RayError:  # Ray learns late that a node is gone
-                continue
+            except RayError as error:
+                if any(node["Alive"] for node in _nodes() if node["NodeID"] == node_id):
+                    wrong.append(f"{name}: {_cause(error)}")
         if wrong:
             raise ClusterError(
                 "nodes of the cluster are not as this process is:\n  " + "\n  ".join(wrong),
@@ -156,7 +162,8 @@ class RayWorkers:
 
 
 @ray.remote
-def _describe(function: Task) -> dict[str, str]:
+def _describe(function: Task, folder: str) -> dict[str, str]:
+    _enter(folder)
     return describe(function)
 
 
@@ -164,18 +171,27 @@ def _describe(function: Task) -> dict[str, str]:
 class _Host:
     """Holds one worker process, on whatever node Ray starts it."""
 
-    def __init__(self, function: Task, number: int):
-        self._function, self._number = function, number
+    def __init__(self, function: Task, folder: str, number: int):
+        _enter(folder)
+        self._function, self._number, self._begun = function, number, False
         self._process: WorkerProcess | None = None
         self._node = ray.get_runtime_context().get_node_id()
         self._name = _name(self._node)
 
     def begin(self, known: Set[str]) -> tuple[str, dict[str, str] | None]:
         """Return the node's id, and unless that is known, what `describe` says there."""
+        self._begun = True
         return self._node, None if self._node in known else describe(self._function)
 
-    def work(self, task: Any, attempts: int, time_limit: float | None) -> tuple[Outcome, bool]:
-        """Do a task; return what became of it, and whether the worker process went with it."""
+    def work(
+        self, task: Any, attempts: int, time_limit: float | None
+    ) -> tuple[Outcome, bool] | None:
+        """Do a task; return what became of it, and whether the worker process went with it.
+
+        None, before `begin`: Ray has started it again, maybe on a node that nobody has looked at.
+        """
+        if not self._begun:
+            return None
         self._process = self._process or WorkerProcess(self._function, self._number)
         self._process.give(task, attempts, time_limit)
         while (outcome := self._process.settle()) is None:
@@ -191,90 +207,145 @@ class _Host:
         end_workers([self._process] if self._process else [])
 
 
+class _Given(NamedTuple):
+    """A task, with how often it broke its worker, and how often its worker was lost."""
+
+    task: Any
+    broke: int = 0
+    lost: int = 0
+
+    @property
+    def attempt(self) -> int:
+        return self.broke + self.lost + 1
+
+
 class _Work:
-    """Hosts, and the tasks that they work on."""
+    """Hosts, and the tasks that they work on.
+
+    Args:
+        make: Makes a host of a number.
+        hosts: How many there are.
+        limits: Of the tasks.
+        own: What `describe` says here.
+        known: Ids of nodes where it says the same.
+    """
 
     def __init__(
-        self, hosts: Iterable[Any], limits: Limits, own: Mapping[str, str], known: set[str]
+        self,
+        make: Callable[[int], Any],
+        hosts: int,
+        limits: Limits,
+        own: Mapping[str, str],
+        known: set[str],
     ):
-        self._limits, self._own, self._known = limits, own, known
-        self._waiting: deque[tuple[Any, int]] = deque()
+        self._make, self._limits, self._own, self._known = make, limits, own, known
+        self._waiting: deque[_Given] = deque()
         self._idle: list[Any] = []
-        self._calls: dict[Any, tuple[Any, tuple[Any, int] | None]] = {}
-        for host in hosts:
-            self._begin(host)
+        self._left_out: list[Any] = []
+        self._calls: dict[Any, tuple[Any, _Given | None]] = {}
+        self._made = 0
+        self._why = ""
+        for _ in range(hosts):
+            self._begin(self._new())
 
     def run(self, tasks: Iterable[Any], wanted: str) -> Iterator[Outcome]:
         """Yield outcomes as they come; `wanted` says what a worker takes, for who waits."""
-        self._waiting += [(task, 1) for task in tasks]
-        begun = False
+        self._waiting += map(_Given, tasks)
+        told = time.monotonic()
         while self._waiting or any(given for _, given in self._calls.values()):
             while self._waiting and self._idle:
                 host, given = self._idle.pop(), self._waiting.popleft()
-                call = host.work.remote(*given, self._limits.get("time_limit"))
+                call = host.work.remote(given.task, given.attempt, self._limits.get("time_limit"))
                 self._calls[call] = host, given
             done, _ = ray.wait([*self._calls], timeout=_LOOK_S)
-            begun = begun or bool(done)
-            if not begun:
-                say(f"No node of the cluster has {wanted} for a worker yet; waiting for one")
             for call in done:
                 yield from self._settle(call, *self._calls.pop(call))
+            if self._idle or any(given for _, given in self._calls.values()):
+                told = time.monotonic()
+            elif time.monotonic() - told > _LOOK_S:
+                told = time.monotonic()
+                say(f"No node of the cluster has {wanted} for a worker; waiting for one{self._why}")
 
     def end(self) -> None:
         """End all hosts: those without a task may close what they hold, within a time."""
         ends = [host.end.remote() for host in self._idle]
         if ends:
             ray.wait(ends, num_returns=len(ends), timeout=CLOSE_S)
-        for host in (*self._idle, *(host for host, _ in self._calls.values())):
+        working = [host for host, _ in self._calls.values()]
+        for host in (*self._idle, *self._left_out, *working):
             ray.kill(host)
+
+    def _new(self) -> Any:
+        self._made += 1
+        return self._make(self._made - 1)
 
     def _begin(self, host: Any) -> None:
         self._calls[host.begin.remote(self._known)] = host, None
 
-    def _settle(self, call: Any, host: Any, given: tuple[Any, int] | None) -> Iterator[Outcome]:
+    def _settle(self, call: Any, host: Any, given: _Given | None) -> Iterator[Outcome]:
         """Take what came of a call; yield the outcome of its task, unless that is done again."""
         try:
             answer = ray.get(call)
+        except RayTaskError as error:
+            if given is not None:
+                raise error.cause from None
+            self._leave_out(host, _cause(error))
         except RayError as error:
-            told = error.cause if isinstance(error, RayTaskError) else None
-            if given is None and (told or getattr(error, "actor_init_failed", False)):
-                self._retire(host, ClusterError(f"a worker cannot begin: {_cause(error)}"))
-                return
-            if told is not None:
-                raise told from None
-            self._begin(host)  # Ray starts it again, where there is room
-            if given is not None and not self._again(given, _LOSSES):
-                lost = RuntimeError(f"the worker was lost with its node: {_cause(error)}")
-                yield Outcome(given[0], None, lost, None, given[1])
-            return
-        if given is None:
-            node, found = answer
-            wrong = [] if found is None else _differences(_name(node), found, self._own)
-            if wrong:
-                self._retire(host, ClusterError("; ".join(wrong), "Install the same there."))
+            self._lose(host, error)
+            if given is not None:
+                yield from self._again(given._replace(lost=given.lost + 1), error)
+        else:
+            if given is None:
+                self._take(host, *answer)
+            elif answer is None:
+                self._waiting.append(given)
+                self._begin(host)
             else:
-                self._known.add(node)
-                self._idle.append(host)
-            return
-        outcome, over = answer
+                yield from self._outcome(host, given, *answer)
+
+    def _take(self, host: Any, node: str, found: Mapping[str, str] | None) -> None:
+        """Let a host that has begun work, if its node is as it should be."""
+        wrong = [] if found is None else _differences(_name(node), found, self._own)
+        if wrong:
+            self._leave_out(host, "; ".join(wrong))
+        else:
+            self._known.add(node)
+            self._idle.append(host)
+
+    def _leave_out(self, host: Any, why: str) -> None:
+        """Do without a host, which keeps its place, so that the next one is put elsewhere."""
+        say(f"A worker is left out: {why}")
+        self._left_out.append(host)
+        self._begin(self._new())
+
+    def _lose(self, host: Any, error: RayError) -> None:
+        """Begin a host again that Ray starts again, where there is room; or do without it."""
+        self._why = f" (the last one: {_cause(error)})"
+        if getattr(error, "actor_init_failed", False):
+            self._retire(host, ClusterError(f"a worker cannot begin: {_cause(error)}"))
+        else:
+            self._begin(host)
+
+    def _outcome(self, host: Any, given: _Given, outcome: Outcome, over: bool) -> Iterator[Outcome]:
         if isinstance(outcome.error, WorkerRetiredError):
             self._waiting.appendleft(given)
             self._retire(host, outcome.error)
             return
         self._idle.append(host)
-        if not (
-            (over or isinstance(outcome.error, self._limits.get("again", ())))
-            and self._again(given, self._limits.get("attempts", ATTEMPTS))
-        ):
+        broke = given._replace(broke=given.broke + 1)
+        again = over or isinstance(outcome.error, self._limits.get("again", ()))
+        if again and broke.broke < self._limits.get("attempts", ATTEMPTS):
+            self._waiting.append(broke)
+        else:
             yield outcome
 
-    def _again(self, given: tuple[Any, int], most: int) -> bool:
-        """Queue a task once more, unless it was started so often already."""
-        task, attempts = given
-        if attempts >= most:
-            return False
-        self._waiting.append((task, attempts + 1))
-        return True
+    def _again(self, given: _Given, error: RayError) -> Iterator[Outcome]:
+        """Queue a task whose worker was lost, unless that was so often already."""
+        if given.lost < _LOSSES:
+            self._waiting.append(given)
+        else:
+            lost = RuntimeError(f"the worker was lost with its node: {_cause(error)}")
+            yield Outcome(given.task, None, lost, None, given.attempt - 1)
 
     def _retire(self, host: Any, why: InterferenceError) -> None:
         """Do without a host; if it was the last one, that is an error."""
@@ -282,6 +353,12 @@ class _Work:
         if not self._idle and not self._calls:
             raise why
         say(f"A worker is left out: {why.message}")
+
+
+def _enter(folder: str) -> None:
+    """Be in the folder of the caller, where relative paths mean what they mean there."""
+    with suppress(OSError):
+        os.chdir(folder)
 
 
 @contextmanager
@@ -314,8 +391,13 @@ def _connected(address: str) -> Iterator[None]:
                 logging_level=logging.ERROR,
                 runtime_env={"env_vars": {k: v for k, v in os.environ.items() if k in _PASSED}},
             )
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except ConnectionError as error:
             raise unreached from error
+        except (ValueError, RuntimeError) as error:  # such as another version of Ray
+            raise ClusterError(
+                f"the Ray cluster at {address!r} refuses: {first_line(error)}",
+                "Install the same Ray and Python here and on its nodes.",
+            ) from error
         try:
             yield
         finally:
@@ -332,7 +414,7 @@ def _nodes() -> list[dict[str, Any]]:
 def _name(node_id: str) -> str:
     """Return what a node is called in messages: its address, and the beginning of its id."""
     known = {node["NodeID"]: node["NodeManagerAddress"] for node in _nodes()}
-    return f"{known.get(node_id, socket.gethostname())}-{node_id[:6]}"
+    return f"{known[node_id]}-{node_id[:6]}"
 
 
 def _differences(name: str, found: Mapping[str, str], own: Mapping[str, str]) -> list[str]:

@@ -47,7 +47,7 @@ TIMING_COLUMNS = (
 """Columns that differ from one run to the next; all others do not."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Rollout:
     """One rollout.
 

@@ -4,8 +4,10 @@ import faulthandler
 import multiprocessing
 import os
 import pickle
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 import time
 import traceback
@@ -35,10 +37,17 @@ class Worker:
 
     Attributes:
         number: From 0; a worker that takes the place of one that died has its number.
+        folder: Where tasks may keep files while they run: it goes with the worker, however that
+            ends. None for the system's folder of such files.
     """
 
-    def __init__(self, number: int, tell: Callable[[Any], None] = lambda message: None):
-        self.number = number
+    def __init__(
+        self,
+        number: int,
+        tell: Callable[[Any], None] = lambda message: None,
+        folder: str | None = None,
+    ):
+        self.number, self.folder = number, folder
         self._tell = tell
 
     def hand_in(self, path: str, data: bytes) -> None:
@@ -142,7 +151,8 @@ class WorkerProcess:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._words, their_words = context.Pipe(duplex=False)
-        arguments = (function, theirs, their_words, number)
+        self._folder = tempfile.mkdtemp(prefix="robomme-interference-")
+        arguments = (function, theirs, their_words, number, self._folder)
         self._process = context.Process(target=_serve, args=arguments, daemon=True)
         self._process.start()
         assert self._process.pid is not None
@@ -200,6 +210,7 @@ class WorkerProcess:
         self._process.join()
         self._pipe.close()
         self._words.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def _outcome(self, value: Any, error: BaseException | None, trace: str | None) -> Outcome:
         return Outcome(self._task, value, error, trace, self._attempts, self._files)
@@ -280,7 +291,7 @@ def end_workers(workers: Sequence[WorkerProcess]) -> None:
 # --- the worker's side -------------------------------------------------------------------------
 
 
-def _serve(function: Task, pipe: Connection, words: Connection, number: int) -> None:
+def _serve(function: Task, pipe: Connection, words: Connection, number: int, folder: str) -> None:
     """Work on tasks until there are no more, or the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     # Written by a signal handler in C: also of a process whose interpreter is locked.
@@ -289,11 +300,11 @@ def _serve(function: Task, pipe: Connection, words: Connection, number: int) -> 
     os.setpgid(0, 0)
     multiprocessing.current_process().daemon = False
     # A parent that was killed cannot stop a task that hangs.
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
     # Stdout is for what the command writes.
     os.dup2(2, 1)
     sys.stdout = sys.stderr
-    worker = Worker(number, pipe.send)
+    worker = Worker(number, pipe.send, folder)
     with suppress(OSError, EOFError):
         pipe.send(("ready",))
         while True:
@@ -312,11 +323,12 @@ def _send(pipe: Connection, value: Any, error: BaseException | None, trace: str 
         pipe.send(("done", None, told, trace))
 
 
-def _end_with_parent() -> None:
+def _end_with_parent(folder: str) -> None:
     """End this process and its own when its parent is gone, whatever they are doing."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
+        shutil.rmtree(folder, ignore_errors=True)
         os.killpg(0, signal.SIGKILL)
 
 

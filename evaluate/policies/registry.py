@@ -145,6 +145,8 @@ def served_policy(text: str, serve: str | None) -> str:
         InvalidOptionError: There is no place for the port, or the policy has no server to start.
     """
     if serve is None:
+        if parse_policy(text).serves:
+            raise InvalidOptionError.expected("policy", text, _KINDS["websocket"][1])
         return text
     if text != "websocket":
         raise InvalidOptionError(

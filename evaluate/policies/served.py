@@ -2,7 +2,9 @@
 
 import os
 import shlex
+import shutil
 import subprocess
+import sys
 import tempfile
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
@@ -10,12 +12,10 @@ from typing import Any
 
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import InvalidOptionError, ServerDiedError, printed_last
+from robomme_interference_data.evaluate.policies import server_guard
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.servers import hold_port
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
-
-_END_S = 5.0
-"""Seconds that a server has to end when it is asked to."""
 
 _DEATH_S = 0.5
 """Seconds after which a server that closed its connection is taken to be alive."""
@@ -28,8 +28,9 @@ class ServedPolicy(WebsocketPolicy):
     """A policy server by the command that starts it, which is run when it is first needed.
 
     The command is run without a shell, in this process's folder and environment, and listens at a
-    port that no other server of this package has here. It ends with `close`, and with the worker
-    process. A call that finds it ended raises `ServerDiedError`, with what it printed last.
+    port that no other worker's server has on this machine. It ends, with all that it has started,
+    with `close`, or with this process, however that ends. A call that finds it ended raises
+    `ServerDiedError`, with what it printed last.
 
     Args:
         command: The command, with `{port}` in it.
@@ -85,29 +86,28 @@ class ServedPolicy(WebsocketPolicy):
         """Close the connection, and end the server."""
         super().close()
         if self._process is not None:
-            self._process.terminate()
-            try:
-                self._process.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            assert self._process.stdin is not None
+            self._process.stdin.close()  # the guard ends it
+            self._process.wait()
         self._stack.close()
 
     def _start(self) -> None:
         if self._process is not None:
             return
-        self.started = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         words = [word.replace("{port}", str(self._port)) for word in shlex.split(self._command)]
-        try:
-            # In the group of the worker process, and so ended with it however that ends.
-            self._process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=self._log, stderr=subprocess.STDOUT
-            )
-        except OSError as error:
+        if shutil.which(words[0]) is None:
             raise InvalidOptionError(
-                f"--serve {self._command!r} cannot be run: {error}",
+                f"--serve {self._command!r} cannot be run: there is no program {words[0]}",
                 "Give a program and its arguments: there is no shell.",
-            ) from error
+            )
+        self.started = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+        self._process = subprocess.Popen(
+            [sys.executable, server_guard.__file__, *words],
+            process_group=0,
+            stdin=subprocess.PIPE,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+        )
 
     def _check(self) -> None:
         if self._process is None:

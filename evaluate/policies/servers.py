@@ -34,59 +34,55 @@ def hold_servers(text: str, out: Path) -> Iterator[None]:
     Raises:
         PolicyServerError: Another run drives one of them; says which.
     """
+    folder = default_cache_folder().parent / "servers"
     with ExitStack() as stack:
         for host, port in parse_policy(text).servers:
-            stack.enter_context(_hold_server(host, port, f"the run in {out.resolve()}"))
+            machine = socket.gethostname() if host in _THIS_MACHINE else host
+            lock = folder / f"{machine.replace(':', '_')}_{port}.lock"
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                lock.touch()
+                holder = lock.read_text(encoding="utf-8", errors="replace")
+            except OSError as error:
+                say(f"Nothing keeps other runs from the policy server {host}:{port}: {error}")
+                continue
+            busy = PolicyServerError(
+                f"the policy server {host}:{port} is driven by {holder or 'another run'}; two runs "
+                "spoil each other, as a server holds one memory",
+                "Wait for that run to end, or start another server, on another port.",
+            )
+            stack.enter_context(hold(lock, busy))
+            with suppress(OSError):  # such as a full disk: the lock holds all the same
+                lock.write_text(f"the run in {out.resolve()} (process {os.getpid()})", "utf-8")
         yield
 
 
 @contextmanager
 def hold_port() -> Iterator[int]:
-    """Choose a port for a server on this machine, and keep it from all others until the block ends.
+    """Choose a port for a server on this machine, and keep it from other workers in the block.
 
     A server listens only when its model is loaded. Were the port free until then, two that load at
-    once might get the same, and one of them both rollouts.
+    once might get the same, and one of them both rollouts. So its number is taken as the name of
+    an abstract socket (Linux): known to whoever could listen there, whatever user or container,
+    and gone with the process.
 
     Raises:
         PolicyServerError: All are taken.
     """
     with ExitStack() as stack:
         for port in _PORTS:
-            with suppress(PolicyServerError, OSError):
-                with socket.socket() as free:
-                    free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
-                    free.bind(("", port))
-                stack.enter_context(_hold_server("localhost", port, "a worker"))
+            name = stack.enter_context(socket.socket(socket.AF_UNIX))
+            with suppress(OSError), socket.socket() as free:
+                free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
+                free.bind(("", port))
+                name.bind(f"\0robomme-interference-{port}")
                 break
         else:
             raise PolicyServerError(
-                f"none of the ports {_PORTS[0]} to {_PORTS[-1]} is free on this machine"
+                f"none of the ports {_PORTS[0]} to {_PORTS[-1]} can be had on this machine",
+                "--serve needs Linux, and a free port there.",
             )
         yield port
-
-
-@contextmanager
-def _hold_server(host: str, port: int, holder: str) -> Iterator[None]:
-    folder = default_cache_folder().parent / "servers"
-    machine = socket.gethostname() if host in _THIS_MACHINE else host
-    lock = folder / f"{machine.replace(':', '_')}_{port}.lock"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock.touch()
-        other = lock.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        say(f"Nothing keeps other runs from the policy server {host}:{port}: {error}")
-        yield
-        return
-    busy = PolicyServerError(
-        f"the policy server {host}:{port} is driven by {other or 'another run'}; two runs "
-        "spoil each other, as a server holds one memory",
-        "Wait for that run to end, or start another server, on another port.",
-    )
-    with hold(lock, busy):
-        with suppress(OSError):  # such as a full disk: the lock holds all the same
-            lock.write_text(f"{holder} (process {os.getpid()})", "utf-8")
-        yield
 
 
 def check_metadata(said: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:

@@ -7,6 +7,7 @@ import psutil
 import pytest
 from support import runs
 from support.serve_policy import command
+from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import (
     InterferenceError,
@@ -71,6 +72,7 @@ def test_one_that_cannot_start_is_told_with_its_last_words(tmp_path: Path, words
     [
         ({"policy": "websocket"}, "websocket with --serve"),
         ({"policy": "replay", "serve": "serve {port}"}, "has none to start"),
+        ({"policy": "websocket:serve {port}"}, "websocket with --serve"),
         ({"policy": "websocket", "serve": "serve 8000"}, "a command with {port}"),
         ({"policy": "websocket", "serve": "serve '{port}"}, "a command with {port}"),
         ({"policy": "websocket", "serve": "no-such-program {port}"}, "cannot be run"),
@@ -114,6 +116,19 @@ def test_two_servers_of_one_machine_have_two_ports() -> None:
         policy.close()
         with hold_port() as again:
             assert len({other, again}) == 2
+
+
+def test_what_a_script_started_ends_with_it(tmp_path: Path) -> None:
+    """A shell that waits for the server would leave it behind."""
+    script = tmp_path / "serve.sh"
+    line = command("--pids", tmp_path / "pids").replace("'{port}'", "$1")
+    script.write_text(f"{line}\ntrue\n")
+    policy: Any = make_policy(f"websocket:bash {script} {{port}}")
+    assert policy.metadata()["server_metadata"] == {"checkpoint": "tiny/1"}
+    pid = int((tmp_path / "pids").read_text())
+    assert psutil.pid_exists(pid)
+    policy.close()
+    wait_until_gone([pid])
 
 
 def test_the_end_of_a_long_log_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

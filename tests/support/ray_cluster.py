@@ -35,5 +35,5 @@ def running_cluster(nodes: int, cpus: int = 1) -> Iterator[Cluster]:
             os.environ["PYTHONPATH"] = before
 
 
-def add_node(cluster: Cluster, cpus: int = 1) -> Any:
-    return cluster.add_node(num_cpus=cpus, object_store_memory=_MEMORY)
+def add_node(cluster: Cluster, cpus: int = 1, **environment: str) -> Any:
+    return cluster.add_node(num_cpus=cpus, object_store_memory=_MEMORY, env_vars=environment)

@@ -103,6 +103,16 @@ class Held:
         sys.stdout.write("closed\n")
 
 
+class Marked:
+    """Says of itself what its node's environment says."""
+
+    def __call__(self, task: Any, worker: Worker) -> Any:
+        return task
+
+    def describe(self) -> dict[str, str]:
+        return {"mark": os.environ.get("MARK", "none")}
+
+
 class Placed:
     """Says of itself which node of a cluster it is on: no two say the same."""
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from support.ray_cluster import add_node, running_cluster
 from support.retrieval import QUIET
 from support.serve_policy import command
 from support.splits import GOLDEN, contents
-from support.worker_calls import Placed, behave, wait_until_gone
+from support.worker_calls import Marked, Placed, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan
@@ -169,6 +170,28 @@ def test_a_worker_that_is_killed_for_memory_costs_no_task(cluster: Any, tmp_path
         (None, None, 2),
         (7, None, 1),
     }
+
+
+def test_a_node_that_joins_and_differs_is_left_out(
+    cluster: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And the worker that was to be there is made on the next one."""
+    nodes = []
+    with ThreadPoolExecutor(1) as pool:
+        work = RayWorkers(1, cluster.address, cpus=2).run(Marked(), [7])
+        done = pool.submit(list, work)
+        try:
+            nodes.append(add_node(cluster, cpus=2, MARK="other"))
+            said, end = "", time.monotonic() + 60
+            while "mark is other there, none here" not in said:
+                assert time.monotonic() < end and not done.done(), said
+                time.sleep(0.1)
+                said += capsys.readouterr().err
+            nodes.append(add_node(cluster, cpus=2))
+            assert [outcome.value for outcome in done.result(timeout=60)] == [7]
+        finally:
+            for node in nodes:
+                cluster.remove_node(node, allow_graceful=False)
 
 
 def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
