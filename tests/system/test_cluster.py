@@ -73,6 +73,12 @@ def driver(out: Path, address: str) -> subprocess.Popen[str]:
     )
 
 
+def raylets(node: Any) -> list[Any]:
+    """What runs a node's workers."""
+    found: list[Any] = node.all_processes["raylet"]
+    return found
+
+
 def wait_for_rows(out: Path, count: int, running: subprocess.Popen[str]) -> None:
     log, end = out / "rollouts.jsonl", time.monotonic() + 200
     while not log.exists() or log.read_bytes().count(b"\n") < count:
@@ -103,6 +109,20 @@ def test_a_node_and_the_driver_are_killed_and_no_row_is_lost(
     after = read_record(out)  # refuses a second row of a finished rollout
     assert all(after[item] == row for item, row in before.items())
     assert [row | {"video": None} for row in ended(tmp_path / "one")] == ended(out)
+
+
+def test_ctrl_c_gives_all_workers_back(cluster: Any, tmp_path: Path) -> None:
+    running = driver(tmp_path / "run", cluster.address)
+    wait_for_rows(tmp_path / "run", 1, running)
+    nodes = [one.process.pid for each in cluster.list_all_nodes() for one in raylets(each)]
+    hosts = [child for pid in nodes for child in psutil.Process(pid).children(recursive=True)]
+    workers = [each.pid for each in hosts if "spawn_main" in " ".join(each.cmdline())]
+    assert len(workers) == 3
+    running.send_signal(signal.SIGINT)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 130 and "go on with:" in err
+    wait_until_gone(workers)
+    assert 1 <= len(read_record(tmp_path / "run")) < ROLLOUTS
 
 
 def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -> None:
@@ -212,7 +232,7 @@ def test_a_node_that_stalls_is_given_up(cluster: Any) -> None:
     node = add_node(cluster, cpus=2)
     work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7), ("value", 8)])
     first = next(work)
-    stalled = [one.process.pid for one in node.all_processes["raylet"]]
+    stalled = [one.process.pid for one in raylets(node)]
     stalled += [child.pid for pid in stalled for child in psutil.Process(pid).children(True)]
     for pid in stalled:
         os.kill(pid, signal.SIGSTOP)
