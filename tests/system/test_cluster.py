@@ -227,6 +227,30 @@ def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
             cluster.remove_node(node, allow_graceful=False)
 
 
+def test_a_node_with_notice_works_on_until_it_is_gone(cluster: Any) -> None:
+    """As a spot machine has, which Ray is told to drain."""
+    node = add_node(cluster, cpus=2)
+    work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("pid", n) for n in range(3)])
+    try:
+        first = next(work)
+        words = f"drain-node --address {cluster.address} --node-id {node.node_id} "
+        words += "--reason DRAIN_NODE_REASON_PREEMPTION --reason-message spot"
+        ray = Path(sys.executable).with_name("ray")
+        subprocess.run(
+            [ray, *words.split(), "--deadline-remaining-seconds", "120"], check=True, timeout=60
+        )
+        second = next(work)
+        assert (second.value, second.node) == (first.value, first.node)
+        cluster.remove_node(node, allow_graceful=False)
+        wait_until_gone([first.value])
+        node = add_node(cluster, cpus=2)
+        (third,) = work
+        assert third.error is None and third.node not in (None, first.node)
+    finally:
+        work.close()
+        cluster.remove_node(node, allow_graceful=False)
+
+
 def test_a_node_that_stalls_is_given_up(cluster: Any) -> None:
     """As when its network does: nothing of it answers, and nothing ends."""
     node = add_node(cluster, cpus=2)
