@@ -2,7 +2,8 @@
 
     python benchmarks/cluster.py --rollouts 100000
 
-- *driver*: rollouts that do nothing, their rows written as in a run; what they cost the driver.
+- *driver*: rollouts that do nothing, their rows written and shown as in a run; what they cost the
+  driver.
 - *overhead*: rollouts of `replay` on the embedded simulator, by worker processes and by as many
   workers of a cluster, from when all of them have started.
 - *grid*: the paper's 25,200 rollouts on more and more workers, by a simulation of the queue: every
@@ -31,6 +32,7 @@ from robomme_interference_data.constants import FAMILIES, MAX_STEPS
 from robomme_interference_data.evaluate.config import Run, RunConfig
 from robomme_interference_data.evaluate.log import open_log
 from robomme_interference_data.evaluate.plan import WorkItem, shuffle_work
+from robomme_interference_data.evaluate.progress import RunProgress
 from robomme_interference_data.execution import Processes
 from robomme_interference_data.ids import EpisodeId
 
@@ -55,14 +57,20 @@ def drive(rollouts: int, workers: int) -> list[str]:
     """Write the rows of rollouts that do nothing; return a row of the table."""
     config = RunConfig(policy="hold", split=Path(), out=Path())
     this, todo = psutil.Process(), items(rollouts)
-    with TemporaryDirectory() as folder, open_log(Path(folder), {}, "none") as log:
+    with (
+        TemporaryDirectory() as folder,
+        open_log(Path(folder), {}, "none") as log,
+        RunProgress() as shown,
+    ):
+        shown.start(todo, [])
         task = Nothing(Run(config, "hold", "none", "none"))
         memory: list[int] = []
         with closing(RayWorkers(workers, "local").run(task, todo)) as outcomes:
-            log.append(next(outcomes).value)
+            next(outcomes)
             began, used = time.perf_counter(), time.process_time()
             for number, outcome in enumerate(outcomes):
                 log.append(outcome.value)
+                shown.row(outcome.value, outcome.node)
                 if number in (rollouts // 10, rollouts - 2):
                     memory.append(this.memory_info().rss)
             seconds, used = time.perf_counter() - began, time.process_time() - used

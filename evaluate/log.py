@@ -122,7 +122,12 @@ class RunHeader:
 
 
 class RunLog:
-    """A run's folder that is written, see `open_log`; `rows` has the row that counts of each."""
+    """A run's folder that is written, see `open_log`.
+
+    Attributes:
+        rows: The row that counts of each rollout, as of the opening, and of the end once that is
+            written: rows between are on the disk, and not in memory.
+    """
 
     def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
         self.folder, self.header, self.rows = folder, header, rows
@@ -140,7 +145,7 @@ class RunLog:
         Raises:
             OSError: The file cannot be written; it is named.
         """
-        item, path = WorkItem.of(row), self.folder / RUN_RECORD
+        path = self.folder / RUN_RECORD
         try:
             with path.open("ab") as file:
                 file.write(_line(row))
@@ -148,11 +153,11 @@ class RunLog:
                 os.fsync(file.fileno())
         except OSError as error:  # from writing, it names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
-        self.rows[item] = row
         if trace:
             log = self.folder / ERRORS_LOG
             with log.open("a", encoding="utf-8", errors="backslashreplace") as file:
-                file.write(f"{row.finished_at} {item}, attempt {row.attempt}\n{trace.rstrip()}\n\n")
+                file.write(f"{row.finished_at} {WorkItem.of(row)}, attempt {row.attempt}\n")
+                file.write(f"{trace.rstrip()}\n\n")
 
     def write_all(self, rows: Iterable[Rollout]) -> None:
         """Write all rows anew, whole or not at all."""
