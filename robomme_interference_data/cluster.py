@@ -46,6 +46,10 @@ from robomme_interference_data.worker_process import (
 _PASSED = ("PYTHONPATH", "HF_ENDPOINT", "HF_HUB_OFFLINE")
 """What the environment of this process says to workers: where modules are, and where the Hub."""
 
+_TOKEN = (
+    "If its nodes want a token: set RAY_AUTH_MODE=token, and put theirs into ~/.ray/auth_token."
+)
+
 _CONNECT_S = 10.0
 """Seconds to wait for a cluster's head."""
 
@@ -88,6 +92,15 @@ class RayWorkers:
             if not 0 <= getattr(self, name) < float("inf"):
                 told = f"--{name}-per-worker"
                 raise InvalidOptionError.expected(told, getattr(self, name), "0 or more")
+        if self.gpus > 1 and self.gpus % 1:  # so Ray has it
+            raise InvalidOptionError.expected("--gpus-per-worker", self.gpus, "1 or less, or whole")
+        port = self.address.rpartition(":")[2]
+        if self.address not in ("auto", "local") and not (
+            port != self.address and port.isdecimal() and int(port) < 1 << 16
+        ):
+            raise InvalidOptionError.expected(
+                "--ray-address", self.address, "auto, local or HOST:PORT"
+            )
 
     def run(
         self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
@@ -392,11 +405,12 @@ def _connected(address: str) -> Iterator[None]:
                 runtime_env={"env_vars": {k: v for k, v in os.environ.items() if k in _PASSED}},
             )
         except ConnectionError as error:
+            unreached.hint = f"{unreached.hint}\n{_TOKEN}"
             raise unreached from error
-        except (ValueError, RuntimeError) as error:  # such as another version of Ray
+        except (ValueError, RuntimeError, RayError) as error:  # such as another version of Ray
             raise ClusterError(
                 f"the Ray cluster at {address!r} refuses: {first_line(error)}",
-                "Install the same Ray and Python here and on its nodes.",
+                f"Install the same Ray and Python here and on its nodes.\n{_TOKEN}",
             ) from error
         try:
             yield

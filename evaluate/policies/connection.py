@@ -67,7 +67,8 @@ class ServerConnection:
         port: Its port.
         connect_s: Most seconds to wait until it can be used.
         response_s: Most seconds from a message to its answer.
-        check: Called where no answer came; raises where it is known why none will.
+        check: Called where no answer came; raises where it is known why none will, and else
+            returns what to do about it, or None.
 
     Attributes:
         name: `host:port`.
@@ -81,7 +82,7 @@ class ServerConnection:
         *,
         connect_s: float,
         response_s: float,
-        check: Callable[[], None] = lambda: None,
+        check: Callable[[], str | None] = lambda: None,
     ):
         self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self._address = host, port
@@ -132,12 +133,12 @@ class ServerConnection:
                     until = 0.0
             except InvalidHandshake as error:
                 raise self._refusal(error) from error
-            self._check()
+            hint = self._check()
             if time.monotonic() + pause > until:
                 raise PolicyServerError(
                     f"policy server {self.name} cannot be reached: {reason}"
                     + (f" (for {self._connect_s:g} s)" if until else ""),
-                    f"Start it, or check host and port; {_GUIDE}",
+                    hint or f"Start it, or check host and port; {_GUIDE}",
                 )
             time.sleep(pause)
             pause = min(2 * pause, longest)

@@ -109,12 +109,17 @@ class ServedPolicy(WebsocketPolicy):
             stderr=subprocess.STDOUT,
         )
 
-    def _check(self) -> None:
+    def _check(self) -> str | None:
         if self._process is None:
-            return
+            return None
         with suppress(subprocess.TimeoutExpired):
             code = self._process.wait(_DEATH_S)
             raise ServerDiedError(
                 f"the policy server that a worker had started ended, exit code {code}",
                 printed_last(self.log().splitlines()),
             )
+        told = (
+            "--serve started it, and it runs: it has to listen at {port}; if it needs longer, give "
+            "--policy-option connect_s=SECONDS"
+        )
+        return "\n".join(filter(None, (told, printed_last(self.log().splitlines()))))

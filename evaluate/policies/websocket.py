@@ -73,8 +73,9 @@ class WebsocketPolicy(Policy):
         self._live = False  # whether the first live observation came
         self._held: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
 
-    def _check(self) -> None:
-        """Raise if it is known that the server will not answer."""
+    def _check(self) -> str | None:
+        """Raise if it is known that the server will not answer; return what to do, or None."""
+        return None
 
     def reset(self, info: RolloutInfo) -> None:
         """Empty the server's memory, connecting first, or again if the connection was lost."""

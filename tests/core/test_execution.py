@@ -150,6 +150,11 @@ def test_the_executor_that_is_asked_for() -> None:
         ({"executor": "ray", "workers": 0}, "workers 0"),
         ({"executor": "ray", "gpus_per_worker": -1.0}, "--gpus-per-worker -1"),
         ({"executor": "ray", "cpus_per_worker": float("nan")}, "--cpus-per-worker nan"),
+        ({"executor": "ray", "gpus_per_worker": 1.5}, "--gpus-per-worker 1.5"),
+        *(
+            ({"executor": "ray", "ray_address": given}, f"--ray-address {given!r}; expected auto")
+            for given in ("", "here", "here:", "10.0.0.1:head", "10.0.0.1:65536", "ray://a:1x")
+        ),
     ],
 )
 def test_settings_of_workers_are_checked(settings: dict[str, Any], told: str) -> None:

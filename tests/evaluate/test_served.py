@@ -1,5 +1,7 @@
 """Policy servers that workers start themselves."""
 
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,18 @@ def test_one_that_cannot_start_is_told_with_its_last_words(tmp_path: Path, words
         serve(tmp_path / "run", *words)
     assert "rror" in str(raised.value.hint)
     assert not (tmp_path / "run").exists()
+
+
+def test_one_that_does_not_listen_is_told_with_its_last_words(tmp_path: Path) -> None:
+    words = shlex.join(
+        [sys.executable, "-uc", "print('loading {port}'); __import__('time').sleep(99)"]
+    )
+    with pytest.raises(PolicyServerError, match="cannot be reached") as raised:
+        runs.run(
+            tmp_path / "run", policy="websocket", serve=words, policy_options=("connect_s=1.5",)
+        )
+    hint = str(raised.value.hint)
+    assert "listen at {port}" in hint and "connect_s" in hint and "loading 18" in hint
 
 
 @pytest.mark.parametrize(

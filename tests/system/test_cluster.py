@@ -144,16 +144,31 @@ def test_nodes_that_differ_are_refused_before_the_first_task(cluster: Any) -> No
     assert raised.value.message.count("node is ") == 3  # the driver is on the head
 
 
-def test_a_cluster_that_is_not_there() -> None:
-    """In a process of its own: this one is a driver already."""
+def connect(address: str, **environment: str) -> str:
+    """In a process of its own, for this one is a driver already; return what went wrong."""
     code = (
+        "import sys\n"
         "from robomme_interference_data.cluster import RayWorkers\n"
-        "list(RayWorkers(1, '127.0.0.1:1').run(print, [1]))"
+        "list(RayWorkers(1, sys.argv[1]).run(print, [1]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", code, address],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
-    assert "ClusterError: no Ray cluster can be reached at '127.0.0.1:1'" in done.stderr
+    return done.stderr
+
+
+def test_a_cluster_that_is_not_there() -> None:
+    assert "ClusterError: no Ray cluster can be reached at '127.0.0.1:1'" in connect("127.0.0.1:1")
+
+
+def test_a_token_that_is_missing(cluster: Any, tmp_path: Path) -> None:
+    said = connect(cluster.address, RAY_AUTH_MODE="token", HOME=str(tmp_path))
+    assert "ClusterError" in said and "~/.ray/auth_token" in said
 
 
 def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
