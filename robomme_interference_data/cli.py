@@ -152,6 +152,8 @@ def main() -> None:
         names = [name for name in (error.filename, error.filename2) if name is not None]
         where = f"{' -> '.join(map(str, names))}: " if names else ""
         hint = "Check the path, its permissions and the space left on the disk."
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            hint = "A file lies where a folder is to be: give another path, or move the file away."
         _fail(f"{where}{error.strerror}", hint)
 
 

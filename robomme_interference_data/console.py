@@ -87,7 +87,7 @@ def stoppable(kept: str, place: Path | None = None) -> Iterator[None]:
     """
 
     def told() -> str:
-        return kept if place is None or place.exists() else "Nothing was written yet"
+        return kept if place is None or place.is_dir() else "Nothing was written yet"
 
     def stop(*_: object) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut the ending short

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.asking import QUERIES, ask
 from support.vision_language import save_tiny_adapter, save_tiny_model
 
 from robomme_interference_data.errors import InvalidOptionError, ModelError
@@ -73,3 +74,15 @@ def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
 
 def test_a_folder_stays_what_it_is(tiny: Path) -> None:
     assert pin_model(f"transformers:{tiny}") == f"transformers:{tiny}"
+
+
+def test_questions_are_put_to_it(tiny: Path, tmp_path: Path) -> None:
+    told = {"model": f"transformers:{tiny}", "system": "tiny", "frames": 2}
+    rows = ask(tmp_path / "run", **told, model_options=("max_tokens=12",)).rows
+    assert {row.status for row in rows} <= {"success", "fail"} and len(rows) == len(QUERIES)
+    assert {row.model_calls for row in rows} == {1}
+    again = ask(tmp_path / "again", **told, model_options=("max_tokens=12", "device=cpu")).rows
+    assert [row.answer for row in again] == [row.answer for row in rows]
+    (tmp_path / "moved").symlink_to(tiny)  # the same weights: the same run, which is done
+    moved = told | {"model": f"transformers:{tmp_path / 'moved'}"}
+    assert ask(tmp_path / "run", **moved, model_options=("max_tokens=12",)).rows == rows

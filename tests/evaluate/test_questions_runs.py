@@ -359,6 +359,15 @@ def test_the_command_prints_a_table_or_json(tmp_path: Path, run: Any) -> None:
 
 
 @pytest.mark.usefixtures("serial")
+def test_a_file_where_a_run_is_to_be_stays(tmp_path: Path, run: Any) -> None:
+    (tmp_path / "file").write_text("mine")
+    code, out, err = run(*words(tmp_path / "file"))
+    assert (code, out) == (1, "")
+    assert "Nothing was written yet" in err and "a folder is to be" in err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("serial")
 def test_what_broke_is_told_with_the_command_to_go_on(tmp_path: Path, run: Any) -> None:
     with ChatServer(look, faults=[BROKEN] * 9) as server:
         model = f"openai:{server.url}#tiny"
