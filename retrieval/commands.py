@@ -1,6 +1,7 @@
 """The commands of retrieval: `index`, `retrieve`, `retrieval-score` and `calibrate`."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,6 +36,8 @@ EncoderName = Annotated[
     ),
 ]
 Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
+Families = Annotated[list[str], typer.Option(help="Families.", show_default="all")]
+Conditions = Annotated[list[str], typer.Option(help="Conditions.", show_default="all")]
 
 
 @with_settings
@@ -168,6 +171,8 @@ def retrieval_score(
             metavar="RULE…",
         ),
     ] = ["max"],  # noqa: B006 - typer copies it
+    families: Families = [],  # noqa: B006
+    conditions: Conditions = [],  # noqa: B006
     camera: Camera = "front",
     shift: Annotated[str, typer.Option(help=SHIFT_HELP)] = NO_SHIFT,
     out: Annotated[
@@ -182,7 +187,7 @@ def retrieval_score(
     ```
     robomme-interference retrieval-score my-split
     robomme-interference retrieval-score my-split --rules all --out my-score
-    robomme-interference retrieval-score my-split --shift light:2
+    robomme-interference retrieval-score my-split --shift light:2 --conditions k7
     ```
     """
     from robomme_interference_data.files import write_text
@@ -193,7 +198,7 @@ def retrieval_score(
     check_output(out)
     name = encoders.encoder_name(encoder)
     wanted = select.parse_rules(rules, encoders.published_threshold(name))
-    about, measured = _measured(split, name, camera, shift, quiet=as_json)
+    about, measured = _measured(split, name, camera, shift, families, conditions, as_json)
     grades = [grade.grade(one, rule) for rule in wanted for one in measured]
     cells = list(grade.cells(grades))
     title = f"Retrieval on {about['split']}, encoder {name}, camera {camera}"
@@ -219,6 +224,8 @@ def calibrate(
         tuple[float, float],
         typer.Option(help="First and last threshold to try, in steps of 0.01."),
     ] = (0.80, 0.99),
+    families: Families = [],  # noqa: B006
+    conditions: Conditions = [],  # noqa: B006
     camera: Camera = "front",
     out: Picture = None,
     as_json: AsJson = False,
@@ -241,7 +248,7 @@ def calibrate(
     check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
-    about, measured = _measured(split, name, camera, NO_SHIFT, quiet=as_json)
+    about, measured = _measured(split, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
     found = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['split']}"
@@ -255,31 +262,39 @@ def calibrate(
 
 
 def _measured(
-    split: Path, encoder: str, camera: str, shift: str, *, quiet: bool
+    split: Path,
+    encoder: str,
+    camera: str,
+    shift: str,
+    families: Sequence[str],
+    conditions: Sequence[str],
+    quiet: bool,
 ) -> tuple[dict[str, Any], list["Measured"]]:
-    """Measure all buffers of a split that hold frames of the lesson; tell what they are of."""
+    """Measure all wanted buffers that hold frames of the lesson; tell what they are of."""
     from robomme_interference_data.loading import load_split
     from robomme_interference_data.retrieval.select import measure
     from robomme_interference_data.views import live_embedding
     from robomme_interference_data.work_progress import WorkProgress
 
     under, opened = parse_shift(shift), load_split(split)
+    wanted: dict[str, Any] = {"family": families, "condition": conditions}
+    total = sum(1 for _ in opened.manifests(**wanted))
     measured = []
     with WorkProgress(unit="buffers", quiet=quiet) as progress:
-        progress.start(encoder, len(opened))
-        for buffer in opened.buffers():
+        progress.start(encoder, total)
+        for buffer in opened.buffers(**wanted):
             if buffer.manifest.lesson_frames:
                 query = live_embedding(opened, buffer, under, encoder, camera)
                 measured.append(measure(buffer, encoder, camera, query))
             progress.advance(1)
-    left_out = len(opened) - len(measured)
+    left_out = total - len(measured)
     if not measured:
         raise InvalidOptionError(
             f"none of the {left_out} buffers of {split} holds a lesson: there is nothing to grade",
             f"Type: {opened.planning('k0', 'k3')}",
         )
     if left_out and not quiet:
-        say(f"{left_out} of {len(opened)} buffers hold no lesson and are left out")
+        say(f"{left_out} of {total} buffers hold no lesson and are left out")
     about = {"split": opened.name, "revision": opened.revision, "encoder": encoder}
     about |= {"camera": camera, "shift": shift}
     return about | {"buffers": len(measured), "left_out": left_out}, measured

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.conditions import in_order
 from robomme_interference_data.constants import (
     FURTHER,
     INDEX_DIR,
@@ -17,7 +16,7 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
     SHIFTED,
 )
-from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.files import atomic_path
 from robomme_interference_data.hub import HubFiles
 from robomme_interference_data.ids import parse_numbers
@@ -131,19 +130,11 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
 
 def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
     """Return the episodes of each dataset that the wanted buffers and their queries hold."""
-    for family in config.families:
-        if family not in split.families:
-            raise UnknownNameError.among("family", family, split.location, split.families)
-    names = {split.planned(one).name for one in in_order(config.conditions or split.conditions)}
     numbers = None if config.episodes is None else {*parse_numbers(config.episodes)}
     found: dict[str, set[int]] = {name: set() for name in split.header.datasets}
-    for manifest in split.manifests():
+    for manifest in split.manifests(family=config.families, condition=config.conditions):
         episode = manifest.episode_id
-        if (
-            manifest.condition in names
-            and (not config.families or episode.family in config.families)
-            and (numbers is None or episode.index in numbers)
-        ):
+        if numbers is None or episode.index in numbers:
             found[manifest.query.dataset].add(manifest.query.episode_index)
             if SHIFTED in found:
                 found[SHIFTED].add(split.datasets[SHIFTED].index_of(episode))

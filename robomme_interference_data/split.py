@@ -235,24 +235,38 @@ class Split:
     def manifests(
         self,
         *,
-        family: str | None = None,
-        condition: Condition | str | None = None,
+        family: str | Sequence[str] | None = None,
+        condition: Condition | str | Sequence[Condition | str] | None = None,
         k: int | None = None,
         difficulty: str | None = None,
     ) -> Iterator[BufferManifest]:
         """Yield the manifests of all buffers, or of those that have all given properties.
 
+        Args:
+            family: Family, or several; None, or an empty sequence, for all.
+            condition: Condition, likewise.
+            k: Instead of a condition, see `load_buffer`.
+            difficulty: Difficulty of the query episode.
+
         Raises:
             UnknownNameError: No buffer has this family, condition or difficulty.
         """
-        name = None if condition is None and k is None else self.planned(condition, k).name
+        some = (condition,) if isinstance(condition, Condition | str) else tuple(condition or ())
+        if k is not None:
+            some = (self.planned(some[0] if some else None, k),)
+        wanted = {
+            "family": (family,) if isinstance(family, str) else family or (),
+            "condition": [self.planned(one).name for one in some],
+            "difficulty": () if difficulty is None else (difficulty,),
+        }
         keep = np.ones(len(self), bool)
-        for column, value in (("family", family), ("condition", name), ("difficulty", difficulty)):
-            if value is not None:
-                if value not in self._keys[column]:
-                    known = {one for one in self._keys[column] if one is not None}
+        for column, values in wanted.items():
+            known = {one for one in self._keys[column] if one is not None}
+            for value in values:
+                if value not in known:
                     raise UnknownNameError.among(column, value, self.location, known)
-                keep &= np.array([one == value for one in self._keys[column]])
+            if values:
+                keep &= np.array([one in values for one in self._keys[column]])
         return self._read(keep)
 
     def load(

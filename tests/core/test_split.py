@@ -58,6 +58,8 @@ def test_what_a_split_lists() -> None:
         ({"condition": "k3"}, 3),
         ({"k": 0}, 3),
         ({"condition": "no-history", "family": "MoveCube"}, 1),
+        ({"condition": ["k3", parse_condition("k0"), "k3"], "family": ("MoveCube",) * 2}, 2),
+        ({"condition": (), "family": ("PatternLock", "MoveCube")}, 10),
         ({"difficulty": "easy"}, 15),  # the sample's index 0
     ],
 )
@@ -71,7 +73,7 @@ def test_filters(filters: dict[str, Any], count: int) -> None:
 @pytest.mark.parametrize(
     ("filters", "told"),
     [
-        ({"family": "MoveCub"}, "Did you mean 'MoveCube'?"),
+        ({"family": ("MoveCube", "MoveCub")}, "Did you mean 'MoveCube'?"),
         ({"difficulty": "hard"}, "Known: easy"),
         ({"condition": "k2"}, "k1"),
     ],

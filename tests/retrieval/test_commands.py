@@ -73,6 +73,18 @@ def test_the_table_by_family_and_condition(run: Run, indexed: Path) -> None:
     assert out.splitlines()[-1].startswith("Cells of a family and a condition that pass: max/")
 
 
+def test_only_what_is_asked_for(run: Run, indexed: Path) -> None:
+    picked = ("--families", "PatternLock", "MoveCube", "--conditions", "k3", "no-history")
+    code, out, err = run("retrieval-score", indexed, *picked)
+    assert code == 0 and "2 of 4 buffers hold no lesson" in err
+    rows = [line.split()[:3] for line in out.splitlines()[4:7]]
+    assert rows == [["MoveCube", "k3", "1"], ["PatternLock", "k3", "1"], ["all", "k3", "2"]]
+    code, out, _ = run("calibrate", indexed, *picked, "--json")
+    assert code == 0 and json.loads(out)["buffers"] == 2
+    code, _, err = run("retrieval-score", indexed, "--conditions", "k2")
+    assert code == 1 and "condition 'k2' is not in" in err
+
+
 def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
     options = ("--rules", "oracle", "last,max/-1", "--out", tmp_path)
     code, out, err = run("retrieval-score", indexed, *options)
