@@ -247,6 +247,10 @@ def test_a_part_comes_with_its_embeddings(
         load_split(one).load("MoveCube/test/0", "k1", cameras=["front"]) for one in (out, root)
     )
     assert np.array_equal(found.embeddings("thumbnail"), expected.embeddings("thumbnail"))
+    (told, _), (whole, _) = (
+        run("retrieval-score", one, *part[:4], "--json")[1:] for one in (out, root)
+    )
+    assert json.loads(told)["cells"] == json.loads(whole)["cells"] != []
 
 
 # --- every command takes a repository -------------------------------------------------------------
