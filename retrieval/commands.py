@@ -10,6 +10,8 @@ import typer
 from robomme_interference_data.console import (
     AsJson,
     ConditionName,
+    Conditions,
+    Families,
     Picture,
     QueryName,
     SplitFolder,
@@ -36,8 +38,6 @@ EncoderName = Annotated[
     ),
 ]
 Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
-Families = Annotated[list[str], typer.Option(help="Families.", show_default="all")]
-Conditions = Annotated[list[str], typer.Option(help="Conditions.", show_default="all")]
 
 
 @with_settings

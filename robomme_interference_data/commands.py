@@ -10,6 +10,8 @@ import typer
 from robomme_interference_data.console import (
     AsJson,
     ConditionName,
+    Conditions,
+    Families,
     Picture,
     QueryName,
     SplitFolder,
@@ -27,8 +29,8 @@ from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 def list_buffers(
     split: SplitFolder,
-    family: Annotated[str | None, typer.Option(help="Only this family.")] = None,
-    condition: Annotated[str | None, typer.Option(help="Only this condition, as k3.")] = None,
+    families: Families = [],  # noqa: B006 - typer copies it
+    conditions: Conditions = [],  # noqa: B006
     difficulty: Annotated[str | None, typer.Option(help="Only easy, medium or hard.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -36,8 +38,8 @@ def list_buffers(
 
     Examples:
     ```
-    robomme-interference list my-split --condition k3
-    robomme-interference list my-split --family MoveCube --json
+    robomme-interference list my-split --conditions k3 k7
+    robomme-interference list my-split --families MoveCube --json
     ```
     """
     from robomme_interference_data.loading import load_split
@@ -45,7 +47,7 @@ def list_buffers(
     from robomme_interference_data.tables import Table
 
     opened = load_split(split)
-    found = opened.manifests(family=family, condition=condition, difficulty=difficulty)
+    found = opened.manifests(family=families, condition=conditions, difficulty=difficulty)
     if as_json:
         print_json([to_dict(manifest) for manifest in found])
         return

@@ -23,6 +23,8 @@ SplitOption = Annotated[
 ]
 QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
 ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]
+Families = Annotated[list[str], typer.Option(help="Families.", show_default="all")]
+Conditions = Annotated[list[str], typer.Option(help="Conditions, such as k3.", show_default="all")]
 Picture = Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")]
 
 

@@ -117,7 +117,7 @@ def test_help_imports_nothing_heavy() -> None:
         (["list"], "Missing argument"),
         (["list", ".", "--bad"], "No such option: --bad"),
         (["show", EPISODE], "Missing argument"),
-        (["list", ".", "--condition", "k1", "k3"], "unexpected extra argument"),
+        (["list", ".", "--difficulty", "easy", "hard"], "unexpected extra argument"),
         (["build", "demonstrations", "--source", "frames:."], "Missing option '--out'"),
     ],
 )
@@ -135,9 +135,9 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
     ("arguments", "told"),
     [
         (["list", "{}/nowhere"], ("neither a folder nor", "namespace/name")),
-        (["list", "{}", "--family", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
-        (["list", "{}", "--condition", "k9"], ("'k9'", "--conditions no-history k0 k1 k3 k7 k9")),
-        (["list", "{}", "--condition", "seven"], ("'seven'", "k0")),
+        (["list", "{}", "--families", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
+        (["list", "{}", "--conditions", "k9"], ("'k9'", "--conditions no-history k0 k1 k3 k7 k9")),
+        (["list", "{}", "--conditions", "seven"], ("'seven'", "k0")),
         (["show", "MoveCube/test/9", "k3", "--split", "{}"], ("MoveCube/test/9", EPISODE)),
         (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
         (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0 k1 k3 k7 k9")),
@@ -212,7 +212,7 @@ def test_the_condition_is_there_in_a_narrow_terminal(
     run: Run, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "40")
-    code, out, _ = run("list", tiny_split, "--family", "MoveCube")
+    code, out, _ = run("list", tiny_split, "--families", "MoveCube")
     assert code == 0
     assert all(condition in out for condition in ("no-history", "k0", "k1", "k3", "k7"))
 
@@ -221,8 +221,9 @@ def test_the_condition_is_there_in_a_narrow_terminal(
     ("options", "count"),
     [
         ([], 15),
-        (["--condition", "k3"], 3),
-        (["--family", "MoveCube", "--difficulty", "easy"], 5),
+        (["--conditions", "k3"], 3),
+        (["--families", "MoveCube", "--difficulty", "easy"], 5),
+        (["--families", "MoveCube", "PatternLock", "--conditions", "k7", "k0"], 4),
     ],
 )
 def test_list_as_json_is_one_value(

@@ -64,7 +64,7 @@ def test_buffers_of_other_kinds(split: Path, run: Run, tmp_path: Path) -> None:
     for command in ("verify", "audit"):
         code, out, err = run(command, split)
         assert code == 0, out + err
-    code, out, _ = run("list", split, "--condition", "before-k3", "--json")
+    code, out, _ = run("list", split, "--conditions", "before-k3", "--json")
     assert [row["lesson_frames"] for row in json.loads(out)] == [48, 48, 48]
     for condition in ("before-k3", "absent-k1"):
         code, _, err = run("show", QUERY, condition, "--split", split, "--out", tmp_path / "a.png")
