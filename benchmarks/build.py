@@ -32,11 +32,11 @@ from robomme_interference_data.build_dataset.sources import (
 )
 from robomme_interference_data.build_dataset.stage import StageTask
 from robomme_interference_data.constants import CAMERA_PREFIX, DEMONSTRATIONS, FPS
-from robomme_interference_data.digest import FeatureDigests
-from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.execution import Executor, Processes, Serial, Worker
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Executor, Processes, Serial, Worker
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.storage.digest import FeatureDigests
+from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 FAMILIES = ("VideoUnmask", "VideoUnmaskSwap", "PatternLock")

@@ -27,14 +27,14 @@ from nothing import Nothing
 from timing import Times, machine, positive, table
 
 from evaluate import seconds_a_rollout
-from robomme_interference_data.cluster import RayWorkers
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
-from robomme_interference_data.evaluate.config import Run, RunConfig
-from robomme_interference_data.evaluate.log import open_log
-from robomme_interference_data.evaluate.plan import WorkItem, shuffle_work
-from robomme_interference_data.evaluate.progress import RunProgress
-from robomme_interference_data.execution import Processes
+from robomme_interference_data.evaluate.run.config import Run, RunConfig
+from robomme_interference_data.evaluate.run.log import open_log
+from robomme_interference_data.evaluate.run.plan import WorkItem, shuffle_work
+from robomme_interference_data.evaluate.run.progress import RunProgress
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import Processes
+from robomme_interference_data.runtime.ray_cluster import RayWorkers
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 CELLS = 56

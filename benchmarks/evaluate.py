@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from timing import interleave, machine, positive, table
 
 from robomme_interference_data import DecodedCache, Split, load_split
-from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.config import Run
-from robomme_interference_data.evaluate.plan import WorkItem
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
-from robomme_interference_data.evaluate.rollout import run_rollout
-from robomme_interference_data.execution import Executor
+from robomme_interference_data.evaluate.rollout.rollout import run_rollout
+from robomme_interference_data.evaluate.run.config import Run
+from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Rollout, Status
+from robomme_interference_data.runtime.executor import Executor
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 

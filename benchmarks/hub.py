@@ -23,8 +23,8 @@ from robomme_interference_data.build_dataset.lerobot_writer import require_lerob
 from robomme_interference_data.cards.publish import Publisher
 from robomme_interference_data.cards.publish_config import PublishConfig
 from robomme_interference_data.constants import ACTION, RECORDS_PATH, STATE
+from robomme_interference_data.data.fetch import FetchConfig, fetch, plan_fetch
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.fetch import FetchConfig, fetch, plan_fetch
 
 CONDITIONS = ("k0", "k1", "k3", "k7")
 REAL, WHOLE, PLAIN = "someone/real", "someone/whole", "someone/plain"

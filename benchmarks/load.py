@@ -25,9 +25,9 @@ from timing import in_fresh_process, interleave, machine, megabytes, peak_memory
 
 from robomme_interference_data import Buffer, DecodedCache, Split, load_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
-from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.constants import FRONT
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.schema.conditions import parse_condition
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO_SPLIT = ROOT / "demo" / "split"

@@ -27,8 +27,8 @@ from robomme_interference_data.constants import (
     STATE,
     WRIST,
 )
-from robomme_interference_data.encode import CODECS, VideoEncoder
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.encode import CODECS, VideoEncoder
 
 SIDE, LESSON = 32, 8
 CAMERAS = (FRONT, WRIST)

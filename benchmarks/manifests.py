@@ -39,11 +39,11 @@ from robomme_interference_data.constants import (
     WRIST,
 )
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.files import write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import BufferManifest
-from robomme_interference_data.records import EpisodeRecord, SpanDigests
-from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests
+from robomme_interference_data.storage.files import write_json
 
 _SPANS = ("first", "second", "last", "query")
 SHAPES = {FRONT: (256, 256, 3), WRIST: (256, 256, 3), STATE: (8,)}

@@ -1,9 +1,9 @@
 """A rollout that does nothing, in a module of its own: workers import it."""
 
-from robomme_interference_data.evaluate.config import Run, RunConfig
-from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.execution import Worker
-from robomme_interference_data.rollouts import Rollout
+from robomme_interference_data.evaluate.run.config import Run, RunConfig
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.runtime.executor import Worker
+from robomme_interference_data.schema.rollouts import Rollout
 
 
 class Nothing:

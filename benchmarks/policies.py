@@ -22,12 +22,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from robomme_interference_data import load_split
-from robomme_interference_data.buffer import Buffer, Chunk
 from robomme_interference_data.constants import UNIT_FRAMES
+from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
 from robomme_interference_data.evaluate.policies.wire import pack, unpack
-from robomme_interference_data.evaluate.rollout import read_ahead
+from robomme_interference_data.evaluate.rollout.rollout import read_ahead
 
 CHUNK = 16
 ANSWER = pack({"reset_finished": True, "add_buffer_finished": True})

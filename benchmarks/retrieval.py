@@ -35,12 +35,12 @@ from robomme_interference_data.constants import (
     RECORDS_PATH,
 )
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.files import LocalFiles, read_json, write_json
 from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.storage.files import LocalFiles, read_json, write_json
 
 QUIET = WorkProgress(quiet=True)
 RULE = Rule("max")

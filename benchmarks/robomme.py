@@ -15,7 +15,7 @@ import numpy as np
 from timing import machine, positive, table
 
 from robomme_interference_data.simulators.base import Status
-from robomme_interference_data.simulators.robomme import ARMS, RoboMMESimulator
+from robomme_interference_data.simulators.robomme.simulator import ARMS, RoboMMESimulator
 
 KINDS = {
     "all, as RoboMME itself": (("front", "wrist"), True, 1),

@@ -32,12 +32,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
-from robomme_interference_data.bootstrap import drawn_counts
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.evaluate.score.scoring import score
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.rows import arrow_schema
+from robomme_interference_data.schema.codec import arrow_schema
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.stats.bootstrap import drawn_counts
 
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
 KS = (0, 1, 3, 7)

@@ -19,8 +19,8 @@ import numpy as np
 from timing import in_fresh_process, machine, positive, table
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.execution import Processes, Worker
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import Processes, Worker
 from robomme_interference_data.simulators import Simulator, Status, make_simulator
 
 EPISODE = "MoveCube/test/0"

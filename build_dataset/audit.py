@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field
 from statistics import mean
 from typing import Any
 
-from robomme_interference_data.conditions import KINDS, Kind, parse_condition
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     CONTRADICTIONS,
@@ -14,12 +13,13 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     MANIFEST_PATH,
 )
+from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import BufferManifest, SessionEntry
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.split import Split
-from robomme_interference_data.tables import Table
+from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
+from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.viz.tables import Table
 
 
 @dataclass(frozen=True)

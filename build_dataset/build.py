@@ -13,25 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from robomme_interference_data.build_dataset.config import BuildPlan
-from robomme_interference_data.build_dataset.earlier import Earlier, read_earlier
-from robomme_interference_data.build_dataset.identity import complete_dataset, identity_of
-from robomme_interference_data.build_dataset.lerobot_writer import (
-    StoredEpisode,
-    load_lerobot,
-    require_lerobot,
-    write_lerobot,
-)
-from robomme_interference_data.build_dataset.stage import (
-    Staged,
-    StageTask,
-    Task,
-    keep_staged,
-    read_staged,
-    staged_name,
-)
 from robomme_interference_data.constants import ACTION, IDENTITY_PATH
-from robomme_interference_data.encode import get_codec
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
@@ -40,10 +22,29 @@ from robomme_interference_data.errors import (
     SourceError,
     first_line,
 )
-from robomme_interference_data.execution import Executor, Outcome
-from robomme_interference_data.files import canonical_json, working
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Executor, Outcome
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.encode import get_codec
+from robomme_interference_data.storage.files import canonical_json, working
+
+from .config import BuildPlan
+from .earlier import Earlier, read_earlier
+from .identity import complete_dataset, identity_of
+from .lerobot_writer import (
+    StoredEpisode,
+    load_lerobot,
+    require_lerobot,
+    write_lerobot,
+)
+from .stage import (
+    Staged,
+    StageTask,
+    Task,
+    keep_staged,
+    read_staged,
+    staged_name,
+)
 
 _ADVICE = "Choose another --out, or remove the folder first."
 

@@ -5,18 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.build_dataset.config import (
-    AllConfig,
-    BuildConfig,
-    BuildPlan,
-    NewConfig,
-    PlanConfig,
-    plan_all,
-    plan_build,
-    plan_new,
-    position_limit,
-)
-from robomme_interference_data.console import (
+from robomme_interference_data.cli.console import (
     AsJson,
     Group,
     SplitFolder,
@@ -34,11 +23,23 @@ from robomme_interference_data.constants import (
     SHIFTED,
 )
 from robomme_interference_data.errors import MissingFileError, visible
-from robomme_interference_data.execution import WorkersConfig, make_executor
-from robomme_interference_data.settings import with_settings
+from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
+from robomme_interference_data.schema.settings import with_settings
+
+from .config import (
+    AllConfig,
+    BuildConfig,
+    BuildPlan,
+    NewConfig,
+    PlanConfig,
+    plan_all,
+    plan_build,
+    plan_new,
+    position_limit,
+)
 
 if TYPE_CHECKING:
-    from robomme_interference_data.files import Files
+    from robomme_interference_data.storage.files import Files
 
 app = typer.Typer(
     cls=Group,
@@ -191,9 +192,10 @@ def questions(
     robomme-interference build questions my-split
     ```
     """
-    from robomme_interference_data.build_dataset.questions import make_questions, write_questions
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .questions import make_questions, write_questions
 
     if not split.is_dir():
         raise MissingFileError(
@@ -265,8 +267,9 @@ def new_split(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> N
 
 
 def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool) -> None:
-    from robomme_interference_data.build_dataset.build import build_dataset
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .build import build_dataset
 
     with WorkProgress(unit="episodes") as progress:
         result = build_dataset(plan, out, make_executor(workers), progress)
@@ -281,10 +284,11 @@ def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool)
 
 
 def _plan(split: Path, config: PlanConfig, *, as_json: bool, base: "Files | None" = None) -> None:
-    from robomme_interference_data.build_dataset.manifests import write_manifests
-    from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .manifests import write_manifests
+    from .material import in_folder, plan_manifests
 
     limit = position_limit(config)
     places = in_folder(split) | ({} if base is None else {DEMONSTRATIONS: base})
@@ -315,9 +319,10 @@ def verify(
     robomme-interference verify my-split
     ```
     """
-    from robomme_interference_data.build_dataset.verify import verify_split
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .verify import verify_split
 
     progress = WorkProgress()
     checks = verify_split(load_split(split), decode=decode, progress=progress)
@@ -349,8 +354,9 @@ def audit(
     robomme-interference audit my-split
     ```
     """
-    from robomme_interference_data.build_dataset.audit import audit_split
-    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.data.loading import load_split
+
+    from .audit import audit_split
 
     report = audit_split(load_split(split))
     if as_json:

@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, datasets_of, in_order
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
@@ -20,15 +19,17 @@ from robomme_interference_data.constants import (
     UNITS,
 )
 from robomme_interference_data.errors import InvalidOptionError, SourceError
-from robomme_interference_data.execution import WorkersConfig, make_executor
 from robomme_interference_data.ids import EpisodeId, parse_numbers
-from robomme_interference_data.manifest import SessionEntry
-from robomme_interference_data.settings import setting
+from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, datasets_of, in_order
+from robomme_interference_data.schema.manifest import SessionEntry
+from robomme_interference_data.schema.settings import setting
 
 if TYPE_CHECKING:
-    from robomme_interference_data.build_dataset.sources import Source, SourceEpisode
-    from robomme_interference_data.dataset import Dataset
-    from robomme_interference_data.draw import UnitPool
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.schema.draw import UnitPool
+
+    from .sources import Source, SourceEpisode
 
 _CPUS = os.cpu_count() or 1
 
@@ -156,9 +157,10 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
         SourceError: A condition needs a dataset that the split lacks; and as `plan_all`.
         HubError, MissingFileError, FormatError: The demonstrations cannot be read.
     """
-    from robomme_interference_data.build_dataset.material import check_needs, in_folder
-    from robomme_interference_data.dataset import Dataset
-    from robomme_interference_data.hub import HubFiles, locate
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.storage.hub import HubFiles, locate
+
+    from .material import check_needs, in_folder
 
     base = Dataset(locate(config.demonstrations))
     if not isinstance(base.files, HubFiles) or base.kind != DEMONSTRATIONS:
@@ -181,9 +183,10 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
 def _check_plans(
     queries: Iterable[EpisodeId], plans: dict[str, BuildPlan], out: Path, plan: PlanConfig
 ) -> None:
-    from robomme_interference_data.build_dataset.build import find_earlier
-    from robomme_interference_data.build_dataset.manifests import check_place
-    from robomme_interference_data.draw import UnitPool
+    from robomme_interference_data.schema.draw import UnitPool
+
+    from .build import find_earlier
+    from .manifests import check_place
 
     conditions = in_order(plan.conditions)
     position_limit(plan)
@@ -227,8 +230,9 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
         InvalidOptionError: A setting is not what it may be, or does not fit the sources.
         SourceError, MissingExtraError, HubError: A source cannot be used.
     """
-    from robomme_interference_data.build_dataset.sources import open_source
-    from robomme_interference_data.encode import get_codec
+    from robomme_interference_data.storage.encode import get_codec
+
+    from .sources import open_source
 
     get_codec(config.codec)
     if config.time_limit is not None and not config.time_limit > 0:

@@ -10,7 +10,6 @@ needed.
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
-from robomme_interference_data.build_dataset.sources.base import Frame
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
@@ -20,6 +19,8 @@ from robomme_interference_data.constants import (
     Unit,
 )
 from robomme_interference_data.errors import SourceError
+
+from .sources.base import Frame
 
 
 class NothingToStore(Exception):

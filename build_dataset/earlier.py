@@ -9,15 +9,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.image_stats import before_scaling
-from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.constants import EPISODES_DIR, REPORT_PATH
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.files import LocalFiles
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.parquet import RowSpan
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.rows import read_header
+from robomme_interference_data.schema.codec import read_header
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.parquet import RowSpan
+
+from .image_stats import before_scaling
+from .lerobot_writer import StoredEpisode
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,9 @@ from robomme_interference_data.constants import (
     SUMS_PATH,
     UNITS,
 )
-from robomme_interference_data.files import (
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.records import Counts, DatasetIdentity, EpisodeRecord
+from robomme_interference_data.storage.files import (
     all_files,
     canonical_json,
     format_sums,
@@ -41,9 +43,7 @@ from robomme_interference_data.files import (
     write_json,
     write_text,
 )
-from robomme_interference_data.parquet import open_parquet, writing
-from robomme_interference_data.records import Counts, DatasetIdentity, EpisodeRecord
-from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+from robomme_interference_data.storage.parquet import open_parquet, writing
 
 _LEROBOTS = ("episode_index", "length")
 """Fields of a record that LeRobot writes."""

@@ -17,10 +17,10 @@ from robomme_interference_data.constants import (
     STATS_PATH,
     TASKS_PATH,
 )
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.files import read_json
-from robomme_interference_data.lerobot_files import LeRobotFiles
+from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 _TOLERANCE_S = 1e-4
 """LeRobot's own tolerance of timestamps, in seconds."""

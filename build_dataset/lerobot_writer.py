@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, FPS
-from robomme_interference_data.encode import Codec
 from robomme_interference_data.errors import MissingExtraError
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.encode import Codec
 
 _OWN_FILES_MB = 1e-6
 """Bound on the size of a file, a byte: no episode shares one with another."""

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from robomme_interference_data.build_dataset.material import ManifestPlan, QueryMaterial
 from robomme_interference_data.constants import (
     FORMAT_VERSION,
     IDENTITY_PATH,
@@ -21,20 +20,26 @@ from robomme_interference_data.constants import (
     MAX_STEPS,
     RULE_VERSION,
 )
+from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import (
     BuildError,
     HistoryTooLongError,
 )
-from robomme_interference_data.files import (
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.manifest import (
+    BufferManifest,
+    ManifestDataset,
+    ManifestHeader,
+)
+from robomme_interference_data.storage.files import (
     sha256_file,
     working,
     write_json,
 )
-from robomme_interference_data.hub import HubFiles
-from robomme_interference_data.manifest import BufferManifest, ManifestDataset, ManifestHeader
-from robomme_interference_data.parquet import writing
-from robomme_interference_data.query import Query
-from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+from robomme_interference_data.storage.hub import HubFiles
+from robomme_interference_data.storage.parquet import writing
+
+from .material import ManifestPlan, QueryMaterial
 
 _BATCH = 1024
 """Rows in a row group: few bytes find one buffer."""

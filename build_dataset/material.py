@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.constants import (
     ACTION,
     CONTRADICTIONS,
@@ -22,13 +21,14 @@ from robomme_interference_data.constants import (
     UNIT_FRAMES,
     UNITS,
 )
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.draw import UnitPool
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import FormatError, InvalidOptionError, SourceError
-from robomme_interference_data.files import Files, LocalFiles
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import SessionEntry
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
+from robomme_interference_data.schema.draw import UnitPool
+from robomme_interference_data.schema.manifest import SessionEntry
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import Files, LocalFiles
 
 
 @dataclass(frozen=True)

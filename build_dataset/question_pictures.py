@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from robomme_interference_data.questions import LETTERS
-from robomme_interference_data.subgoal import Pixel
+from robomme_interference_data.data.questions import LETTERS
+from robomme_interference_data.schema.subgoal import Pixel
 
 _LARGER = 3  # times: the picture of things
 _OVER = 14  # pixels of the view: a letter over its thing

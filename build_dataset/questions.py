@@ -9,18 +9,18 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
-from robomme_interference_data.encode import png
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.lazy import load_extra
-from robomme_interference_data.parquet import writing
-from robomme_interference_data.query import Query
-from robomme_interference_data.questions import Question
-from robomme_interference_data.rows import arrow_schema, to_table
+from robomme_interference_data.schema.codec import arrow_schema, to_table
+from robomme_interference_data.schema.subgoal import Pixel
 from robomme_interference_data.simulators.tabletop.camera import SIZE, to_pixels
 from robomme_interference_data.simulators.tabletop.episodes import turn_of
 from robomme_interference_data.simulators.tabletop.families import recorded_scene
-from robomme_interference_data.split import Split
-from robomme_interference_data.subgoal import Pixel
+from robomme_interference_data.storage.encode import png
+from robomme_interference_data.storage.parquet import writing
 
 _MOST, _DRAWN = 5, 4
 """Options of a question at most; and of one whose scene allows more answers."""

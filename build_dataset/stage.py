@@ -16,22 +16,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.arrays import write_array
-from robomme_interference_data.build_dataset.config import BuildPlan
-from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
-from robomme_interference_data.build_dataset.image_stats import STATISTICS, ImageStats
-from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
-from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, FPS, LESSONS, STATE
-from robomme_interference_data.digest import FeatureDigests, SpanDigester, combine
-from robomme_interference_data.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
-from robomme_interference_data.execution import Worker
-from robomme_interference_data.files import canonical_json, write_json
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EpisodeRecord, SpanDigests, lesson_spans
-from robomme_interference_data.rows import read_header, to_dict
-from robomme_interference_data.video import iter_frames
+from robomme_interference_data.runtime.executor import Worker
+from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
+from robomme_interference_data.storage.arrays import write_array
+from robomme_interference_data.storage.digest import FeatureDigests, SpanDigester, combine
+from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
+from robomme_interference_data.storage.files import canonical_json, write_json
+from robomme_interference_data.storage.video import iter_frames
+
+from .config import BuildPlan
+from .cut import CUTS, NothingToStore
+from .image_stats import STATISTICS, ImageStats
+from .lerobot_writer import StoredEpisode
+from .sources import Frame, Recording, SourceEpisode
 
 _RECORD = "record.json"
 _LAYOUT = 5

@@ -5,12 +5,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from robomme_interference_data.build_dataset.identity import identity_of, listed_files
-from robomme_interference_data.build_dataset.lerobot_meaning import lerobot_violations
-from robomme_interference_data.build_dataset.manifests import planned_buffers
-from robomme_interference_data.build_dataset.material import plan_manifests
-from robomme_interference_data.build_dataset.questions import planned_questions
-from robomme_interference_data.conditions import datasets_of
 from robomme_interference_data.constants import (
     DATASETS,
     DISTRACTORS,
@@ -27,19 +21,26 @@ from robomme_interference_data.constants import (
     UNIT_MIN_RAW_FRAMES,
     UNITS,
 )
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.digest import combine
-from robomme_interference_data.embeddings import IndexHeader, index_folder
-from robomme_interference_data.encode import CODECS, decode_image
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.embeddings import IndexHeader, index_folder
+from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError, InterferenceError
-from robomme_interference_data.files import LocalFiles, all_files, sha256_file
-from robomme_interference_data.manifest import ManifestHeader
-from robomme_interference_data.questions import read_questions
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.rows import read_header, to_dict
-from robomme_interference_data.shifts import SHIFTS
-from robomme_interference_data.split import Split
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.conditions import datasets_of
+from robomme_interference_data.schema.manifest import ManifestHeader
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.shifts import SHIFTS
+from robomme_interference_data.storage.digest import combine
+from robomme_interference_data.storage.encode import CODECS, decode_image
+from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
+
+from .identity import identity_of, listed_files
+from .lerobot_meaning import lerobot_violations
+from .manifests import planned_buffers
+from .material import plan_manifests
+from .questions import planned_questions
 
 _TOO_MANY = "is too many: it is in no list"
 

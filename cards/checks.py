@@ -7,10 +7,10 @@ from pathlib import Path
 from robomme_interference_data.build_dataset.audit import audit_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.files import LocalFiles, naming
-from robomme_interference_data.split import Split
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.storage.files import LocalFiles, naming
 
 
 def check_split(split: Split, progress: WorkProgress | None = None) -> None:

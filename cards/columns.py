@@ -9,8 +9,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import pyarrow as pa
 
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import ROLES
-from robomme_interference_data.rows import arrow_schema
+from robomme_interference_data.schema.codec import arrow_schema
+from robomme_interference_data.schema.manifest import ROLES
 
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.+?)(?=^    \w|^\S|\Z)", re.MULTILINE | re.DOTALL)
 _ELSEWHERE = re.compile(r" \(see [^)]*\)|, see [\w.]+(?=\.(?:\s|$))")  # where the code says more

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cards.publish_config import PublishConfig, VersionConfig
-from robomme_interference_data.console import (
+from robomme_interference_data.cli.console import (
     AsJson,
     SplitFolder,
     check_output,
@@ -18,14 +17,17 @@ from robomme_interference_data.console import (
 )
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score import Grid
-from robomme_interference_data.settings import with_settings
+from robomme_interference_data.schema.settings import with_settings
+
+from .publish_config import PublishConfig, VersionConfig
 
 if TYPE_CHECKING:
-    from robomme_interference_data.cards.publication import Publication
-    from robomme_interference_data.cards.publishing import Publishing
-    from robomme_interference_data.cards.step import Step
-    from robomme_interference_data.files import Files
-    from robomme_interference_data.split import Split
+    from robomme_interference_data.data.buffer_set import Split
+    from robomme_interference_data.storage.files import Files
+
+    from .publication import Publication
+    from .publishing import Publishing
+    from .step import Step
 
 Private = Annotated[bool, typer.Option("--private", help="New repositories are private.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only tell what would be sent.")]
@@ -57,7 +59,7 @@ def card(
     robomme-interference card my-run --repo-id my-name/my-results
     ```
     """
-    from robomme_interference_data.cards.publication import Publication
+    from .publication import Publication
 
     typer.echo(card_text(source, Publication(repo_id, version, licence)), nl=False)
 
@@ -71,7 +73,6 @@ def card_text(source: str, about: "Publication") -> str:
         MissingExtraError: jinja2 is not installed.
         InterferenceError: It cannot be read.
     """
-    from robomme_interference_data.cards import render
     from robomme_interference_data.constants import (
         IDENTITY_PATH,
         MANIFEST_PATH,
@@ -79,9 +80,11 @@ def card_text(source: str, about: "Publication") -> str:
         RUN_RECORD,
         RUN_TABLES,
     )
-    from robomme_interference_data.dataset import Dataset
-    from robomme_interference_data.hub import locate
-    from robomme_interference_data.loading import load_split
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.storage.hub import locate
+
+    from . import render
 
     if Path(source).is_file():
         return render.results_text(Path(source), about)
@@ -133,11 +136,12 @@ def publish(
     robomme-interference publish my-split --repo-id my-name/my-split --to export/
     ```
     """
-    from robomme_interference_data.cards.checks import check_split
-    from robomme_interference_data.cards.upload import HubRepository
     from robomme_interference_data.constants import DEMONSTRATIONS, INDEX_DIR
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .checks import check_split
+    from .upload import HubRepository
 
     opened = load_split(split)
     here = opened.header.datasets[DEMONSTRATIONS].place is None  # else they are published already
@@ -161,8 +165,8 @@ def publish(
 def _export(
     split: "Split", config: PublishConfig, to: Path, *, dry_run: bool, as_json: bool
 ) -> None:
-    from robomme_interference_data.cards.export import exported_tree, write_tree
-    from robomme_interference_data.cards.tree import total_size
+    from .export import exported_tree, write_tree
+    from .tree import total_size
 
     tree = exported_tree(split, config)
     written = not dry_run and write_tree(tree, to)
@@ -183,7 +187,7 @@ def _publish(
     yes: bool,
     as_json: bool,
 ) -> None:
-    from robomme_interference_data.cards.publish import Publisher
+    from .publish import Publisher
 
     publisher = Publisher(split, config, private=private, tell=say)
     steps = publisher.plan()
@@ -205,7 +209,7 @@ def _carry_out(
     as_json: bool,
 ) -> "list[Step]":
     """Show what is to be done, ask, do it, and tell; return what was done."""
-    from robomme_interference_data.cards.step import step_table
+    from .step import step_table
 
     say(step_table(steps).text())
     if not dry_run and any(step.published is None for step in steps):
@@ -242,8 +246,8 @@ def publish_results(
     robomme-interference publish-results my-run --repo-id my-name/my-results --yes
     ```
     """
-    from robomme_interference_data.cards.publish_results import results_of, score_run
-    from robomme_interference_data.cards.publishing import Publishing
+    from .publish_results import results_of, score_run
+    from .publishing import Publishing
 
     goods = results_of(score_run(run, grid), run, config)
     publishing = Publishing(config, private=private, tell=say)

@@ -5,8 +5,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import PurePosixPath
 
-from robomme_interference_data.cards.metadata import BUFFERS_FILE
-from robomme_interference_data.cards.tree import Content, Tree
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
@@ -17,13 +15,16 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
     SUMS_PATH,
 )
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import HashMismatchError, MissingFileError
-from robomme_interference_data.files import canonical_json, indented_json
-from robomme_interference_data.manifest import BufferManifest, ManifestHeader
-from robomme_interference_data.questions import read_questions
-from robomme_interference_data.rows import to_dict
-from robomme_interference_data.split import Split
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
+from robomme_interference_data.storage.files import canonical_json, indented_json
+
+from .metadata import BUFFERS_FILE
+from .tree import Content, Tree
 
 
 def dataset_tree(dataset: Dataset) -> Tree:

@@ -11,26 +11,27 @@ from urllib.parse import quote
 
 import pyarrow as pa
 
-from robomme_interference_data.cards import citation
-from robomme_interference_data.cards.columns import Column, columns_of
-from robomme_interference_data.cards.contents import questions_of
-from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts, kinds_of_sources
-from robomme_interference_data.cards.metadata import (
+from robomme_interference_data.constants import RECORDS_PATH, SUMS_PATH
+from robomme_interference_data.data.questions import Question
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import sha256_file
+
+from . import citation
+from .columns import Column, columns_of
+from .contents import questions_of
+from .facts import DatasetFacts, SplitFacts, kinds_of_sources
+from .metadata import (
     BUFFERS,
     BUFFERS_FILE,
     EPISODES,
     QUESTIONS,
     ROLLOUTS,
 )
-from robomme_interference_data.cards.publication import HUB, OTHER, Publication
-from robomme_interference_data.cards.responsible import origin, responsible
-from robomme_interference_data.cards.results import ResultsFacts
-from robomme_interference_data.constants import RECORDS_PATH, SUMS_PATH
-from robomme_interference_data.errors import FormatError
-from robomme_interference_data.files import sha256_file
-from robomme_interference_data.manifest import BufferManifest
-from robomme_interference_data.questions import Question
-from robomme_interference_data.records import EpisodeRecord
+from .publication import HUB, OTHER, Publication
+from .responsible import origin, responsible
+from .results import ResultsFacts
 
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0")
 

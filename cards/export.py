@@ -3,10 +3,6 @@
 import shutil
 from pathlib import Path
 
-from robomme_interference_data.cards import render
-from robomme_interference_data.cards.publish import demonstrations_of, units_of
-from robomme_interference_data.cards.publish_config import PublishConfig
-from robomme_interference_data.cards.tree import Content, Tree
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     FURTHER,
@@ -15,9 +11,14 @@ from robomme_interference_data.constants import (
     MANIFEST_PATH,
     MANIFESTS,
 )
+from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.files import LocalFiles, all_files, sha256_file, working
-from robomme_interference_data.split import Split
+from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file, working
+
+from . import render
+from .publish import demonstrations_of, units_of
+from .publish_config import PublishConfig
+from .tree import Content, Tree
 
 _CARD = (render.README, render.STRIP, render.CROISSANT)
 _OURS = {"data", "meta", "videos", INDEX_DIR, MANIFESTS, DEMONSTRATIONS, *FURTHER, *_CARD}

@@ -8,11 +8,6 @@ from functools import cached_property
 from statistics import mean, median
 from typing import Any
 
-from robomme_interference_data.cards.contents import questions_of
-from robomme_interference_data.cards.limits import limits
-from robomme_interference_data.cards.markdown import escape
-from robomme_interference_data.cards.publication import check_repo_id, is_commit
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DIFFICULTIES,
@@ -20,13 +15,19 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     REPORT_PATH,
 )
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.files import read_json, sha256_file
-from robomme_interference_data.manifest import BufferManifest
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.split import Split
-from robomme_interference_data.tables import Table
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import read_json, sha256_file
+from robomme_interference_data.viz.tables import Table
+
+from .contents import questions_of
+from .limits import limits
+from .markdown import escape
+from .publication import check_repo_id, is_commit
 
 LOSSY_SOURCE = "lerobot/robomme"
 """A published dataset of the same episodes whose pictures are lossily compressed."""

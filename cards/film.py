@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts
-from robomme_interference_data.conditions import parse_condition
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.query import Query
-from robomme_interference_data.strip import shown_camera, strip_png
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.viz.filmstrip import shown_camera, strip_png
+
+from .facts import DatasetFacts, SplitFacts
 
 FIRST_CHOICE = "k3"
 """The condition that a strip shows if there is such a one."""

@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score.cube import TEST_EPISODES
-from robomme_interference_data.records import EpisodeRecord
+from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
+from robomme_interference_data.schema.records import EpisodeRecord
 
 
 def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:

@@ -4,7 +4,7 @@ import re
 import unicodedata
 from typing import Any
 
-from robomme_interference_data.tables import Table
+from robomme_interference_data.viz.tables import Table
 
 _MOST, _MOST_IN_BLOCK = 400, 20_000
 """Letters of a text that are shown."""

@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.constants import MANIFEST_ROWS, MANIFESTS
+
+from .publication import Publication
 
 BUFFERS, EPISODES, QUESTIONS, ROLLOUTS = "buffers", "episodes", "questions", "rollouts"
 """Names under which `datasets.load_dataset` gives the tables."""

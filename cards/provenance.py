@@ -5,11 +5,12 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
-from robomme_interference_data.cards.facts import DatasetFacts, SplitFacts
-from robomme_interference_data.cards.markdown import code, escape
-from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.constants import FORMAT_VERSION
-from robomme_interference_data.tables import Table
+from robomme_interference_data.viz.tables import Table
+
+from .facts import DatasetFacts, SplitFacts
+from .markdown import code, escape
+from .publication import Publication
 
 
 def provenance(about: Publication, rows: Iterable[tuple[str, Any]]) -> Table:

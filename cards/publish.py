@@ -4,25 +4,26 @@ from collections.abc import Iterable
 from functools import cached_property
 from typing import Any
 
-from robomme_interference_data.cards import render
-from robomme_interference_data.cards.contents import (
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, IDENTITY_PATH
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.errors import PublishError
+from robomme_interference_data.storage.hub import HubFiles
+
+from . import render
+from .contents import (
     dataset_tree,
     parts_of_buffers,
     parts_of_dataset,
     parts_of_questions,
     split_tree,
 )
-from robomme_interference_data.cards.publish_config import PublishConfig
-from robomme_interference_data.cards.publishing import Card, Goods, Parts, Publishing
-from robomme_interference_data.cards.step import Step
-from robomme_interference_data.cards.tree import Tree
-from robomme_interference_data.cards.versions import Version
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, IDENTITY_PATH
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.errors import PublishError
-from robomme_interference_data.hub import HubFiles
-from robomme_interference_data.loading import load_split
-from robomme_interference_data.split import Split
+from .publish_config import PublishConfig
+from .publishing import Card, Goods, Parts, Publishing
+from .step import Step
+from .tree import Tree
+from .versions import Version
 
 _UNKNOWN = "0" * 40
 """Stands for the commit of demonstrations that are not published yet."""

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
-from robomme_interference_data.cards.publication import OTHER, Publication, check_repo_id
-from robomme_interference_data.cards.versions import Version
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.settings import setting
+from robomme_interference_data.schema.settings import setting
+
+from .publication import OTHER, Publication, check_repo_id
+from .versions import Version
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,22 @@ from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robomme_interference_data.cards import render
-from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.publish_config import VersionConfig
-from robomme_interference_data.cards.publishing import Goods
-from robomme_interference_data.cards.tree import Content, Tree
-from robomme_interference_data.cards.versions import Version
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.evaluate.log import read_record
+from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.evaluate.score import Grid, Settings
 from robomme_interference_data.evaluate.score.scoring import Score, score, write_score
-from robomme_interference_data.files import canonical_json
-from robomme_interference_data.hub import HubFiles
-from robomme_interference_data.rollouts import TIMING_COLUMNS
-from robomme_interference_data.rows import to_dict
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
+from robomme_interference_data.storage.files import canonical_json
+from robomme_interference_data.storage.hub import HubFiles
+
+from . import render
+from .publication import Publication
+from .publish_config import VersionConfig
+from .publishing import Goods
+from .tree import Content, Tree
+from .versions import Version
 
 _SCORE = "score"
 """Folder of tables, figures and report."""

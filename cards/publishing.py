@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
-from robomme_interference_data.cards import render
-from robomme_interference_data.cards.publish_config import VersionConfig
-from robomme_interference_data.cards.step import Step
-from robomme_interference_data.cards.tree import Content, Difference, Entry, Tree, beside, compare
-from robomme_interference_data.cards.upload import HubRepository
-from robomme_interference_data.cards.versions import Change, Version, change_between
 from robomme_interference_data.errors import FormatError, MissingFileError, PublishError
-from robomme_interference_data.hub import HubFiles
+from robomme_interference_data.storage.hub import HubFiles
+
+from . import render
+from .publish_config import VersionConfig
+from .step import Step
+from .tree import Content, Difference, Entry, Tree, beside, compare
+from .upload import HubRepository
+from .versions import Change, Version, change_between
 
 Card = Callable[[Version], Mapping[str, bytes]]
 """Makes the card of a version: bytes by path."""

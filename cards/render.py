@@ -8,33 +8,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.cards import citation, croissant
-from robomme_interference_data.cards.columns import Column, columns_of
-from robomme_interference_data.cards.facts import (
-    LOSSY_SOURCE,
-    DatasetFacts,
-    SplitFacts,
-)
-from robomme_interference_data.cards.film import Film, film_of_lesson, film_of_split
-from robomme_interference_data.cards.markdown import Raw, block, code, escape, quoted, table
-from robomme_interference_data.cards.metadata import (
-    BUFFERS,
-    BUFFERS_FILE,
-    EPISODES,
-    QUESTIONS,
-    config,
-    front_matter,
-)
-from robomme_interference_data.cards.provenance import (
-    as_json,
-    dataset_rows,
-    provenance,
-    sources,
-    split_rows,
-)
-from robomme_interference_data.cards.publication import OTHER, Publication
-from robomme_interference_data.cards.results import ResultsFacts, results_values
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     FPS,
@@ -46,14 +19,42 @@ from robomme_interference_data.constants import (
     UNIT_MIN_RAW_FRAMES,
     UNIT_STRIDE,
 )
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.manifest import BufferManifest
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.split import Split
-from robomme_interference_data.tables import Table
-from robomme_interference_data.templates import fill
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.templates import fill
+
+from . import citation, croissant
+from .columns import Column, columns_of
+from .facts import (
+    LOSSY_SOURCE,
+    DatasetFacts,
+    SplitFacts,
+)
+from .film import Film, film_of_lesson, film_of_split
+from .markdown import Raw, block, code, escape, quoted, table
+from .metadata import (
+    BUFFERS,
+    BUFFERS_FILE,
+    EPISODES,
+    QUESTIONS,
+    config,
+    front_matter,
+)
+from .provenance import (
+    as_json,
+    dataset_rows,
+    provenance,
+    sources,
+    split_rows,
+)
+from .publication import OTHER, Publication
+from .results import ResultsFacts, results_values
 
 README, STRIP, CROISSANT = "README.md", "README-strip.png", "croissant.json"
 """Files of a card, at the root of a repository."""

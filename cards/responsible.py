@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from robomme_interference_data.cards.publication import HUB, Publication
+from .publication import HUB, Publication
 
 
 def responsible(

@@ -8,25 +8,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from robomme_interference_data.cards.columns import Column, columns_of
-from robomme_interference_data.cards.facts import one_split
-from robomme_interference_data.cards.limits import simulated
-from robomme_interference_data.cards.markdown import Raw, code, escape
-from robomme_interference_data.cards.metadata import ROLLOUTS, config
-from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_TABLES
-from robomme_interference_data.drawing import open_figure, save_figure
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.log import RunHeader
+from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.score import Grid, Settings
-from robomme_interference_data.evaluate.score.curves import Data
-from robomme_interference_data.evaluate.score.figures import draw_figure
-from robomme_interference_data.evaluate.score.headline import headline
+from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.figures import draw_figure
+from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.systems import display_name
-from robomme_interference_data.files import sha256_file
-from robomme_interference_data.rollouts import FINAL, Rollout
-from robomme_interference_data.tables import Table
+from robomme_interference_data.schema.rollouts import FINAL, Rollout
+from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.viz.figure import open_figure, save_figure
+from robomme_interference_data.viz.tables import Table
+
+from .columns import Column, columns_of
+from .facts import one_split
+from .limits import simulated
+from .markdown import Raw, code, escape
+from .metadata import ROLLOUTS, config
+from .publication import Publication
 
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",

@@ -4,10 +4,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.cards.tree import Difference, Tree, total_size
-from robomme_interference_data.cards.upload import HubRepository, State
-from robomme_interference_data.cards.versions import Version
-from robomme_interference_data.tables import Table
+from robomme_interference_data.viz.tables import Table
+
+from .tree import Difference, Tree, total_size
+from .upload import HubRepository, State
+from .versions import Version
 
 
 @dataclass(frozen=True)

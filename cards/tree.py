@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
-from robomme_interference_data.files import sha256_file
+from robomme_interference_data.storage.files import sha256_file
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.cards.tree import Difference, Entry, Tree, compare
-from robomme_interference_data.cards.versions import Version, versions_of
 from robomme_interference_data.errors import HubError
-from robomme_interference_data.hub_errors import Asked, busy_for
+from robomme_interference_data.storage.hub_errors import Asked, busy_for
+
+from .tree import Difference, Entry, Tree, compare
+from .versions import Version, versions_of
 
 _TRIES = 5
 _AT_ONCE = 16

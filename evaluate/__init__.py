@@ -3,7 +3,7 @@
 ```python
 from pathlib import Path
 
-from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from . import RunConfig, run_evaluation
 
 if __name__ == "__main__":  # worker processes import the script
     config = RunConfig(policy="replay", split=Path("demo/tabletop"), out=Path("runs/replay"))
@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.config import RunConfig
-    from robomme_interference_data.evaluate.merge import Merged, merge_runs
-    from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
-    from robomme_interference_data.evaluate.run import RunResult, run_evaluation
+    from .policies.policy import Policy, RolloutInfo
+    from .run.config import RunConfig
+    from .run.evaluation import RunResult, run_evaluation
+    from .run.merge import Merged, merge_runs
 
 __all__ = [
     "Merged",
@@ -31,4 +31,4 @@ __all__ = [
     "run_evaluation",
 ]
 
-__getattr__ = lazily(__name__, ".config", ".policies.policy", ".merge", ".run")
+__getattr__ = lazily(__name__, ".run.config", ".policies.policy", ".run.merge", ".run.evaluation")

@@ -8,21 +8,22 @@ and follows from manifests and records alone; nothing is decoded, nor simulated.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.conditions import NO_HISTORY, in_order
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.config import CeilingConfig, unusual_retrieval
-from robomme_interference_data.evidence import known_parts
-from robomme_interference_data.query import Query
 from robomme_interference_data.retrieval.encoders import encoder_name, published_threshold
 from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.sampling import MEMORIES, check_memory, evidence_kept
-from robomme_interference_data.shifts import NO_SHIFT, parse_shift
+from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
+from robomme_interference_data.schema.evidence import known_parts
+from robomme_interference_data.schema.sampling import MEMORIES, check_memory, evidence_kept
+from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.tabletop.families import recorded_scene
-from robomme_interference_data.split import Split
-from robomme_interference_data.tables import Table
-from robomme_interference_data.views import live_embedding
+from robomme_interference_data.viz.tables import Table
+
+from .run.config import CeilingConfig, unusual_retrieval
 
 
 @dataclass(frozen=True)

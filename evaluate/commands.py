@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.console import (
+from robomme_interference_data.cli.console import (
     AsJson,
     SplitFolder,
     check_output,
@@ -14,12 +14,13 @@ from robomme_interference_data.console import (
     say,
     stoppable,
 )
-from robomme_interference_data.evaluate.config import AskConfig, CeilingConfig, RunConfig
-from robomme_interference_data.settings import with_settings
-from robomme_interference_data.shifts import NO_SHIFT
+from robomme_interference_data.schema.settings import with_settings
+from robomme_interference_data.schema.shifts import NO_SHIFT
+
+from .run.config import AskConfig, CeilingConfig, RunConfig
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.run import RunResult
+    from .run.evaluation import RunResult
 
 
 @with_settings
@@ -36,9 +37,10 @@ def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) 
     robomme-interference ceiling my-split --retrieval thumbnail --shift light:2
     ```
     """
-    from robomme_interference_data.evaluate import ceiling as module
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.rows import to_dict
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.schema.codec import to_dict
+
+    from . import ceiling as module
 
     opened = load_split(split)
     cells = module.ceiling(opened, config)
@@ -89,8 +91,8 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
       --split S --out runs/shard-2
     ```
     """
-    from robomme_interference_data.evaluate.progress import RunProgress
-    from robomme_interference_data.evaluate.run import run_evaluation
+    from .run.evaluation import run_evaluation
+    from .run.progress import RunProgress
 
     check_output(config.out)
     kept = f"Finished rollouts are in {config.out}"
@@ -119,8 +121,8 @@ def ask(config: AskConfig, as_json: AsJson = False) -> None:
       --system mine-blank --split S --out runs/blank
     ```
     """
-    from robomme_interference_data.evaluate.progress import RunProgress
-    from robomme_interference_data.evaluate.questions.ask import run_examination
+    from .questions.ask import run_examination
+    from .run.progress import RunProgress
 
     check_output(config.out)
     kept = f"Answers are in {config.out}"
@@ -131,8 +133,9 @@ def ask(config: AskConfig, as_json: AsJson = False) -> None:
 
 def _tell(result: "RunResult", unit: str, *, as_json: bool) -> None:
     """Print what a run came to; fails if something broke."""
-    from robomme_interference_data.evaluate.progress import rate_table
-    from robomme_interference_data.rows import to_dict
+    from robomme_interference_data.schema.codec import to_dict
+
+    from .run.progress import rate_table
 
     if as_json:
         print_json([to_dict(row) for row in result.rows])
@@ -166,8 +169,8 @@ def merge(
     robomme-interference merge runs/shard-1 runs/shard-2 --out runs/whole
     ```
     """
-    from robomme_interference_data.evaluate.merge import merge_runs
-    from robomme_interference_data.evaluate.progress import rate_table
+    from .run.merge import merge_runs
+    from .run.progress import rate_table
 
     check_output(out)
     merged = merge_runs(runs, out)

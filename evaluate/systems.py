@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from typing import Any
 
-from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
 from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError, UnknownNameError
+from robomme_interference_data.schema.conditions import NO_HISTORY
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _TOO_ALIKE = 0.9  # of difflib's ratio: one letter in ten

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.conditions import in_order
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.grade import ALL, grade
-from robomme_interference_data.retrieval.select import Measured, Rule
-from robomme_interference_data.tables import Table
+from robomme_interference_data.schema.conditions import in_order
+from robomme_interference_data.viz.tables import Table
+
+from .grade import ALL, grade
+from .select import Measured, Rule
 
 _DIGITS = 6
 

@@ -5,10 +5,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.conditions import in_order, parse_condition
-from robomme_interference_data.drawing import GREY, INK, Hue, open_figure, save_figure, tidy
-from robomme_interference_data.retrieval.calibrate import Calibration
-from robomme_interference_data.retrieval.grade import ALL, PASS_MARK, Cell
+from robomme_interference_data.schema.conditions import in_order, parse_condition
+from robomme_interference_data.viz.figure import GREY, INK, Hue, open_figure, save_figure, tidy
+
+from .calibrate import Calibration
+from .grade import ALL, PASS_MARK, Cell
 
 _COLOURS = (Hue.BLUE, Hue.VERMILION, Hue.GREEN, Hue.PINK, Hue.ORANGE, Hue.SKY, INK)
 _MARKERS = "osD^vPX"

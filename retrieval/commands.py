@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.console import (
+from robomme_interference_data.cli.console import (
     AsJson,
     ConditionName,
     Conditions,
@@ -23,12 +23,12 @@ from robomme_interference_data.console import (
 )
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
-from robomme_interference_data.execution import Serial, WorkersConfig, make_executor
-from robomme_interference_data.settings import with_settings
-from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
+from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
+from robomme_interference_data.schema.settings import with_settings
+from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
-    from robomme_interference_data.retrieval.select import Measured
+    from .select import Measured
 
 EncoderName = Annotated[
     str,
@@ -72,11 +72,12 @@ def index(
     robomme-interference index my-split --encoder siglip --device cuda
     ```
     """
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.retrieval.encoders import make_encoder
-    from robomme_interference_data.retrieval.index import build_index, look_on_hub
-    from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.runtime.progress import WorkProgress
+    from robomme_interference_data.schema.codec import to_dict
+
+    from .encoders import make_encoder
+    from .index import build_index, look_on_hub
 
     places = [split / IDENTITY_PATH, *sorted(split.glob(f"*/{IDENTITY_PATH}"))]
     roots = [path.parent.parent for path in places if path.is_file()]
@@ -135,10 +136,11 @@ def retrieve(
     robomme-interference retrieve MoveCube/test/0 k7 --split my-split --rule joined --shift light:2
     ```
     """
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.retrieval import drawing, encoders, reasons, select
-    from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.views import live_embedding, live_frame
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.views import live_embedding, live_frame
+    from robomme_interference_data.schema.codec import to_dict
+
+    from . import drawing, encoders, reasons, select
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -190,10 +192,11 @@ def retrieval_score(
     robomme-interference retrieval-score my-split --shift light:2 --conditions k7
     ```
     """
-    from robomme_interference_data.files import write_text
-    from robomme_interference_data.retrieval import charts, encoders, grade, select
-    from robomme_interference_data.rows import to_dict
-    from robomme_interference_data.tables import Table
+    from robomme_interference_data.schema.codec import to_dict
+    from robomme_interference_data.storage.files import write_text
+    from robomme_interference_data.viz.tables import Table
+
+    from . import charts, encoders, grade, select
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -241,9 +244,10 @@ def calibrate(
     robomme-interference calibrate my-split --sweep 0.30 0.99 --out cuts.png
     ```
     """
-    from robomme_interference_data.retrieval import calibrate as fitting
-    from robomme_interference_data.retrieval import charts, encoders, select
-    from robomme_interference_data.rows import to_dict
+    from robomme_interference_data.schema.codec import to_dict
+
+    from . import calibrate as fitting
+    from . import charts, encoders, select
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -271,10 +275,11 @@ def _measured(
     quiet: bool,
 ) -> tuple[dict[str, Any], list["Measured"]]:
     """Measure all wanted buffers that hold frames of the lesson; tell what they are of."""
-    from robomme_interference_data.loading import load_split
-    from robomme_interference_data.retrieval.select import measure
-    from robomme_interference_data.views import live_embedding
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.views import live_embedding
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .select import measure
 
     under, opened = parse_shift(shift), load_split(split)
     wanted: dict[str, Any] = {"family": families, "condition": conditions}

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.drawing import GREY, INK, Page, ink_on, open_page, tidy, tint
-from robomme_interference_data.retrieval.reasons import Reasons, frames_text
-from robomme_interference_data.retrieval.segment import Span
-from robomme_interference_data.retrieval.select import MIN_FRAMES, Choice, Measured
-from robomme_interference_data.strip import LESSON_COLOR, mark_evidence, session_colors
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.viz.figure import GREY, INK, Page, ink_on, open_page, tidy, tint
+from robomme_interference_data.viz.filmstrip import LESSON_COLOR, mark_evidence, session_colors
+
+from .reasons import Reasons, frames_text
+from .segment import Span
+from .select import MIN_FRAMES, Choice, Measured
 
 # Inches.
 _WIDTH, _HEIGHT = 7.2, 6.1

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.bootstrap import bootstrap
-from robomme_interference_data.conditions import in_order
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.retrieval.select import Measured, Rule, choose
-from robomme_interference_data.sampling import evidence_kept
-from robomme_interference_data.stats import wilson
-from robomme_interference_data.tables import Table, percent
+from robomme_interference_data.schema.conditions import in_order
+from robomme_interference_data.schema.sampling import evidence_kept
+from robomme_interference_data.stats.bootstrap import bootstrap
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.viz.tables import Table, percent
+
+from .select import Measured, Rule, choose
 
 PASS_MARK = 0.9
 """Least mean purity and mean coverage of a good cell (released reference)."""

@@ -18,15 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.arrays import write_array
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     DISTRACTORS,
     FORMAT_VERSION,
     INDEX_HEADER,
 )
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.embeddings import (
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set_index import normalised
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.embeddings import (
     CENTRE_FILE,
     INDEX_SUMS,
     EmbeddingIndex,
@@ -44,8 +45,11 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     first_line,
 )
-from robomme_interference_data.execution import Executor, Serial, Worker
-from robomme_interference_data.files import (
+from robomme_interference_data.runtime.executor import Executor, Serial, Worker
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.storage.arrays import write_array
+from robomme_interference_data.storage.files import (
     Files,
     LocalFiles,
     atomic_path,
@@ -57,13 +61,10 @@ from robomme_interference_data.files import (
     write_json,
     write_text,
 )
-from robomme_interference_data.hub import HubFiles
-from robomme_interference_data.retrieval.encoders import Encoder, check_encoder, encoder_digest
-from robomme_interference_data.retrieval.segment import typical_cosine
-from robomme_interference_data.rows import to_dict
-from robomme_interference_data.split import Split
-from robomme_interference_data.split_index import normalised
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.storage.hub import HubFiles
+
+from .encoders import Encoder, check_encoder, encoder_digest
+from .segment import typical_cosine
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robomme_interference_data.buffer import Buffer
-from robomme_interference_data.retrieval.grade import Grade, grade
-from robomme_interference_data.retrieval.segment import Span
-from robomme_interference_data.retrieval.select import METHODS, Choice, Measured, Rule
-from robomme_interference_data.tables import percent
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.viz.tables import percent
+
+from .grade import Grade, grade
+from .segment import Span
+from .select import METHODS, Choice, Measured, Rule
 
 
 @dataclass(frozen=True)

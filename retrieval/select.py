@@ -12,20 +12,21 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import SAMPLE_FRAMES
+from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.evidence import Evidence
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import Session
-from robomme_interference_data.retrieval.segment import (
+from robomme_interference_data.schema.evidence import Evidence
+from robomme_interference_data.schema.manifest import Session
+from robomme_interference_data.schema.sampling import runs
+
+from .segment import (
     Span,
     adjacent_cosines,
     closest_cosines,
     cosines,
     segments,
 )
-from robomme_interference_data.sampling import runs
 
 ADAPTIVE: Final = "adaptive"
 

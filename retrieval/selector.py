@@ -6,17 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.embeddings import index_folder
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.data.buffer_set_index import SplitIndex
+from robomme_interference_data.data.embeddings import index_folder
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.encoders import (
+
+from .encoders import (
     check_encoder,
     make_encoder,
     published_threshold,
 )
-from robomme_interference_data.retrieval.select import Rule, choose, measure
-from robomme_interference_data.split_index import SplitIndex
+from .select import Rule, choose, measure
 
 
 class Selector:

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING
 from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
-    from robomme_interference_data.buffer import Buffer, Chunk
-    from robomme_interference_data.cache import DecodedCache
-    from robomme_interference_data.conditions import Condition
-    from robomme_interference_data.dataset import Dataset
+    from robomme_interference_data.data.buffer import Buffer, Chunk
+    from robomme_interference_data.data.buffer_set import Split
+    from robomme_interference_data.data.dataset import Dataset
+    from robomme_interference_data.data.loading import load_buffer, load_split
+    from robomme_interference_data.data.query import Query
     from robomme_interference_data.errors import InterferenceError
     from robomme_interference_data.ids import EpisodeId
-    from robomme_interference_data.loading import load_buffer, load_split
-    from robomme_interference_data.manifest import BufferManifest, Session, SessionEntry
-    from robomme_interference_data.query import Query
-    from robomme_interference_data.records import EpisodeRecord
-    from robomme_interference_data.rollouts import Rollout
-    from robomme_interference_data.split import Split
+    from robomme_interference_data.schema.conditions import Condition
+    from robomme_interference_data.schema.manifest import BufferManifest, Session, SessionEntry
+    from robomme_interference_data.schema.records import EpisodeRecord
+    from robomme_interference_data.schema.rollouts import Rollout
+    from robomme_interference_data.storage.cache import DecodedCache
 
 __all__ = [
     # load
@@ -50,7 +50,7 @@ __all__ = [
 
 __getattr__ = lazily(
     __name__,
-    *(".loading", ".split", ".buffer", ".cache", ".query"),
-    *(".records", ".manifest", ".rollouts"),
-    *(".ids", ".conditions", ".dataset", ".errors"),
+    *(".data.loading", ".data.buffer_set", ".data.buffer", ".storage.cache", ".data.query"),
+    *(".schema.records", ".schema.manifest", ".schema.rollouts"),
+    *(".ids", ".schema.conditions", ".data.dataset", ".errors"),
 )

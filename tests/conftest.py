@@ -205,7 +205,7 @@ def run(
 ) -> Callable[..., tuple[int, str, str]]:
     """Run the command line in this process; returns exit code, stdout and stderr."""
 
-    from robomme_interference_data.cli import main
+    from robomme_interference_data.cli.main import main
 
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["robomme-interference", *map(str, arguments)])

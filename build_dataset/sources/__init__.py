@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
-from robomme_interference_data.build_dataset.sources.base import (
+from robomme_interference_data.errors import InvalidOptionError, nearest
+
+from .base import (
     Frame,
     Recording,
     Source,
     SourceEpisode,
 )
-from robomme_interference_data.errors import InvalidOptionError, nearest
 
 __all__ = ["KINDS", "Frame", "Recording", "Source", "SourceEpisode", "open_source"]
 
@@ -61,22 +62,22 @@ def open_source(
         )
     # Each in a module of its own, which brings libraries that the others do not need.
     if kind == "robomme-h5":
-        from robomme_interference_data.build_dataset.sources.h5 import H5Source
+        from .h5 import H5Source
 
         return H5Source(_folder(location))
     if kind == "lerobot":
-        from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
+        from .lerobot import LeRobotSource
 
         return LeRobotSource(location, columns=columns, families_file=families_file)
     if kind == "frames":
-        from robomme_interference_data.build_dataset.sources.frames import FramesSource
+        from .frames import FramesSource
 
         return FramesSource(_folder(location))
     if kind == "sample":
-        from robomme_interference_data.build_dataset.sources.sample import SampleSource
+        from .sample import SampleSource
 
         return SampleSource(tuple(location.split(","))) if location else SampleSource()
-    from robomme_interference_data.build_dataset.sources import simulator
+    from . import simulator
 
     return simulator.ShiftedSource() if shifted else simulator.SimulatorSource(kind, robomme_python)
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.errors import SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EvidenceSpan
+from robomme_interference_data.schema.records import EvidenceSpan
 
 
 @dataclass(frozen=True)

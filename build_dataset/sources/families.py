@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robomme_interference_data.build_dataset.sources.robomme_families import BLOCKS
 from robomme_interference_data.errors import InvalidIdError, SourceError
 from robomme_interference_data.ids import EpisodeId
+
+from .robomme_families import BLOCKS
 
 _BLOCK = 100
 _CSV = ("episode_index,family on the first line, and split and index if wanted", "0,MoveCube")

@@ -12,27 +12,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.sources.base import (
+from robomme_interference_data.errors import InvalidIdError, SourceError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.video import iter_frames
+
+from .base import (
     Recording,
     Source,
     SourceEpisode,
     compose,
     file_state,
 )
-from robomme_interference_data.build_dataset.sources.frames_table import (
+from .frames_table import (
     TABLE,
     EpisodeRows,
     read_frames_table,
 )
-from robomme_interference_data.build_dataset.sources.images import (
+from .images import (
     decode_images,
     probe_video,
 )
-from robomme_interference_data.errors import InvalidIdError, SourceError
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.parquet import RowSpan
-from robomme_interference_data.simulators.base import choose_cameras
-from robomme_interference_data.video import iter_frames
 
 _VIDEO_SUFFIXES = (".mkv", ".mp4", ".avi", ".mov", ".webm")
 _REQUIRED_CAMERA = "front"

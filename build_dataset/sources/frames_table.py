@@ -10,10 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from robomme_interference_data.build_dataset.sources.base import demonstration_length
 from robomme_interference_data.errors import FormatError, InvalidIdError, SourceError, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.parquet import RowSpan, is_listed
+from robomme_interference_data.storage.parquet import RowSpan, is_listed
+
+from .base import demonstration_length
 
 TABLE = "frames.parquet"
 """Name of the table in a frames folder."""

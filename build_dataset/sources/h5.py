@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robomme_interference_data.build_dataset.sources.base import (
+from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.evidence import spans_of_texts
+from robomme_interference_data.simulators.base import choose_cameras
+
+from .base import (
     Frame,
     Recording,
     Source,
@@ -22,11 +27,7 @@ from robomme_interference_data.build_dataset.sources.base import (
     demonstration_length,
     file_state,
 )
-from robomme_interference_data.build_dataset.sources.robomme_families import ROBOMME
-from robomme_interference_data.errors import InterferenceError, MissingExtraError, SourceError
-from robomme_interference_data.evidence import spans_of_texts
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.base import choose_cameras
+from .robomme_families import ROBOMME
 
 if TYPE_CHECKING:
     import h5py

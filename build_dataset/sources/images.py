@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.encode import decode_image, is_png
 from robomme_interference_data.errors import FormatError, InterferenceError, SourceError
-from robomme_interference_data.video import open_video
+from robomme_interference_data.storage.encode import decode_image, is_png
+from robomme_interference_data.storage.video import open_video
 
 _RGB_FORMATS = (
     *("rgb24", "bgr24", "rgb0", "bgr0", "0rgb", "0bgr", "gbrp"),

@@ -12,7 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.sources.base import (
+from robomme_interference_data.errors import FormatError, SourceError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.codec import from_dict
+from robomme_interference_data.schema.evidence import spans_of_texts
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.simulators.base import CAMERAS, choose_cameras
+from robomme_interference_data.storage.encode import is_png
+from robomme_interference_data.storage.hub import HubFiles, locate
+from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.parquet import RowSpan
+
+from .base import (
     Recording,
     Source,
     SourceEpisode,
@@ -20,28 +31,18 @@ from robomme_interference_data.build_dataset.sources.base import (
     demonstration_length,
     file_state,
 )
-from robomme_interference_data.build_dataset.sources.columns import resolve_columns
-from robomme_interference_data.build_dataset.sources.families import (
+from .columns import resolve_columns
+from .families import (
     ids_by_block,
     ids_by_columns,
     ids_by_file,
 )
-from robomme_interference_data.build_dataset.sources.images import decode_images, info_is_exact
-from robomme_interference_data.build_dataset.sources.robomme_families import (
+from .images import decode_images, info_is_exact
+from .robomme_families import (
     BLOCKS,
     ROBOMME,
     families_for_goal,
 )
-from robomme_interference_data.encode import is_png
-from robomme_interference_data.errors import FormatError, SourceError
-from robomme_interference_data.evidence import spans_of_texts
-from robomme_interference_data.hub import HubFiles, locate
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.lerobot_files import LeRobotFiles
-from robomme_interference_data.parquet import RowSpan
-from robomme_interference_data.records import EvidenceSpan
-from robomme_interference_data.rows import from_dict
-from robomme_interference_data.simulators.base import CAMERAS, choose_cameras
 
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _MEND = "Correct the dataset, or leave the episode out."

@@ -12,16 +12,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.sources.base import (
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.simulators.base import choose_cameras
+
+from .base import (
     Frame,
     Recording,
     Source,
     SourceEpisode,
 )
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EvidenceSpan
-from robomme_interference_data.simulators.base import choose_cameras
 
 _CUBES = ((200, 40, 40), (40, 160, 60), (50, 80, 200))
 _EPISODES = {"train": 3, "test": 1}

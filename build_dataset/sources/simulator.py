@@ -6,14 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.build_dataset.sources.base import (
-    Frame,
-    Recording,
-    Source,
-    SourceEpisode,
-)
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.shifts import SHIFTS
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.simulators.base import (
     Demonstration,
     Observation,
@@ -23,6 +17,13 @@ from robomme_interference_data.simulators.base import (
 from robomme_interference_data.simulators.registry import make_simulator
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+
+from .base import (
+    Frame,
+    Recording,
+    Source,
+    SourceEpisode,
+)
 
 
 class SimulatorSource(Source):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.shifts import KINDS, STRENGTHS, Shift
+from robomme_interference_data.schema.shifts import KINDS, STRENGTHS, Shift
 from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from robomme_interference_data.encode import CLIP, VideoEncoder
-from robomme_interference_data.evaluate.models.model import Message, Part, Video
-from robomme_interference_data.sampling import spread
+from robomme_interference_data.schema.sampling import spread
+from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+
+from .model import Message, Part, Video
 
 
 def within(messages: Iterable[Message], images: int | None) -> list[Message]:

@@ -12,10 +12,11 @@ from typing import Any
 import openai
 from openai import OpenAI
 
-from robomme_interference_data.encode import png
 from robomme_interference_data.errors import InvalidOptionError, ModelError, first_line
-from robomme_interference_data.evaluate.models.images import data_url, mp4, within
-from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
+from robomme_interference_data.storage.encode import png
+
+from .images import data_url, mp4, within
+from .model import ChatModel, Message, Part, Reply, Video
 
 _WAITS = "The same command goes on where it stopped."
 

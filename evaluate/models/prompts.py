@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import FormatError, UnknownNameError, nearest
-from robomme_interference_data.evaluate.models.model import Part, Video
+
+from .model import Part, Video
 
 _MOST_BYTES = 1 << 16
 

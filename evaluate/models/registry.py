@@ -7,10 +7,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
-from robomme_interference_data.evaluate.models.model import ChatModel
-from robomme_interference_data.evaluate.options import bind_options
-from robomme_interference_data.hub import HubFiles, locate
+from robomme_interference_data.evaluate.specs import bind_options
 from robomme_interference_data.lazy import load_extra
+from robomme_interference_data.storage.hub import HubFiles, locate
+
+from .model import ChatModel
 
 _KINDS = {
     "openai": (

@@ -16,10 +16,11 @@ from robomme_interference_data.errors import (
     ModelError,
     first_line,
 )
-from robomme_interference_data.evaluate.models.images import within
-from robomme_interference_data.evaluate.models.model import ChatModel, Message, Reply
-from robomme_interference_data.files import digest_folder
-from robomme_interference_data.hub import HubFiles, locate
+from robomme_interference_data.storage.files import digest_folder
+from robomme_interference_data.storage.hub import HubFiles, locate
+
+from .images import within
+from .model import ChatModel, Message, Reply
 
 _FILES = ("*.json", "*.safetensors", "*.jinja", "*.txt", "*.model")
 

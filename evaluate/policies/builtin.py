@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import PolicyError
-from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
-from robomme_interference_data.evidence import known_parts
-from robomme_interference_data.sampling import MEMORIES, check_memory
+from robomme_interference_data.schema.evidence import known_parts
+from robomme_interference_data.schema.sampling import MEMORIES, check_memory
 from robomme_interference_data.simulators.base import Observation, Simulator
+
+from .policy import Frames, Policy, RolloutInfo
 
 THUMBNAIL = 16
 """Side of the small image by which frames are compared."""

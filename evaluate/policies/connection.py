@@ -12,13 +12,14 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from robomme_interference_data.console import say
+from robomme_interference_data.cli.console import say
 from robomme_interference_data.errors import (
     PolicyServerError,
     ServerKeepaliveError,
     WireError,
 )
-from robomme_interference_data.evaluate.policies.wire import pack, unpack
+
+from .wire import pack, unpack
 
 API_KEY_VARIABLE = "ROBOMME_POLICY_API_KEY"
 """Environment variable with the key that servers behind a gate ask for."""

@@ -11,20 +11,21 @@ from typing import Any, cast
 
 import numpy as np
 
-from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.console import say
+from robomme_interference_data.cli.console import say
 from robomme_interference_data.errors import InterferenceError, PolicyError, PolicyServerError
-from robomme_interference_data.evaluate.policies.policy import Policy
-from robomme_interference_data.evaluate.policies.registry import (
+from robomme_interference_data.evaluate.systems import System
+from robomme_interference_data.runtime.executor import Executor, Worker
+from robomme_interference_data.schema.conditions import NO_HISTORY
+
+from .policy import Policy
+from .registry import (
     BUILTINS,
     check_workers,
     make_policy,
     parse_policy,
     policy_options,
 )
-from robomme_interference_data.evaluate.policies.servers import check_keeps, check_metadata
-from robomme_interference_data.evaluate.systems import System
-from robomme_interference_data.execution import Executor, Worker
+from .servers import check_keeps, check_metadata
 
 _WITHOUT_EFFECT = {
     "websocket": ("server", "connect_s", "response_s"),

@@ -31,10 +31,11 @@ from robomme_interference_data.errors import (
     MissingFileError,
     PolicyError,
 )
-from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
-from robomme_interference_data.files import digest_folder
-from robomme_interference_data.hub import locate
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+from robomme_interference_data.storage.files import digest_folder
+from robomme_interference_data.storage.hub import locate
+
+from .policy import Frames, Policy, RolloutInfo
 
 _IMAGE_SHAPE = (3, 256, 256)
 """Shape of an image of the simulators, channels first."""

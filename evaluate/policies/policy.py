@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.evidence import Evidence
+from robomme_interference_data.schema.evidence import Evidence
 from robomme_interference_data.simulators.base import Observation, Simulator
 
 Frames = Mapping[str, NDArray[np.uint8]]

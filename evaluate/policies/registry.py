@@ -14,10 +14,11 @@ from robomme_interference_data.errors import (
     UnknownNameError,
     nearest,
 )
-from robomme_interference_data.evaluate.options import bind_options, signature_of
-from robomme_interference_data.evaluate.policies.policy import Policy
+from robomme_interference_data.evaluate.specs import bind_options, signature_of
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.simulators.base import CAMERAS
+
+from .policy import Policy
 
 BUILTINS = ("replay", "recall", "oracle", "guess", "obey", "hold")
 """Policies without learned weights."""

@@ -12,10 +12,11 @@ from typing import Any
 
 from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.errors import InvalidOptionError, ServerDiedError, printed_last
-from robomme_interference_data.evaluate.policies import server_guard
-from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.evaluate.policies.servers import hold_port
-from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
+
+from . import server_guard
+from .policy import RolloutInfo
+from .servers import hold_port
+from .websocket import WebsocketPolicy
 
 _DEATH_S = 0.5
 """Seconds after which a server that closed its connection is taken to be alive."""

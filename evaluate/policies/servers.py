@@ -7,12 +7,13 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.cache import default_cache_folder
-from robomme_interference_data.console import say
+from robomme_interference_data.cli.console import say
 from robomme_interference_data.errors import InvalidOptionError, PolicyServerError
-from robomme_interference_data.evaluate.policies.registry import make_policy, parse_policy
 from robomme_interference_data.evaluate.systems import System
-from robomme_interference_data.files import hold
+from robomme_interference_data.storage.cache import default_cache_folder
+from robomme_interference_data.storage.files import hold
+
+from .registry import make_policy, parse_policy
 
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1", "0.0.0.0")
 

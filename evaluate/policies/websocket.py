@@ -16,9 +16,10 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     ServerKeepaliveError,
 )
-from robomme_interference_data.evaluate.policies.connection import ServerConnection
-from robomme_interference_data.evaluate.policies.policy import Frames, Policy, RolloutInfo
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
+
+from .connection import ServerConnection
+from .policy import Frames, Policy, RolloutInfo
 
 _NO_FRAMES = "history feats is empty"
 """In the error of a server that keeps frames and is asked for actions before it has any."""

@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FPS
-from robomme_interference_data.encode import decode_image
+from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.config import AskConfig
 from robomme_interference_data.evaluate.models.model import ChatModel, Video
 from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.models.registry import make_model
-from robomme_interference_data.evaluate.questions.prompt import load_prompt, read_letter
-from robomme_interference_data.query import Query
-from robomme_interference_data.questions import Question
+from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.simulators.tabletop.families import recorded_scene
+from robomme_interference_data.storage.encode import decode_image
+
+from .prompt import load_prompt, read_letter
 
 CONTROLS = ("none", "blank", "text")
 """What is kept from a model: nothing; what the frames of the history show; all images."""

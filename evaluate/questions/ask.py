@@ -5,34 +5,35 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.constants import PROTOCOL_VERSION
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.data.questions import digest_questions, read_questions
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
-from robomme_interference_data.evaluate.checks import check_positive
-from robomme_interference_data.evaluate.config import AskConfig, Run, unusual_retrieval
-from robomme_interference_data.evaluate.log import open_log
 from robomme_interference_data.evaluate.models.registry import (
     model_identity,
     parse_model,
     pin_model,
 )
-from robomme_interference_data.evaluate.plan import Plan, plan_work
-from robomme_interference_data.evaluate.questions.answers import (
+from robomme_interference_data.evaluate.run.checks import check_positive
+from robomme_interference_data.evaluate.run.config import AskConfig, Run, unusual_retrieval
+from robomme_interference_data.evaluate.run.evaluation import Listener, RunResult, run_items
+from robomme_interference_data.evaluate.run.identity import retrieval_index, start_of
+from robomme_interference_data.evaluate.run.log import open_log
+from robomme_interference_data.evaluate.run.plan import Plan, plan_work
+from robomme_interference_data.evaluate.systems import known_system, name_system
+from robomme_interference_data.retrieval.select import Rule
+from robomme_interference_data.runtime.executor import Executor, end_if_starting, make_executor
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.sampling import MEMORIES
+from robomme_interference_data.simulators.tabletop.families import recorded_scene
+
+from .answers import (
     CONTROLS,
     OWN,
     make_answerer,
 )
-from robomme_interference_data.evaluate.questions.task import AskTask
-from robomme_interference_data.evaluate.run import Listener, RunResult, run_items
-from robomme_interference_data.evaluate.start import retrieval_index, start_of
-from robomme_interference_data.evaluate.systems import known_system, name_system
-from robomme_interference_data.execution import Executor, end_if_starting, make_executor
-from robomme_interference_data.loading import load_split
-from robomme_interference_data.questions import digest_questions, read_questions
-from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.sampling import MEMORIES
-from robomme_interference_data.simulators.tabletop.families import recorded_scene
-from robomme_interference_data.split import Split
+from .task import AskTask
 
 
 def run_examination(

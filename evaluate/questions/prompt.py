@@ -4,9 +4,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from robomme_interference_data.data.questions import Question
 from robomme_interference_data.evaluate.models.model import Message, Part
 from robomme_interference_data.evaluate.models.prompts import fill, read_prompt
-from robomme_interference_data.questions import Question
 
 PROMPTS = ("choice",)
 """The prompt that comes with the package."""

@@ -7,30 +7,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robomme_interference_data.constants import FRONT
-from robomme_interference_data.evaluate.config import AskConfig, Run
-from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.questions.answers import (
-    Answerer,
-    Asked,
-    make_answerer,
-)
-from robomme_interference_data.evaluate.record import record_file
-from robomme_interference_data.evaluate.rollout import retrieval_columns
-from robomme_interference_data.evaluate.versions import package_versions
-from robomme_interference_data.evaluate.worker import make_selector
-from robomme_interference_data.evidence import known_parts
-from robomme_interference_data.execution import Worker
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.evaluate.rollout.rollout import retrieval_columns
+from robomme_interference_data.evaluate.rollout.transcripts import record_file
+from robomme_interference_data.evaluate.rollout.worker import make_selector
+from robomme_interference_data.evaluate.run.config import AskConfig, Run
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.versions import package_versions
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.loading import load_split
-from robomme_interference_data.questions import Question, digest_questions, read_questions
-from robomme_interference_data.rollouts import Rollout, Status
-from robomme_interference_data.sampling import (
+from robomme_interference_data.runtime.executor import Worker
+from robomme_interference_data.schema.evidence import known_parts
+from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.schema.sampling import (
     MEMORIES,
     evidence_kept,
     lesson_frames,
     lesson_share,
 )
-from robomme_interference_data.split import Split
+
+from .answers import (
+    Answerer,
+    Asked,
+    make_answerer,
+)
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector

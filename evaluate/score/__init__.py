@@ -5,7 +5,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.settings import setting
+from robomme_interference_data.schema.settings import setting
 
 
 class Against(StrEnum):

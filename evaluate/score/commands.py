@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.console import (
+from robomme_interference_data.cli.console import (
     AsJson,
     check_output,
     command_line,
     print_json,
     say,
 )
-from robomme_interference_data.evaluate.score import Settings
-from robomme_interference_data.settings import with_settings
+from robomme_interference_data.schema.settings import with_settings
+
+from . import Settings
 
 if TYPE_CHECKING:
-    from robomme_interference_data.evaluate.score.rows import Rows
+    from .rows.checked import Rows
 
 
 @with_settings
@@ -43,10 +44,11 @@ def score(
         --against paper --out my-score
     ```
     """
-    from robomme_interference_data.evaluate.score.headline import headline
-    from robomme_interference_data.evaluate.score.scoring import score as compute
-    from robomme_interference_data.evaluate.score.scoring import write_score
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.runtime.progress import WorkProgress
+
+    from .report.headline import headline
+    from .scoring import score as compute
+    from .scoring import write_score
 
     check_output(out, export_to)
     found = compute(settings)
@@ -104,7 +106,7 @@ def compare(
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     ```
     """
-    from robomme_interference_data.evaluate.score.compare import compare as compute
+    from .comparisons.compare import compare as compute
 
     found = compute(run_a, run_b, (system_a, system_b), lenient, conditions or ())
     _tell(found.runs, found.notes)
@@ -134,7 +136,7 @@ def power(
     robomme-interference power --margin 3 --episodes 450 --flips 0.12 --json
     ```
     """
-    from robomme_interference_data.evaluate.score.power import plan
+    from .power import plan
 
     found = plan(margin / 100, episodes, flips)
     if as_json:

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.pairs import Pairs
-from robomme_interference_data.significance import SURE
-from robomme_interference_data.stats import z_of
-from robomme_interference_data.tables import percent
+from robomme_interference_data.stats.intervals import z_of
+from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.viz.tables import percent
+
+from .comparisons.pairs import Pairs
 
 POWER = 0.8
 """The power that is planned for."""

@@ -5,29 +5,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.bootstrap import DRAWS
 from robomme_interference_data.errors import BadRowsError
-from robomme_interference_data.evaluate.score import (
-    Against,
-    Grid,
-    Settings,
-    access,
-    cells,
-    chance,
-    contrasts,
-    effects,
-    equivalence,
-    families,
-    interaction,
-    paper,
-    ranks,
-)
-from robomme_interference_data.evaluate.score.cube import Cube, cubes_of
-from robomme_interference_data.evaluate.score.rows import Rows, read_rows
 from robomme_interference_data.evaluate.systems import base_of
-from robomme_interference_data.files import write_text
-from robomme_interference_data.tables import Table
-from robomme_interference_data.templates import load_jinja2
+from robomme_interference_data.stats.bootstrap import DRAWS
+from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.viz.tables import Table
+from robomme_interference_data.viz.templates import load_jinja2
+
+from . import Against, Grid, Settings
+from .comparisons import contrasts, effects, equivalence, families, interaction, ranks
+from .outcomes import Cube, cubes_of
+from .rows.checked import Rows, read_rows
+from .tables import cells, chance, paper
+from .tables import evidence_kept as access
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
@@ -203,8 +193,12 @@ def write_score(
         MissingExtraError: matplotlib or jinja2 is not installed.
         InvalidOptionError: The released layout cannot hold the rows (see `export`).
     """
-    from robomme_interference_data.drawing import MAKER, open_figure
-    from robomme_interference_data.evaluate.score import export, figures, methods, report
+    from robomme_interference_data.viz.figure import MAKER, open_figure
+
+    from .plots import figures
+    from .report import methods
+    from .report import page as report
+    from .rows import export
 
     with open_figure():
         load_jinja2("the report")

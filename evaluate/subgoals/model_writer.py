@@ -11,16 +11,17 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply
 from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.evaluate.subgoals.prompt import Answer, load_prompt, merge_near
-from robomme_interference_data.evaluate.subgoals.writer import (
+from robomme_interference_data.schema.sampling import spread
+from robomme_interference_data.schema.subgoal import Subgoal
+from robomme_interference_data.simulators.base import Observation, Simulator
+
+from .prompt import Answer, load_prompt, merge_near
+from .writer import (
     CAMERA,
     History,
     SubgoalWriter,
     Turn,
 )
-from robomme_interference_data.sampling import spread
-from robomme_interference_data.simulators.base import Observation, Simulator
-from robomme_interference_data.subgoal import Subgoal
 
 
 class ModelWriter(SubgoalWriter):

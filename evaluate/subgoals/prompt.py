@@ -10,7 +10,7 @@ from typing import Any
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import Part
 from robomme_interference_data.evaluate.models.prompts import check_places, fill, read_prompt
-from robomme_interference_data.subgoal import Pixel, Subgoal, read_points, write_points
+from robomme_interference_data.schema.subgoal import Pixel, Subgoal, read_points, write_points
 
 PROMPTS = ("simple", "grounded", "memer")
 """The prompts that come with the package: for SimpleSG, GroundSG and MemER."""

@@ -5,16 +5,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from robomme_interference_data.evaluate.config import RunConfig
 from robomme_interference_data.evaluate.models.registry import (
     make_model,
     model_identity,
     pin_model,
 )
-from robomme_interference_data.evaluate.options import bind_options
-from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
-from robomme_interference_data.evaluate.subgoals.writer import ORACLE, OracleWriter, SubgoalWriter
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.specs import bind_options
 from robomme_interference_data.evaluate.systems import System
+
+from .model_writer import ModelWriter
+from .writer import ORACLE, OracleWriter, SubgoalWriter
 
 _WHAT = "subgoal"  # has options: --subgoal-option
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.buffer import Buffer
 from robomme_interference_data.constants import FPS
+from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation, Simulator
-from robomme_interference_data.subgoal import Subgoal
 
 CAMERA = "front"
 

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.embeddings import EncoderRecord, encoder_id
+from robomme_interference_data.data.embeddings import EncoderRecord, encoder_id
 from robomme_interference_data.errors import InvalidOptionError, StaleIndexError, UnknownNameError
-from robomme_interference_data.files import canonical_json
+from robomme_interference_data.storage.files import canonical_json
 
 _KINDS = ("siglip", "thumbnail")
 
@@ -117,9 +117,9 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
     if batch is not None and batch < 1:
         raise InvalidOptionError.expected("batch", batch, "1 or more")
     if kind == "thumbnail":
-        from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+        from .thumbnail import Thumbnail
 
         return Thumbnail()
-    from robomme_interference_data.retrieval.encoders.siglip import Siglip
+    from .siglip import Siglip
 
     return Siglip(model or PAPER_ENCODER, device, batch)

@@ -17,8 +17,9 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     first_line,
 )
-from robomme_interference_data.hub import HubFiles, locate
-from robomme_interference_data.retrieval.encoders import encoder_name
+from robomme_interference_data.storage.hub import HubFiles, locate
+
+from . import encoder_name
 
 _FILES = ("*.json", "*.safetensors")
 

@@ -1,6 +1,6 @@
 """Simulators of the benchmark's task families.
 
-from robomme_interference_data.simulators import make_simulator
+from . import make_simulator
 
 simulator = make_simulator("tabletop")
 lesson, first, info = simulator.reset("MoveCube/test/3")
@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING
 from robomme_interference_data.lazy import lazily
 
 if TYPE_CHECKING:
-    from robomme_interference_data.rollouts import Status
-    from robomme_interference_data.simulators.base import (
+    from robomme_interference_data.schema.rollouts import Status
+
+    from .base import (
         Demonstration,
         EpisodeInfo,
         Observation,
         Simulator,
     )
-    from robomme_interference_data.simulators.registry import SIMULATORS, make_simulator
+    from .registry import SIMULATORS, make_simulator
 
 __all__ = [
     # make one

@@ -15,9 +15,9 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.records import EvidenceSpan
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.subgoal import Subgoal
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.subgoal import Subgoal
 
 CAMERAS = ("front", "wrist")
 """The cameras of every simulator, in the order in which they are listed."""

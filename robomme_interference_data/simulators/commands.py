@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.console import AsJson, check_output, print_json
+from robomme_interference_data.cli.console import AsJson, check_output, print_json
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.shifts import NO_SHIFT, SHIFT_HELP
+from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,11 +54,12 @@ def simulate(
     ```
     """
     from robomme_interference_data.constants import FPS
-    from robomme_interference_data.encode import CLIP, VideoEncoder
-    from robomme_interference_data.files import atomic_path
     from robomme_interference_data.ids import EpisodeId
-    from robomme_interference_data.rollouts import Status
-    from robomme_interference_data.simulators.registry import check_shift, make_simulator
+    from robomme_interference_data.schema.rollouts import Status
+    from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+    from robomme_interference_data.storage.files import atomic_path
+
+    from .registry import check_shift, make_simulator
 
     check_shift(simulator, shift)
     policies = POLICIES if simulator != "robomme" else POLICIES[2:]

@@ -9,13 +9,14 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     UnknownNameError,
 )
-from robomme_interference_data.shifts import parse_shift
-from robomme_interference_data.simulators.base import Simulator
+from robomme_interference_data.schema.shifts import parse_shift
+
+from .base import Simulator
 
 
 def _tabletop(**options: Any) -> Simulator:
     try:
-        from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
+        from .tabletop.simulator import TabletopSimulator
     except ImportError as error:
         library = error.name or "a library"
         raise MissingExtraError.needs("the tabletop simulator", library, "sim") from error
@@ -23,7 +24,7 @@ def _tabletop(**options: Any) -> Simulator:
 
 
 def _robomme(**options: Any) -> Simulator:
-    from robomme_interference_data.simulators.robomme import RoboMMESimulator
+    from .robomme.simulator import RoboMMESimulator
 
     return RoboMMESimulator(**options)
 
@@ -93,12 +94,12 @@ def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
         InvalidOptionError, MissingExtraError, SimulatorCrashError: As `RoboMMESimulator`.
     """
     if name == "tabletop":
-        from robomme_interference_data.simulators.tabletop import SUITE_VERSION
+        from .tabletop import SUITE_VERSION
 
         return {"tabletop": str(SUITE_VERSION)}
     if name != "robomme":
         return {}
-    from robomme_interference_data.simulators.robomme import RoboMMESimulator
+    from .robomme.simulator import RoboMMESimulator
 
     with RoboMMESimulator(python) as simulator:
         return simulator.versions

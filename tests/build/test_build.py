@@ -20,7 +20,7 @@ from robomme_interference_data.build_dataset.config import (
 )
 from robomme_interference_data.build_dataset.sources import Source
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -30,9 +30,9 @@ from robomme_interference_data.errors import (
     PoolTooSmallError,
     SourceError,
 )
-from robomme_interference_data.execution import Serial
-from robomme_interference_data.files import LocalFiles, hold, read_json, work_folder
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.storage.files import LocalFiles, hold, read_json, work_folder
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
 

@@ -11,9 +11,6 @@ from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
 from robomme_interference_data.build_dataset.manifests import planned_buffers, write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
-from robomme_interference_data.conditions import KINDS, Kind
-from robomme_interference_data.digest import combine
-from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -23,6 +20,9 @@ from robomme_interference_data.errors import (
     PoolTooSmallError,
     SourceError,
 )
+from robomme_interference_data.schema.conditions import KINDS, Kind
+from robomme_interference_data.schema.draw import UnitPool
+from robomme_interference_data.storage.digest import combine
 
 FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 

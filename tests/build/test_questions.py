@@ -30,12 +30,12 @@ from robomme_interference_data.build_dataset.questions import (
     write_questions,
 )
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES, QUESTIONS_PATH
-from robomme_interference_data.encode import decode_image
+from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.simulators.tabletop.camera import SIZE
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
+from robomme_interference_data.storage.encode import decode_image
 
 GREY = np.full((SIZE, SIZE, 3), 128, np.uint8)
 EPISODES = [

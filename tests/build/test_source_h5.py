@@ -16,7 +16,7 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     SourceError,
 )
-from robomme_interference_data.records import EvidenceSpan
+from robomme_interference_data.schema.records import EvidenceSpan
 
 h5py = pytest.importorskip("h5py")
 

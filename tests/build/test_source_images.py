@@ -9,9 +9,9 @@ from PIL import Image
 from support.recordings import encode_image, make_episode, write_video
 
 from robomme_interference_data.build_dataset.sources.images import info_is_exact, probe_video
-from robomme_interference_data.encode import CODECS, decode_image, is_png
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.video import iter_frames
+from robomme_interference_data.storage.encode import CODECS, decode_image, is_png
+from robomme_interference_data.storage.video import iter_frames
 
 FRAMES = make_episode(7, 5).images["front"]
 OURS = CODECS["av1-lossless"].settings["extra_options"]

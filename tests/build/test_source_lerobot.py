@@ -30,7 +30,7 @@ from robomme_interference_data.errors import (
     SourceError,
     UnknownNameError,
 )
-from robomme_interference_data.records import EvidenceSpan
+from robomme_interference_data.schema.records import EvidenceSpan
 
 VERSIONS = ("v3.0", "v2.1")
 NAME = "MoveCube/train/0"

@@ -33,11 +33,11 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     RAW_DISTRACTORS,
 )
-from robomme_interference_data.digest import combine
 from robomme_interference_data.errors import BuildError, FormatError, SourceError
-from robomme_interference_data.execution import Serial
-from robomme_interference_data.records import EvidenceSpan, SpanDigests
-from robomme_interference_data.video import iter_frames
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
+from robomme_interference_data.storage.digest import combine
+from robomme_interference_data.storage.video import iter_frames
 
 NAME = "MoveCube/test/0"
 

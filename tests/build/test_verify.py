@@ -25,10 +25,10 @@ from robomme_interference_data.build_dataset.manifests import write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import QUESTIONS_PATH
+from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.files import sha256_file
-from robomme_interference_data.questions import read_questions
 from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.storage.files import sha256_file
 
 EPISODES = "distractors/meta/episodes/chunk-000/file-000.parquet"
 RECORDS = "distractors/meta/interference.parquet"

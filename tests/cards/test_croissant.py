@@ -12,12 +12,12 @@ from robomme_interference_data.cards.columns import columns_of
 from robomme_interference_data.cards.croissant import as_bytes
 from robomme_interference_data.cards.render import CROISSANT
 from robomme_interference_data.constants import RECORDS_PATH
-from robomme_interference_data.files import sha256_file
-from robomme_interference_data.manifest import BufferManifest
-from robomme_interference_data.questions import Question
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.rows import arrow_schema
+from robomme_interference_data.data.questions import Question
+from robomme_interference_data.schema.codec import arrow_schema
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.storage.files import sha256_file
 
 NAMES = ("demonstrations", "split", "results")
 MINIMAL = (

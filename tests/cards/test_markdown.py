@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from robomme_interference_data.cards.markdown import Raw, block, code, escape, quoted, table
-from robomme_interference_data.tables import Table
+from robomme_interference_data.viz.tables import Table
 
 READER = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
 HOSTILE = "pick up | the `red` cube\n\n# {{ goal }} <script>alert(1)</script> ![x](http://a.b)"

@@ -16,8 +16,8 @@ from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.questions import write_questions
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.cards.render import split_files
+from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.questions import read_questions
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from support.publishing import files, tags
 from support.splits import GOLDEN
 
 from robomme_interference_data.cards import render
-from robomme_interference_data.files import canonical_json
+from robomme_interference_data.storage.files import canonical_json
 
 Run = Callable[..., tuple[int, str, str]]
 REPO = "someone/results"

@@ -24,13 +24,13 @@ from robomme_interference_data.cards.render import (
     split_text,
 )
 from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH, REPORT_PATH
+from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score import Settings
 from robomme_interference_data.evaluate.score.scoring import score
-from robomme_interference_data.files import read_json, write_json
-from robomme_interference_data.manifest import BufferManifest
-from robomme_interference_data.records import EpisodeRecord
-from robomme_interference_data.split import Split
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import read_json, write_json
 
 COMMIT = "0123456789" * 4
 

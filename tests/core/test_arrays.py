@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from robomme_interference_data.arrays import read_array, write_array
 from robomme_interference_data.errors import FormatError
+from robomme_interference_data.storage.arrays import read_array, write_array
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

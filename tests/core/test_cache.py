@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from robomme_interference_data import DecodedCache
-from robomme_interference_data.cache import default_cache_folder
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.storage.cache import default_cache_folder
 
 SHAPE = (4, 8, 8, 3)
 FILE_BYTES = 4 * 8 * 8 * 3 + 128

@@ -10,16 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data import EpisodeId
-from robomme_interference_data.conditions import (
+from robomme_interference_data.constants import DATASETS, DISTRACTORS
+from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
+from robomme_interference_data.schema.conditions import (
     DEFAULT_CONDITIONS,
     KINDS,
     datasets_of,
     in_order,
     parse_condition,
 )
-from robomme_interference_data.constants import DATASETS, DISTRACTORS
-from robomme_interference_data.errors import InvalidIdError, InvalidOptionError
-from robomme_interference_data.manifest import SessionEntry
+from robomme_interference_data.schema.manifest import SessionEntry
 
 
 def entry(role: str, number: int) -> SessionEntry:

@@ -20,9 +20,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.constants import FAMILIES, RULE_VERSION
-from robomme_interference_data.draw import UnitPool
 from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.draw import UnitPool
 
 parse = EpisodeId.parse
 GOLDEN = Path(__file__).parents[1] / "golden" / f"draws_rule_{RULE_VERSION}.json"
@@ -134,7 +134,7 @@ def test_golden_draws_in_other_processes(hash_seed: str) -> None:
     """Neither Python's hash seed nor the order of a set that depends on it matters."""
     code = (
         "import json, sys\n"
-        "from robomme_interference_data.draw import UnitPool\n"
+        "from robomme_interference_data.schema.draw import UnitPool\n"
         "from robomme_interference_data.ids import EpisodeId\n"
         "for case in json.load(sys.stdin):\n"
         "    names = {f'{f}/train/{i}' for f, n in case['pool'].items() for i in range(n)}\n"

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from robomme_interference_data.encode import (
+from robomme_interference_data.errors import BuildError
+from robomme_interference_data.storage.encode import (
     CLIP,
     CODECS,
     Codec,
     VideoEncoder,
 )
-from robomme_interference_data.errors import BuildError
-from robomme_interference_data.video import iter_frames
+from robomme_interference_data.storage.video import iter_frames
 
 LOSSLESS, LOSSY = CODECS["av1-lossless"], CODECS["lerobot-default"]
 

@@ -13,7 +13,8 @@ from support.splits import LESSON, QUERIES
 
 from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load_split
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evidence import (
+from robomme_interference_data.schema.codec import from_dict, to_dict
+from robomme_interference_data.schema.evidence import (
     Evidence,
     among,
     known_parts,
@@ -21,10 +22,9 @@ from robomme_interference_data.evidence import (
     spans_of_parts,
     spans_of_texts,
 )
-from robomme_interference_data.manifest import place_sessions
-from robomme_interference_data.records import EvidenceSpan
-from robomme_interference_data.rows import from_dict, to_dict
-from robomme_interference_data.sampling import evidence_kept
+from robomme_interference_data.schema.manifest import place_sessions
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.schema.sampling import evidence_kept
 
 ENTRY = SessionEntry(
     "lesson", "MoveCube", EpisodeId("MoveCube", "test", 0), "demonstrations", "r", 0, 0, 20, 1, "s"

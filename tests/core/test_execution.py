@@ -14,7 +14,8 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     WorkerRetiredError,
 )
-from robomme_interference_data.execution import (
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import (
     Processes,
     Serial,
     Worker,
@@ -22,7 +23,6 @@ from robomme_interference_data.execution import (
     describe,
     make_executor,
 )
-from robomme_interference_data.ids import EpisodeId
 
 
 class Noted:
@@ -164,7 +164,7 @@ def test_settings_of_workers_are_checked(settings: dict[str, Any], told: str) ->
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "robomme_interference_data.cluster", raising=False)
+    monkeypatch.delitem(sys.modules, "robomme_interference_data.runtime.ray_cluster", raising=False)
     with pytest.raises(MissingExtraError) as raised:
         make_executor(WorkersConfig(executor="ray"))
     assert "[cluster]" in str(raised.value.hint)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError, MissingFileError
-from robomme_interference_data.files import (
+from robomme_interference_data.storage.files import (
     LocalFiles,
     atomic_path,
     canonical_json,

@@ -24,10 +24,10 @@ from support.splits import (
 )
 
 from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.manifest import BufferManifest, SessionEntry
-from robomme_interference_data.rows import from_dict, to_dict
+from robomme_interference_data.schema.codec import from_dict, to_dict
+from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 
 MEGABYTES = 700
 """What reading a bomb may add to the memory of a process: the largest frame that is read, more than

@@ -21,8 +21,8 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
 )
-from robomme_interference_data.files import LocalFiles
-from robomme_interference_data.hub import HubFiles, locate
+from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.hub import HubFiles, locate
 
 Run = Callable[..., tuple[int, str, str]]
 REPO = "someone/small"
@@ -234,7 +234,7 @@ def test_addresses_of_a_hub(monkeypatch: pytest.MonkeyPatch, given: str) -> None
 def test_a_client_that_cannot_be_imported(tmp_path: Path) -> None:
     """The client reads the address when it is imported, and ends there."""
     told = os.environ | {"HF_ENDPOINT": "http://[", "HF_HUB_OFFLINE": "0"}
-    command = [sys.executable, "-m", "robomme_interference_data.cli", "fetch", REPO]
+    command = [sys.executable, "-m", "robomme_interference_data.cli.main", "fetch", REPO]
     done = subprocess.run(command, env=told, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr and "unset HF_ENDPOINT" in done.stderr

@@ -19,7 +19,7 @@ from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.build_dataset.audit import audit_split
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.cards.contents import split_tree
-from robomme_interference_data.cli import app
+from robomme_interference_data.cli.main import app
 from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import (
     FormatError,
@@ -28,10 +28,10 @@ from robomme_interference_data.errors import (
     MissingFileError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.config import RunConfig
-from robomme_interference_data.evaluate.run import run_evaluation
-from robomme_interference_data.execution import Serial
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.evaluation import run_evaluation
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
+from robomme_interference_data.runtime.executor import Serial
 
 QUERY = "MoveCube/test/0"
 VERSION = "data-1.0.0"

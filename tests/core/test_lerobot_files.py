@@ -21,9 +21,9 @@ from robomme_interference_data.errors import (
     TruncatedVideoError,
     UnknownNameError,
 )
-from robomme_interference_data.files import LocalFiles
-from robomme_interference_data.lerobot_files import LeRobotFiles
-from robomme_interference_data.lerobot_layout import fill_template
+from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.lerobot import LeRobotFiles
+from robomme_interference_data.storage.lerobot_layout import fill_template
 
 VIDEO = "videos/observation.images.front/"
 V21 = "chunk-000/episode_000002"

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.parquet import RowSpan
+from robomme_interference_data.storage.parquet import RowSpan
 
 IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 

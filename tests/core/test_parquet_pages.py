@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.parquet import RowSpan
-from robomme_interference_data.parquet_pages import decoded_size, read_chunks
-from robomme_interference_data.thrift import I32, I64, LIST, STRUCT, Thrift
+from robomme_interference_data.storage.parquet import RowSpan
+from robomme_interference_data.storage.untrusted.parquet_pages import decoded_size, read_chunks
+from robomme_interference_data.storage.untrusted.thrift import I32, I64, LIST, STRUCT, Thrift
 
 GIBIBYTE = 1 << 30
 

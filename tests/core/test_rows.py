@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from robomme_interference_data import EpisodeId
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.rows import (
+from robomme_interference_data.schema.codec import (
     arrow_schema,
     from_dict,
     from_table,

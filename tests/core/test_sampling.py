@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data import EpisodeId, Session, SessionEntry
-from robomme_interference_data.sampling import (
+from robomme_interference_data.schema.sampling import (
     even_sample,
     lesson_frames,
     lesson_share,

@@ -8,8 +8,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from robomme_interference_data.console import AsJson
-from robomme_interference_data.settings import setting, spread_values, with_settings
+from robomme_interference_data.cli.console import AsJson
+from robomme_interference_data.schema.settings import setting, spread_values, with_settings
 
 SEVERAL = ("--families", "--source")
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.shifts import SHIFTS, Shift, parse_shift
+from robomme_interference_data.schema.shifts import SHIFTS, Shift, parse_shift
 
 
 def test_shifts_are_written_as_they_are_read() -> None:

@@ -22,7 +22,6 @@ from robomme_interference_data import (
     load_buffer,
     load_split,
 )
-from robomme_interference_data.conditions import parse_condition
 from robomme_interference_data.errors import (
     FormatError,
     HashMismatchError,
@@ -31,7 +30,8 @@ from robomme_interference_data.errors import (
     MissingFileError,
     UnknownNameError,
 )
-from robomme_interference_data.rows import to_dict
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.conditions import parse_condition
 
 HEADER = "manifests/manifest.json"
 ROWS = "manifests/buffers.parquet"

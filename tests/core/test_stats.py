@@ -10,21 +10,21 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.bootstrap import bootstrap, enough, slope_weights
-from robomme_interference_data.significance import (
-    holm,
-    mcnemar,
-    poisson_binomial,
-    sign_flip,
-    two_proportions,
-)
-from robomme_interference_data.stats import (
+from robomme_interference_data.stats.bootstrap import bootstrap, enough, slope_weights
+from robomme_interference_data.stats.intervals import (
     cohens_h,
     effective,
     fieller,
     newcombe,
     newcombe_paired,
     wilson,
+)
+from robomme_interference_data.stats.significance import (
+    holm,
+    mcnemar,
+    poisson_binomial,
+    sign_flip,
+    two_proportions,
 )
 
 COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)

@@ -19,8 +19,8 @@ from support.splits import QUERIES
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.sampling import spread
-from robomme_interference_data.strip import (
+from robomme_interference_data.schema.sampling import spread
+from robomme_interference_data.viz.filmstrip import (
     COLORS,
     LESSON_COLOR,
     Block,

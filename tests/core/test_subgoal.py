@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.subgoal import Subgoal, read_grounded
+from robomme_interference_data.schema.subgoal import Subgoal, read_grounded
 
 _PIXELS = st.tuples(st.integers(0, 255), st.integers(0, 255))
 

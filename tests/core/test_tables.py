@@ -2,7 +2,7 @@
 
 import math
 
-from robomme_interference_data.tables import Table, percent, points
+from robomme_interference_data.viz.tables import Table, percent, points
 
 TABLE = Table.make(
     "rates",

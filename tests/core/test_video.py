@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from robomme_interference_data.encode import CODECS
 from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
     MissingFileError,
     TruncatedVideoError,
 )
-from robomme_interference_data.video import iter_frames
+from robomme_interference_data.storage.encode import CODECS
+from robomme_interference_data.storage.video import iter_frames
 
 COUNT, SIZE, FPS = 60, (64, 80), 10
 pytestmark = pytest.mark.timeout(120)

@@ -9,8 +9,8 @@ import pytest
 from support.splits import GOLDEN
 
 from robomme_interference_data.errors import FormatError, InterferenceError
-from robomme_interference_data.video import iter_frames
-from robomme_interference_data.video_boxes import find_container
+from robomme_interference_data.storage.untrusted.video_boxes import find_container
+from robomme_interference_data.storage.video import iter_frames
 
 VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 

@@ -9,7 +9,7 @@ from support.runs import EPISODE, roll
 from support.worlds import Cheat, World, query_of
 
 from robomme_interference_data.errors import RolloutError
-from robomme_interference_data.evaluate.agreement import check_lesson
+from robomme_interference_data.evaluate.rollout.recording_check import check_lesson
 from robomme_interference_data.simulators.base import Observation
 
 pytestmark = pytest.mark.usefixtures("world")

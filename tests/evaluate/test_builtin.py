@@ -16,11 +16,11 @@ from robomme_interference_data.evaluate.policies.builtin import (
     follow,
 )
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
-from robomme_interference_data.evidence import place_evidence
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import SessionEntry, place_sessions
-from robomme_interference_data.records import EvidenceSpan
-from robomme_interference_data.sampling import MEMORIES
+from robomme_interference_data.schema.evidence import place_evidence
+from robomme_interference_data.schema.manifest import SessionEntry, place_sessions
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.schema.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation
 
 Vector = NDArray[np.float32]

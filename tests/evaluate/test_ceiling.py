@@ -14,15 +14,15 @@ from support.shifted import add_shifted
 from support.splits import copy_split
 
 from robomme_interference_data import load_split
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.ceiling import ALL, ceiling, chance
-from robomme_interference_data.evaluate.config import CeilingConfig
+from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.query import Query
-from robomme_interference_data.records import EvidenceSpan
+from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
 from robomme_interference_data.simulators.tabletop.families import draw_episode
-from robomme_interference_data.split import Split
 
 
 def kept(split: Path, **settings: Any) -> dict[tuple[str, str], float | None]:

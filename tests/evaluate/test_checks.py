@@ -28,16 +28,16 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.checks import (
+from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.run.checks import (
     check_plan,
     check_settings,
     check_simulator,
     default_system,
 )
-from robomme_interference_data.evaluate.plan import plan_work
-from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.execution import Serial
+from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.simulators.registry import SIMULATORS
 
 pytestmark = pytest.mark.usefixtures("world")

@@ -10,12 +10,12 @@ from support.runs import EPISODE, run_one
 from support.worlds import World
 
 from robomme_interference_data import Buffer, load_buffer
-from robomme_interference_data.encode import VideoEncoder
-from robomme_interference_data.evaluate.clips import history_picture
-from robomme_interference_data.evaluate.log import clip_name
-from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.strip import session_colors
+from robomme_interference_data.evaluate.rollout.clips import history_picture
+from robomme_interference_data.evaluate.run.log import clip_name
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.storage.encode import VideoEncoder
+from robomme_interference_data.viz.filmstrip import session_colors
 
 pytestmark = pytest.mark.usefixtures("trouble")
 

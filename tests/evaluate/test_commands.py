@@ -11,9 +11,9 @@ from support.runs import run_one
 from typer.testing import CliRunner
 
 from robomme_interference_data.evaluate import commands
-from robomme_interference_data.evaluate import run as run_module
-from robomme_interference_data.execution import Serial
-from robomme_interference_data.settings import spread_values
+from robomme_interference_data.evaluate.run import evaluation as run_module
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.schema.settings import spread_values
 
 pytestmark = pytest.mark.usefixtures("trouble", "_serial")
 

@@ -7,7 +7,7 @@ from support.runs import EPISODE, roll
 from support.worlds import Cheat
 
 from robomme_interference_data import load_buffer
-from robomme_interference_data.split import Split
+from robomme_interference_data.data.buffer_set import Split
 
 pytestmark = pytest.mark.usefixtures("world")
 

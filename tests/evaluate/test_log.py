@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.log import open_log, read_record, read_run
-from robomme_interference_data.parquet import open_parquet
-from robomme_interference_data.rows import to_dict
+from robomme_interference_data.evaluate.run.log import open_log, read_record, read_run
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.storage.parquet import open_parquet
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "run"
 

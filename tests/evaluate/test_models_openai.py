@@ -26,7 +26,6 @@ from support.chat_server import (
     ChatServer,
 )
 
-from robomme_interference_data.encode import png
 from robomme_interference_data.errors import (
     InvalidOptionError,
     ModelError,
@@ -40,6 +39,7 @@ from robomme_interference_data.evaluate.models.registry import (
     model_identity,
     parse_model,
 )
+from robomme_interference_data.storage.encode import png
 
 NOISE = np.random.default_rng(0).integers(0, 256, (20, 33, 21, 3), dtype=np.uint8)
 ASKED = [Message("system", ("be brief",)), Message("user", ("what is it? ", NOISE[0]))]

@@ -14,7 +14,6 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.options import bind_options
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     PolicySpec,
@@ -22,6 +21,7 @@ from robomme_interference_data.evaluate.policies.registry import (
     parse_policy,
     policy_options,
 )
+from robomme_interference_data.evaluate.specs import bind_options
 
 OWN = "python:support.own_policies:"
 

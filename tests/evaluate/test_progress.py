@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from robomme_interference_data.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.progress import RunProgress, rate_table
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.progress import RunProgress, rate_table
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Rollout
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
+from robomme_interference_data.schema.rollouts import Rollout
 
 PLAN = [
     WorkItem(condition, EpisodeId(family, "test", index))

@@ -10,8 +10,8 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.config import AskConfig
 from robomme_interference_data.evaluate.questions import ask
+from robomme_interference_data.evaluate.run.config import AskConfig
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ from support.tabletop import LESSON, NOBODY, QUERIES, TABLETOP, copy_tabletop, s
 
 from robomme_interference_data import load_split
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.encode import decode_image
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.questions.answers import Asked, Guesser
-from robomme_interference_data.execution import Processes
+from robomme_interference_data.runtime.executor import Processes
+from robomme_interference_data.storage.encode import decode_image
 
 MOVE = QUERIES[FAMILIES.index("MoveCube") * 2]
 UNIT = 32

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robomme_interference_data.data.questions import LETTERS, Question
 from robomme_interference_data.errors import FormatError, UnknownNameError
 from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.models.prompts import told
@@ -20,7 +21,6 @@ from robomme_interference_data.evaluate.questions.prompt import (
     read_letter,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.questions import LETTERS, Question
 
 PLACES = "<history><picture>{goal}{question}{options}"
 IMAGE = np.zeros((2, 2, 3), np.uint8)

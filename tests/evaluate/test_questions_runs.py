@@ -31,8 +31,9 @@ from typer.testing import CliRunner
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.questions import write_questions
-from robomme_interference_data.cli import app
+from robomme_interference_data.cli.main import app
 from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
@@ -41,13 +42,12 @@ from robomme_interference_data.errors import (
     RunFolderError,
 )
 from robomme_interference_data.evaluate import merge_runs
-from robomme_interference_data.evaluate.config import AskConfig
-from robomme_interference_data.evaluate.log import read_record
 from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.questions import ask as module
-from robomme_interference_data.execution import Serial
+from robomme_interference_data.evaluate.run.config import AskConfig
+from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.runtime.executor import Serial
 
 SOME = {"families": ("MoveCube", "PatternLock")}
 """Four questions."""

@@ -16,13 +16,13 @@ from support.runs import EPISODE, roll, run
 from support.worlds import Cheat, World
 
 from robomme_interference_data import load_split
-from robomme_interference_data.buffer import Buffer
+from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import (
     HistoryTooLongError,
     PolicyError,
 )
 from robomme_interference_data.evaluate.policies.builtin import Privileged
-from robomme_interference_data.evaluate.rollout import read_ahead
+from robomme_interference_data.evaluate.rollout.rollout import read_ahead
 
 pytestmark = pytest.mark.usefixtures("world")
 

@@ -12,8 +12,8 @@ from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
 from robomme_interference_data.errors import RunFolderError, SimulatorCrashError
-from robomme_interference_data.evaluate.log import read_record
-from robomme_interference_data.execution import Outcome, Serial
+from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.runtime.executor import Outcome, Serial
 
 pytestmark = pytest.mark.usefixtures("trouble")
 

@@ -15,7 +15,7 @@ from robomme_interference_data.evaluate.subgoals.prompt import (
     load_prompt,
     merge_near,
 )
-from robomme_interference_data.subgoal import Subgoal
+from robomme_interference_data.schema.subgoal import Subgoal
 
 SIZE = (256, 256)
 BOXES = "<|box_start|>({y},{x})<|box_end|>"

@@ -29,11 +29,11 @@ from robomme_interference_data.errors import (
     ModelError,
     RunFolderError,
 )
-from robomme_interference_data.evaluate.checks import check_settings, default_system
 from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.run.checks import check_settings, default_system
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import OracleWriter
-from robomme_interference_data.subgoal import Subgoal
+from robomme_interference_data.schema.subgoal import Subgoal
 
 pytestmark = pytest.mark.usefixtures("world")
 

@@ -14,8 +14,8 @@ from robomme_interference_data.evaluate.models.model import ChatModel, Message, 
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.subgoals.model_writer import ModelWriter
 from robomme_interference_data.evaluate.subgoals.writer import History
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Observation
-from robomme_interference_data.subgoal import Subgoal
 
 pytestmark = pytest.mark.usefixtures("world")
 

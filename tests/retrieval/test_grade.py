@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 from support.retrieval import made
 
-from robomme_interference_data.evidence import place_evidence
-from robomme_interference_data.records import EvidenceSpan
 from robomme_interference_data.retrieval.grade import ALL, Grade, cells, grade, verdict
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.stats import wilson
+from robomme_interference_data.schema.evidence import place_evidence
+from robomme_interference_data.schema.records import EvidenceSpan
+from robomme_interference_data.stats.intervals import wilson
 
 MAX = Rule("max", 0.5)
 

@@ -23,14 +23,14 @@ from support.retrieval import (
 from support.splits import QUERIES, UNITS
 
 from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.embeddings import EmbeddingIndex
+from robomme_interference_data.data.buffer_set_index import normalised
+from robomme_interference_data.data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import BuildError, MissingIndexError
-from robomme_interference_data.files import hold, work_folder
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import measure
-from robomme_interference_data.split_index import normalised
+from robomme_interference_data.storage.files import hold, work_folder
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 

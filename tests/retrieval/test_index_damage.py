@@ -12,17 +12,17 @@ from support.retrieval import change_header, make_index
 from support.splits import QUERIES
 
 from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.embeddings import episode_file
+from robomme_interference_data.data.embeddings import episode_file
 from robomme_interference_data.errors import (
     FormatError,
     InterferenceError,
     MissingIndexError,
     StaleIndexError,
 )
-from robomme_interference_data.files import format_sums, read_sums, sha256_file
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.select import measure
 from robomme_interference_data.retrieval.selector import Selector
+from robomme_interference_data.storage.files import format_sums, read_sums, sha256_file
 
 FOLDER, OF_UNITS = (f"{name}/index/thumbnail" for name in ("demonstrations", "distractors"))
 

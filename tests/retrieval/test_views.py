@@ -15,7 +15,7 @@ from robomme_interference_data import EpisodeId, load_split
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import IDENTITY_PATH, SHIFTED
 from robomme_interference_data.errors import SourceError
-from robomme_interference_data.files import write_json
+from robomme_interference_data.storage.files import write_json
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from robomme_interference_data.conditions import KINDS, Kind
+from robomme_interference_data.schema.conditions import KINDS, Kind
 
 
 @pytest.fixture

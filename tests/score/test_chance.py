@@ -8,16 +8,16 @@ import pytest
 from support import scoring as made
 from support.scoring import OWN, cells, record, records
 
-from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.drawing import open_figure
 from robomme_interference_data.errors import BadRowsError
-from robomme_interference_data.evaluate.score.curves import Data
-from robomme_interference_data.evaluate.score.figures import draw_figure
-from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.methods import methods
+from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.figures import draw_figure
+from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.stats import wilson
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.viz.figure import open_figure
 
 GOLDEN = made.ROOT / "tests" / "golden" / "score-questions"
 

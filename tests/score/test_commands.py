@@ -15,7 +15,6 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, run
 
-from robomme_interference_data.drawing import MAKER
 from robomme_interference_data.errors import (
     BadRowsError,
     InvalidIdError,
@@ -23,10 +22,11 @@ from robomme_interference_data.errors import (
     MissingExtraError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate.score import figures
-from robomme_interference_data.evaluate.score.export import RELEASED_COLUMNS, export
-from robomme_interference_data.evaluate.score.rows import read_rows
+from robomme_interference_data.evaluate.score.plots import figures
+from robomme_interference_data.evaluate.score.rows.checked import read_rows
+from robomme_interference_data.evaluate.score.rows.export import RELEASED_COLUMNS, export
 from robomme_interference_data.evaluate.score.scoring import TABLES, write_score
+from robomme_interference_data.viz.figure import MAKER
 
 
 def files(folder: Path) -> set[str]:

@@ -9,9 +9,9 @@ from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.compare import Comparison, compare
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.stats import newcombe_paired, wilson
+from robomme_interference_data.evaluate.score.comparisons.compare import Comparison, compare
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.stats.intervals import newcombe_paired, wilson
 
 
 def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> Comparison:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from robomme_interference_data.evaluate.score.cube import success, trials
-from robomme_interference_data.evaluate.score.effects import retained
-from robomme_interference_data.evaluate.score.interaction import changes
-from robomme_interference_data.evaluate.score.pairs import pair
-from robomme_interference_data.stats import wilson
+from robomme_interference_data.evaluate.score.comparisons.effects import retained
+from robomme_interference_data.evaluate.score.comparisons.interaction import changes
+from robomme_interference_data.evaluate.score.comparisons.pairs import pair
+from robomme_interference_data.evaluate.score.outcomes import success, trials
+from robomme_interference_data.stats.intervals import wilson
 
 pytestmark = pytest.mark.slow
 

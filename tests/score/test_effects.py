@@ -7,10 +7,10 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
-from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.stats import fieller, newcombe_paired, wilson
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.stats.intervals import fieller, newcombe_paired, wilson
 
 
 def scored(tmp_path: Path, *parts: list[Rollout]) -> Score:

@@ -8,7 +8,7 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, record, records, row
 
-from robomme_interference_data.evaluate.score.families import over_families
+from robomme_interference_data.evaluate.score.comparisons.families import over_families
 from robomme_interference_data.evaluate.score.scoring import Score
 
 MOVE, PEG = made.FAMILIES

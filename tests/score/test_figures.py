@@ -13,13 +13,13 @@ from support import full_grid
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
-from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.drawing import open_figure
-from robomme_interference_data.evaluate.score.curves import Data, spread
-from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure
-from robomme_interference_data.evaluate.score.looks import Look, looks_of
+from robomme_interference_data.evaluate.score.plots.curves import Data, spread
+from robomme_interference_data.evaluate.score.plots.figures import FIGURES, draw_figure
+from robomme_interference_data.evaluate.score.plots.styles import Look, looks_of
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
-from robomme_interference_data.rollouts import Rollout
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.viz.figure import open_figure
 
 
 def data(path: Path, rows: list[Rollout], paper: bool = False) -> Data:

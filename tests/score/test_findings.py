@@ -7,14 +7,14 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record
 
-from robomme_interference_data.conditions import NO_HISTORY
 from robomme_interference_data.evaluate.score import Grid
-from robomme_interference_data.evaluate.score.compare import compare
-from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.paper import by_family, differing, published
+from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.tables.paper import by_family, differing, published
 from robomme_interference_data.evaluate.systems import SYSTEMS
-from robomme_interference_data.stats import newcombe, wilson
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.stats.intervals import newcombe, wilson
 
 GOLDEN = made.ROOT / "tests" / "golden" / "score"
 PAPER = made.RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"

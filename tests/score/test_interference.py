@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, record, records
 
-from robomme_interference_data.conditions import KINDS, NO_HISTORY, in_order, parse_condition
-from robomme_interference_data.drawing import open_figure
-from robomme_interference_data.evaluate.score.access import ceiling_of
-from robomme_interference_data.evaluate.score.contrasts import QUESTIONS, asked
-from robomme_interference_data.evaluate.score.curves import Data
-from robomme_interference_data.evaluate.score.figures import draw_figure, draw_figures
-from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.report import write_report
+from robomme_interference_data.evaluate.score.comparisons.contrasts import QUESTIONS, asked
+from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.figures import draw_figure, draw_figures
+from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.evaluate.score.report.page import write_report
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.significance import mcnemar
-from robomme_interference_data.stats import newcombe_paired, wilson
+from robomme_interference_data.evaluate.score.tables.evidence_kept import ceiling_of
+from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, in_order, parse_condition
+from robomme_interference_data.stats.intervals import newcombe_paired, wilson
+from robomme_interference_data.stats.significance import mcnemar
+from robomme_interference_data.viz.figure import open_figure
 
 GOLDEN = made.ROOT / "tests" / "golden" / "score-kinds"
 BEYOND = ("interference", "access", "ceiling")

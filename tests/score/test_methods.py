@@ -7,9 +7,9 @@ from support import full_grid
 from support import scoring as made
 from support.scoring import BASE, OWN
 
-from robomme_interference_data.evaluate.score.methods import methods
+from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.scoring import Score, write_score
-from robomme_interference_data.tables import Table
+from robomme_interference_data.viz.tables import Table
 
 
 def cited(found: Score) -> set[str]:

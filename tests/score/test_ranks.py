@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
-from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.pairs import corrected
-from robomme_interference_data.significance import holm, mcnemar, sign_flip, two_proportions
-from robomme_interference_data.stats import combined, newcombe, newcombe_paired
+from robomme_interference_data.evaluate.score.comparisons.pairs import corrected
+from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.stats.intervals import combined, newcombe, newcombe_paired
+from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
 
 # Of 24 episodes: 12, 11, 6 and 5, each a part of the one before.
 FALLING = {"one": 12, "two": 11, "three": 6, "four": 5}

@@ -15,15 +15,19 @@ from support import scoring as made
 from support.browser import open_page
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
-from robomme_interference_data.drawing import open_figure, save_figure
-from robomme_interference_data.evaluate.log import Start
-from robomme_interference_data.evaluate.plan import Plan
-from robomme_interference_data.evaluate.score.curves import Data
-from robomme_interference_data.evaluate.score.figures import FIGURES, draw_figure, draw_figures
-from robomme_interference_data.evaluate.score.headline import headline
-from robomme_interference_data.evaluate.score.report import write_report
+from robomme_interference_data.evaluate.run.log import Start
+from robomme_interference_data.evaluate.run.plan import Plan
+from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.figures import (
+    FIGURES,
+    draw_figure,
+    draw_figures,
+)
+from robomme_interference_data.evaluate.score.report.headline import headline
+from robomme_interference_data.evaluate.score.report.page import write_report
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.files import sha256_file
+from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.viz.figure import open_figure, save_figure
 
 VIDEO = "videos/MoveCube/k0 #0.mp4"
 

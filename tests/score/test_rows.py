@@ -20,9 +20,9 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
 )
-from robomme_interference_data.evaluate.score.compare import compare
-from robomme_interference_data.evaluate.score.export import export
-from robomme_interference_data.evaluate.score.rows import Rows, read_rows
+from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.rows.checked import Rows, read_rows
+from robomme_interference_data.evaluate.score.rows.export import export
 
 COLUMNS = ("simulator", "system", "condition", "family", "episode", "model_seed", "status")
 

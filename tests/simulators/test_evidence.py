@@ -9,7 +9,7 @@ from numpy.random import RandomState
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
 from robomme_interference_data.simulators.tabletop.families import family_class
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.shifts import parse_shift
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import parse_shift
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.tabletop.camera import (
     FRONT_EYE,
     FRONT_TARGET,
     looking,
     to_pixels,
 )
-from robomme_interference_data.subgoal import Subgoal
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 

@@ -23,12 +23,12 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     UnknownNameError,
 )
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.registry import simulator_versions
-from robomme_interference_data.simulators.robomme import EPISODES, RoboMMESimulator
-from robomme_interference_data.simulators.robomme_process import find_python
+from robomme_interference_data.simulators.robomme.process import find_python
+from robomme_interference_data.simulators.robomme.simulator import EPISODES, RoboMMESimulator
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
-from robomme_interference_data.subgoal import Subgoal
 
 HOLD = np.array([0, 0, 0, -1.5, 0, 1.5, 0.75, 1], np.float32)
 
@@ -268,7 +268,7 @@ def test_an_exception_leaves_the_process_running(simulator: RoboMMESimulator) ->
 def test_it_ends_with_us_even_in_a_long_call(robomme_python: Path) -> None:
     code = f"""
         import numpy as np
-        from robomme_interference_data.simulators.robomme import RoboMMESimulator
+        from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
         simulator = RoboMMESimulator({str(robomme_python)!r})
         simulator.reset("MoveCube/test/{HANGS}")
         print(simulator.pid, flush=True)

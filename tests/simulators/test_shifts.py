@@ -13,7 +13,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     UnknownNameError,
 )
-from robomme_interference_data.shifts import KINDS, SHIFTS, Shift
+from robomme_interference_data.schema.shifts import KINDS, SHIFTS, Shift
 from robomme_interference_data.simulators import Status
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")

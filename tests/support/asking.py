@@ -8,12 +8,12 @@ from support.chat_server import ChatServer, Seen
 from support.tabletop import QUERIES, TABLETOP
 
 from robomme_interference_data import load_split
+from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.evaluate import RunResult
-from robomme_interference_data.evaluate.config import AskConfig
 from robomme_interference_data.evaluate.questions.ask import run_examination
-from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.questions import Question, read_questions
+from robomme_interference_data.runtime.executor import Executor, Serial
 
 
 @cache

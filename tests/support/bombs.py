@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from support.splits import GOLDEN
 
-from robomme_interference_data.video import MOST_PIXELS
+from robomme_interference_data.storage.video import MOST_PIXELS
 
 _VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _MEGABYTE = 1 << 20
@@ -191,12 +191,12 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None]]] = {
 
 def read(kind: str, path: Path) -> object:
     """Read a file as what it is."""
-    from robomme_interference_data.arrays import read_array
-    from robomme_interference_data.encode import decode_image
-    from robomme_interference_data.evaluate.log import whole_lines
-    from robomme_interference_data.files import read_json, read_sums
-    from robomme_interference_data.parquet import RowSpan
-    from robomme_interference_data.video import iter_frames
+    from robomme_interference_data.evaluate.run.log import whole_lines
+    from robomme_interference_data.storage.arrays import read_array
+    from robomme_interference_data.storage.encode import decode_image
+    from robomme_interference_data.storage.files import read_json, read_sums
+    from robomme_interference_data.storage.parquet import RowSpan
+    from robomme_interference_data.storage.video import iter_frames
 
     readers: dict[str, Callable[[], object]] = {
         "parquet": lambda: RowSpan(path).table(),

@@ -105,8 +105,8 @@ class BuildServer:
 
 
 def _serve(log: str) -> None:
-    from robomme_interference_data import cli
     from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot
+    from robomme_interference_data.cli import main as cli
 
     load_lerobot()
     # The one other thread is pyarrow's allocator, which is made to be forked.

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import typer
 
-from robomme_interference_data.cli import app
+from robomme_interference_data.cli.main import app
 
 
 def parse(words: Sequence[str]) -> None:

@@ -22,17 +22,17 @@ from support.splits import GOLDEN
 from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_split
-from robomme_interference_data.arrays import read_array
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.embeddings import EmbeddingIndex
-from robomme_interference_data.encode import decode_image
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.embeddings import EmbeddingIndex
+from robomme_interference_data.data.questions import digest_questions, read_questions
 from robomme_interference_data.errors import InterferenceError
-from robomme_interference_data.evaluate.log import read_run
-from robomme_interference_data.evaluate.score.sources import read_part
-from robomme_interference_data.files import LocalFiles, read_sums
-from robomme_interference_data.questions import digest_questions, read_questions
-from robomme_interference_data.video import iter_frames
+from robomme_interference_data.evaluate.run.log import read_run
+from robomme_interference_data.evaluate.score.rows.sources import read_part
+from robomme_interference_data.storage.arrays import read_array
+from robomme_interference_data.storage.encode import decode_image
+from robomme_interference_data.storage.files import LocalFiles, read_sums
+from robomme_interference_data.storage.video import iter_frames
 
 _VIDEO = "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
 _ROWS = "demonstrations/data/chunk-000/file-000.parquet"

@@ -11,8 +11,8 @@ from robomme_interference_data.build_dataset.config import BuildPlan, list_episo
 from robomme_interference_data.build_dataset.manifests import write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
-from robomme_interference_data.execution import Serial
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
 
 FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 

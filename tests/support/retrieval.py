@@ -12,9 +12,7 @@ from support.splits import QUERIES, with_sessions
 
 from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_split
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
-from robomme_interference_data.embeddings import IndexHeader
-from robomme_interference_data.files import write_json
-from robomme_interference_data.manifest import place_sessions
+from robomme_interference_data.data.embeddings import IndexHeader
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import (
@@ -24,8 +22,10 @@ from robomme_interference_data.retrieval.segment import (
     cosines,
 )
 from robomme_interference_data.retrieval.select import Measured
-from robomme_interference_data.rows import read_header, to_dict
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.manifest import place_sessions
+from robomme_interference_data.storage.files import write_json
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]

@@ -8,13 +8,13 @@ from typing import Any
 from support import worlds
 
 from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
-from robomme_interference_data.evaluate.config import Run
-from robomme_interference_data.evaluate.plan import WorkItem
-from robomme_interference_data.evaluate.rollout import run_rollout
-from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.evaluate.rollout.rollout import run_rollout
+from robomme_interference_data.evaluate.run.config import Run
+from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import TIMING_COLUMNS, Rollout
-from robomme_interference_data.rows import to_dict
+from robomme_interference_data.runtime.executor import Executor, Serial
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS, Rollout
 
 CHEAT = "python:support.worlds:make_cheat"
 WORLD = "support.worlds:World"

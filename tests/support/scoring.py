@@ -12,13 +12,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from robomme_interference_data.conditions import NO_HISTORY
-from robomme_interference_data.evaluate.log import RunHeader
+from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.score import Against, Grid, Settings, commands
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.scoring import score as compute
-from robomme_interference_data.rollouts import Rollout
-from robomme_interference_data.rows import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.schema.rollouts import Rollout
 
 BASE, RETRIEVAL, OWN = "perceptual-framesamp-modul", "retrieval-framesamp-modul", "my-memory"
 FAMILIES = ("MoveCube", "InsertPeg")

@@ -12,9 +12,9 @@ from robomme_interference_data.build_dataset.material import in_folder, plan_man
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SHIFTED
-from robomme_interference_data.execution import Serial
-from robomme_interference_data.shifts import SHIFTS
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.shifts import SHIFTS
 
 
 class ShiftedSample(SampleSource):

@@ -7,8 +7,8 @@ import numpy as np
 
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.shifts import Shift
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.simulators.base import (
     Begun,
     Demonstration,

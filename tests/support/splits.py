@@ -11,10 +11,10 @@ from robomme_interference_data.build_dataset.cut import CUTS
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SUMS_PATH
-from robomme_interference_data.dataset import Dataset
-from robomme_interference_data.files import LocalFiles, format_sums, sha256_file
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.manifest import BufferManifest, SessionEntry
+from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
+from robomme_interference_data.storage.files import LocalFiles, format_sums, sha256_file
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "split"
 """Three test queries and the train units of nine families, 32 × 32 pixels, made by

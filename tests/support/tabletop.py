@@ -20,15 +20,15 @@ from robomme_interference_data.build_dataset.material import in_folder, plan_man
 from robomme_interference_data.build_dataset.questions import make_questions, write_questions
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Source, SourceEpisode
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evidence import spans_of_parts
-from robomme_interference_data.execution import Serial
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.schema.evidence import spans_of_parts
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 from robomme_interference_data.simulators.tabletop.camera import SIZE
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 from robomme_interference_data.simulators.tabletop.family import Family
-from robomme_interference_data.work_progress import WorkProgress
 
 TABLETOP = Path(__file__).parents[1] / "golden" / "tabletop"
 """Two queries and a unit of each family, the queries with their questions; made by

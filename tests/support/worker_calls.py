@@ -16,7 +16,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     WorkerRetiredError,
 )
-from robomme_interference_data.execution import Worker
+from robomme_interference_data.runtime.executor import Worker
 
 FOREVER = 100_000.0
 

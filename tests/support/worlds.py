@@ -17,9 +17,9 @@ from robomme_interference_data.constants import STATE
 from robomme_interference_data.errors import SimulatorCrashError
 from robomme_interference_data.evaluate.policies.policy import Frames, RolloutInfo
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
-from robomme_interference_data.subgoal import Subgoal
 
 SPLIT = "WORLDS_SPLIT"
 TROUBLE = "WORLDS_TROUBLE"

@@ -12,8 +12,8 @@ from support.asking import look
 from support.chat_server import ChatServer, Seen
 from support.tabletop import QUERIES, TABLETOP
 
-from robomme_interference_data.evaluate.log import read_record
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.schema.rollouts import Status
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +22,7 @@ WORKERS = 2
 
 def start(server: ChatServer, out: Path, *more: str) -> subprocess.Popen[str]:
     words = f"ask --model openai:{server.url}#tiny --system tiny --conditions k0 --frames 3"
-    command = [sys.executable, "-m", "robomme_interference_data.cli", *words.split(), *more]
+    command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split(), *more]
     return subprocess.Popen(
         [*command, "--workers", str(WORKERS), "--split", str(TABLETOP), "--out", str(out)],
         stdout=subprocess.PIPE,

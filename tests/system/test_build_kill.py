@@ -14,7 +14,7 @@ from support.build_server import BuildServer
 from support.splits import contents
 
 from robomme_interference_data.build_dataset.stage import read_staged
-from robomme_interference_data.files import work_folder
+from robomme_interference_data.storage.files import work_folder
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 

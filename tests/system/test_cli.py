@@ -19,8 +19,8 @@ import typer
 from support.splits import QUERIES, contents
 
 from robomme_interference_data import load_split
-from robomme_interference_data.cli import app
-from robomme_interference_data.rows import to_dict
+from robomme_interference_data.cli.main import app
+from robomme_interference_data.schema.codec import to_dict
 
 ROOT = Path(__file__).parents[2]
 EPISODE = QUERIES[1]
@@ -94,7 +94,7 @@ def test_groups_without_a_command_show_their_help(path: tuple[str, ...], run: Ru
 
 def test_help_imports_nothing_heavy() -> None:
     code = (
-        "import sys; from robomme_interference_data.cli import app\n"
+        "import sys; from robomme_interference_data.cli.main import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "print(*sys.modules, file=sys.stderr)"

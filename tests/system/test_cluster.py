@@ -25,15 +25,15 @@ from support.worker_calls import Marked, Placed, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan
-from robomme_interference_data.cluster import RayWorkers
 from robomme_interference_data.errors import ClusterError
-from robomme_interference_data.evaluate.log import read_record
-from robomme_interference_data.execution import Executor, Serial
+from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
-from robomme_interference_data.rollouts import TIMING_COLUMNS
-from robomme_interference_data.rows import to_dict
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Executor, Serial
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.runtime.ray_cluster import RayWorkers
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -64,7 +64,7 @@ def driver(out: Path, address: str) -> subprocess.Popen[str]:
     """The command, as a user runs it."""
     words = f"evaluate --policy {runs.CHEAT} --simulator {runs.WORLD} --system mine --workers 3"
     words += f" --families VideoRepick MoveCube --executor ray --ray-address {address} --json"
-    command = [sys.executable, "-m", "robomme_interference_data.cli", *words.split()]
+    command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split()]
     return subprocess.Popen(
         [*command, "--split", str(GOLDEN), "--out", str(out)],
         stdout=subprocess.PIPE,
@@ -148,7 +148,7 @@ def connect(address: str, **environment: str) -> str:
     """In a process of its own, for this one is a driver already; return what went wrong."""
     code = (
         "import sys\n"
-        "from robomme_interference_data.cluster import RayWorkers\n"
+        "from robomme_interference_data.runtime.ray_cluster import RayWorkers\n"
         "list(RayWorkers(1, sys.argv[1]).run(print, [1]))"
     )
     done = subprocess.run(

@@ -18,9 +18,9 @@ from support.splits import QUERIES
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import SHIFTED
-from robomme_interference_data.query import Query
-from robomme_interference_data.shifts import SHIFTS
-from robomme_interference_data.views import live_embedding, live_frame
+from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.views import live_embedding, live_frame
+from robomme_interference_data.schema.shifts import SHIFTS
 
 Login = Callable[..., None]
 Run = Callable[..., tuple[int, str, str]]

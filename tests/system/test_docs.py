@@ -16,9 +16,9 @@ from support.hub import push_split, running_hub
 from support.splits import GOLDEN
 from support.tabletop import copy_tabletop
 
-from robomme_interference_data.evaluate import run as run_module
 from robomme_interference_data.evaluate.questions import ask as ask_module
-from robomme_interference_data.execution import Serial
+from robomme_interference_data.evaluate.run import evaluation as run_module
+from robomme_interference_data.runtime.executor import Serial
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

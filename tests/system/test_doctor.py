@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from robomme_interference_data import doctor
-from robomme_interference_data.doctor import Check
+from robomme_interference_data.cli import doctor
+from robomme_interference_data.cli.doctor import Check
 
 OK = Check("fine", True, "1.0")
 ABSENT = Check("optional", None, "not installed", 'pip install "robomme-interference-data[build]"')
@@ -49,7 +49,7 @@ def test_the_table_shows_state_name_detail_and_the_whole_fix() -> None:
 
 def test_this_environment_has_all_that_is_needed_and_nothing_heavy_is_imported() -> None:
     code = (
-        "import sys; from robomme_interference_data.doctor import checks\n"
+        "import sys; from robomme_interference_data.cli.doctor import checks\n"
         "for row in checks(): print(row.name, row.ok, row.fix, sep='|')\n"
         "print(sorted({'torch', 'lerobot', 'h5py', 'sapien', 'mani_skill', 'transformers',"
         " 'matplotlib', 'datasets', 'pandas'} & set(sys.modules)))"
@@ -163,7 +163,9 @@ def test_robommes_interpreter_is_asked(
         assert detail in row.detail
     # It has to play, not only to be there.
     monkeypatch.setenv("ROBOMME_PYTHON", str(robomme_python))
-    monkeypatch.setattr("robomme_interference_data.simulators.robomme.ARMS", ("VideoSleep",))
+    monkeypatch.setattr(
+        "robomme_interference_data.simulators.robomme.simulator.ARMS", ("VideoSleep",)
+    )
     assert (row := doctor.check_robomme()).ok is False
     assert "VideoSleep" in row.detail
 

@@ -22,8 +22,8 @@ def test_a_policy_trained_on_built_demonstrations_acts(tmp_path: Path) -> None:
     from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
     from robomme_interference_data.constants import ACTION
     from robomme_interference_data.evaluate.policies.registry import make_policy
-    from robomme_interference_data.execution import Serial
-    from robomme_interference_data.work_progress import WorkProgress
+    from robomme_interference_data.runtime.executor import Serial
+    from robomme_interference_data.runtime.progress import WorkProgress
 
     out = tmp_path / "demonstrations"
     config = BuildConfig(source=("sample:MoveCube,PatternLock",), out=out, split="test")

@@ -18,10 +18,10 @@ from support.serve_policy import command
 from support.worker_calls import wait_until_gone
 
 from robomme_interference_data.errors import WorkerRetiredError
-from robomme_interference_data.evaluate.log import read_record
-from robomme_interference_data.execution import Processes
-from robomme_interference_data.rollouts import TIMING_COLUMNS
-from robomme_interference_data.rows import to_dict
+from robomme_interference_data.evaluate.run.log import read_record
+from robomme_interference_data.runtime.executor import Processes
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 
 TESTS = Path(__file__).parent.parent
 CONDITIONS = ("no-history", "k0", "k1", "k3", "k7")
@@ -41,7 +41,7 @@ def start(
 ) -> subprocess.Popen[str]:
     usual = f"evaluate --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
     usual += " --families VideoRepick MoveCube --json"
-    called = [sys.executable, "-m", "robomme_interference_data.cli", *usual.split(), *words]
+    called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split(), *words]
     return subprocess.Popen(
         [*called, "--split", os.environ[worlds.SPLIT], "--out", str(out)],
         env=os.environ | {worlds.PAUSE: str(pause)},

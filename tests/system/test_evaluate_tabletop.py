@@ -9,8 +9,8 @@ from support.runs import untimed
 
 from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.checks import check_simulator
-from robomme_interference_data.execution import Processes
+from robomme_interference_data.evaluate.run.checks import check_simulator
+from robomme_interference_data.runtime.executor import Processes
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 pytestmark = pytest.mark.slow

@@ -17,7 +17,7 @@ from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.verify import verify_split
 
 Run = Callable[..., tuple[int, str, str]]
-FETCH = "from robomme_interference_data.cli import main; main()"
+FETCH = "from robomme_interference_data.cli.main import main; main()"
 SPLIT_AT = f"{SPLIT}@data-1.0.0"
 FILE = re.compile(r"/(?:store/)?datasets/([^/]+/[^/]+)/(?:resolve/)?[0-9a-f]{40,64}/(.+)")
 AT_ONCE = 8

@@ -9,7 +9,7 @@ from support.recordings import check_recording, make_episode
 from support.splits import GOLDEN, dataset, stored_frames, stored_states
 
 from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
-from robomme_interference_data.encode import CODECS, Codec
+from robomme_interference_data.storage.encode import CODECS, Codec
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ import pytest
 from support.ray_cluster import running_cluster
 from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
 
-from robomme_interference_data.cluster import RayWorkers
 from robomme_interference_data.errors import SimulatorCrashError, WorkerRetiredError
-from robomme_interference_data.execution import Outcome, Processes
+from robomme_interference_data.runtime.executor import Outcome, Processes
+from robomme_interference_data.runtime.ray_cluster import RayWorkers
 
 pytestmark = pytest.mark.timeout(150)
 
@@ -46,7 +46,7 @@ def run(request: pytest.FixtureRequest) -> Run:
 def script(folder: Path, text: str) -> tuple[list[str], dict[str, str]]:
     """Return the command that runs a script, and its environment."""
     path = folder / "script.py"
-    path.write_text("from robomme_interference_data.execution import Processes\n" + text)
+    path.write_text("from robomme_interference_data.runtime.executor import Processes\n" + text)
     return [sys.executable, str(path)], {**os.environ, "PYTHONPATH": str(TESTS)}
 
 

@@ -19,8 +19,8 @@ from robomme_interference_data.build_dataset.manifests import write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.execution import Serial
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.runtime.progress import WorkProgress
 
 h5py = pytest.importorskip("h5py")
 

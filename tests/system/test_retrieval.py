@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from support.retrieval import QUIET, embedded, files_of
 
-from robomme_interference_data.execution import Processes, Serial
+from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import Rule, choose
-from robomme_interference_data.split_index import normalised
+from robomme_interference_data.runtime.executor import Processes, Serial
 
 Features = dict[str, NDArray[np.float32]]
 

@@ -12,11 +12,11 @@ from support.retrieval import make_index
 from support.splits import QUERIES
 
 from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.errors import FormatError, HubError, InvalidOptionError
 from robomme_interference_data.retrieval.encoders import make_encoder
 from robomme_interference_data.retrieval.select import measure
 from robomme_interference_data.retrieval.selector import Selector
-from robomme_interference_data.split_index import normalised
 
 
 @cache

@@ -12,12 +12,12 @@ from robomme_interference_data.build_dataset.config import BuildConfig, plan_bui
 from robomme_interference_data.build_dataset.manifests import write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
-from robomme_interference_data.dataset import Dataset
+from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.execution import Executor, Processes, Serial
-from robomme_interference_data.files import LocalFiles
-from robomme_interference_data.simulators.robomme import EPISODES
-from robomme_interference_data.work_progress import WorkProgress
+from robomme_interference_data.runtime.executor import Executor, Processes, Serial
+from robomme_interference_data.runtime.progress import WorkProgress
+from robomme_interference_data.simulators.robomme.simulator import EPISODES
+from robomme_interference_data.storage.files import LocalFiles
 
 
 def build(kind: str, config: BuildConfig) -> int:
@@ -72,7 +72,7 @@ def test_an_interpreter_that_will_not_do_leaves_nothing(tmp_path: Path, executor
 
 def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     from robomme_interference_data.evaluate import run_evaluation
-    from robomme_interference_data.evaluate.config import RunConfig
+    from robomme_interference_data.evaluate.run.config import RunConfig
 
     queries = config_of(tmp_path / DEMONSTRATIONS, robomme_python, "45-47")
     build(DEMONSTRATIONS, replace(queries, cameras=("front",)))

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.subgoal import Pixel
+from robomme_interference_data.schema.subgoal import Pixel
 
 FRONT_EYE = (0.80, 0.0, 0.64)
 """Where the front camera stands, in m: the table up to x = 0.14 m, and at its home pose the whole

@@ -20,9 +20,9 @@ from mani_skill.agents.robots import PandaWristCam
 from mani_skill.render.shaders import ShaderConfig
 from mani_skill.sensors.camera import CameraConfig
 
-from robomme_interference_data.simulators.tabletop.kit import Colour
-from robomme_interference_data.simulators.tabletop.motion import ROD
-from robomme_interference_data.simulators.tabletop.renderer import SHADERS
+from .kit import Colour
+from .motion import ROD
+from .renderer import SHADERS
 
 UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)
 """The turn, as a quaternion, that stands up sapien's cylinders, which lie along x."""

@@ -14,26 +14,27 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, FPS
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evidence import spans_of_parts
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.shifts import Shift
+from robomme_interference_data.schema.evidence import spans_of_parts
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import Shift
+from robomme_interference_data.schema.subgoal import Pixel, Subgoal
 from robomme_interference_data.simulators.base import CAMERAS, Demonstration, Observation
-from robomme_interference_data.simulators.tabletop.camera import (
+
+from .camera import (
     FRONT_EYE,
     FRONT_TARGET,
     FRONT_VIEW,
     SIZE,
     to_pixels,
 )
-from robomme_interference_data.simulators.tabletop.drawing import PANDA, SHADER, draw_low_polygon
-from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, turn_of
-from robomme_interference_data.simulators.tabletop.families import draw_episode
-from robomme_interference_data.simulators.tabletop.kit import Kit
-from robomme_interference_data.simulators.tabletop.look import Look
-from robomme_interference_data.simulators.tabletop.motion import BASE, Arm, Point, Script
-from robomme_interference_data.simulators.tabletop.obeying import Obeying
-from robomme_interference_data.simulators.tabletop.renderer import make_renderer
-from robomme_interference_data.subgoal import Pixel, Subgoal
+from .drawing import PANDA, SHADER, draw_low_polygon
+from .episodes import difficulty_of, turn_of
+from .families import draw_episode
+from .kit import Kit
+from .look import Look
+from .motion import BASE, Arm, Point, Script
+from .obeying import Obeying
+from .renderer import make_renderer
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "num_envs": (1,),

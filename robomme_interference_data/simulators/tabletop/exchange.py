@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.tabletop.family import Family, narrowed
-from robomme_interference_data.simulators.tabletop.kit import Body
-from robomme_interference_data.simulators.tabletop.motion import Arm, Script
-from robomme_interference_data.simulators.tabletop.stage import exchanges, shuffled, swap
+from .family import Family, narrowed
+from .kit import Body
+from .motion import Arm, Script
+from .stage import exchanges, shuffled, swap
 
 Pair = tuple[int, int]
 

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.kit import Colour, Kit
-from robomme_interference_data.simulators.tabletop.motion import Arm, Point, Script
+from robomme_interference_data.schema.rollouts import Status
+
+from .kit import Colour, Kit
+from .motion import Arm, Point, Script
 
 _RECALLED = 2
 """Stream of random numbers; see `episodes.turn_of` for the others."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.simulators.tabletop.motion import Point
+from .motion import Point
 
 if TYPE_CHECKING:
     import sapien
@@ -269,7 +269,7 @@ class Kit:
         """
         import sapien
 
-        from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, material
+        from .drawing import UPRIGHT, material
 
         builder = self._scene.create_actor_builder()
         for middle, half, colour in boxes:

@@ -15,10 +15,11 @@ from mani_skill.utils import sapien_utils
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.shifts import KINDS, Shift
-from robomme_interference_data.simulators.tabletop.camera import FRONT_EYE, FRONT_TARGET
-from robomme_interference_data.simulators.tabletop.drawing import UPRIGHT, material
-from robomme_interference_data.simulators.tabletop.kit import Colour
+from robomme_interference_data.schema.shifts import KINDS, Shift
+
+from .camera import FRONT_EYE, FRONT_TARGET
+from .drawing import UPRIGHT, material
+from .kit import Colour
 
 DIMMER, BRIGHTER, TINT = 0.20, 0.12, 0.12  # parts of the light, of a colour
 MOVED, TURNED = 0.045, math.radians(1.5)  # m, rad

@@ -7,9 +7,10 @@ from difflib import get_close_matches
 from functools import cache
 from typing import Any
 
-from robomme_interference_data.simulators.tabletop.family import Family, Step
-from robomme_interference_data.simulators.tabletop.motion import Arm, Point, Script
-from robomme_interference_data.subgoal import Pixel, Subgoal, without_points
+from robomme_interference_data.schema.subgoal import Pixel, Subgoal, without_points
+
+from .family import Family, Step
+from .motion import Arm, Point, Script
 
 _NEAR = 0.6  # of difflib's ratio: wordings that may mean the same
 _HIGH = 0.20  # m, above all that stands on the table

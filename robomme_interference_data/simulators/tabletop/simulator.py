@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import (
     CAMERAS,
     Begun,
@@ -17,9 +18,9 @@ from robomme_interference_data.simulators.base import (
     Simulator,
     choose_cameras,
 )
-from robomme_interference_data.simulators.tabletop.env import TabletopEnv
-from robomme_interference_data.simulators.tabletop.episodes import seed_of
-from robomme_interference_data.subgoal import Subgoal
+
+from .env import TabletopEnv
+from .episodes import seed_of
 
 POLICIES = ("oracle", "guess", "recall")
 

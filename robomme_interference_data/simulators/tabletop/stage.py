@@ -8,8 +8,8 @@ import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.simulators.tabletop.kit import Body, Place
-from robomme_interference_data.simulators.tabletop.motion import Arm, Script, eased
+from .kit import Body, Place
+from .motion import Arm, Script, eased
 
 Spot = tuple[float, float]
 Vector = NDArray[np.float64]

@@ -5,22 +5,23 @@ from functools import lru_cache
 from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.query import Query
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
-from robomme_interference_data.simulators.tabletop.families.insert_peg import InsertPeg
-from robomme_interference_data.simulators.tabletop.families.move_cube import MoveCube
-from robomme_interference_data.simulators.tabletop.families.pattern_lock import PatternLock
-from robomme_interference_data.simulators.tabletop.families.route_stick import RouteStick
-from robomme_interference_data.simulators.tabletop.families.video_place_button import (
+from robomme_interference_data.simulators.tabletop.family import Family
+
+from .insert_peg import InsertPeg
+from .move_cube import MoveCube
+from .pattern_lock import PatternLock
+from .route_stick import RouteStick
+from .video_place_button import (
     VideoPlaceButton,
 )
-from robomme_interference_data.simulators.tabletop.families.video_place_order import VideoPlaceOrder
-from robomme_interference_data.simulators.tabletop.families.video_repick import VideoRepick
-from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
-from robomme_interference_data.simulators.tabletop.families.video_unmask_swap import VideoUnmaskSwap
-from robomme_interference_data.simulators.tabletop.family import Family
+from .video_place_order import VideoPlaceOrder
+from .video_repick import VideoRepick
+from .video_unmask import VideoUnmask
+from .video_unmask_swap import VideoUnmaskSwap
 
 _FAMILIES: dict[str, type[Family]] = {
     each.__name__: each

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import COLOURS, Kit
 from robomme_interference_data.simulators.tabletop.motion import SLOW, Arm, Script

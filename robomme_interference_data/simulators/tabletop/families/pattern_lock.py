@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.random import RandomState
 
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import Body, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 
-from robomme_interference_data.rollouts import Status
-from robomme_interference_data.simulators.tabletop.families.pattern_lock import StickFamily
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import ROD, Arm, Point, Script
 from robomme_interference_data.simulators.tabletop.stage import ABOVE, off_line
+
+from .pattern_lock import StickFamily
 
 Route = tuple[tuple[int, ...], tuple[int, ...]]
 

@@ -2,9 +2,10 @@
 
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.tabletop.families.video_place_button import PlaceFamily
 from robomme_interference_data.simulators.tabletop.kit import Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+
+from .video_place_button import PlaceFamily
 
 ORDINALS = ("first", "second", "third")
 

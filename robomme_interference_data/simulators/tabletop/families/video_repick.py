@@ -2,7 +2,7 @@
 
 from numpy.random import RandomState
 
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
 from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit

@@ -5,7 +5,7 @@ from itertools import chain, islice, permutations, product
 
 from numpy.random import RandomState
 
-from robomme_interference_data.rollouts import Status
+from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.tabletop.family import Family, Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, SIDE, Body, Kit, Place
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script

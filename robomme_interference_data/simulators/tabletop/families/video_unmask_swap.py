@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from numpy.random import RandomState
 
 from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
-from robomme_interference_data.simulators.tabletop.families.video_unmask import VideoUnmask
 from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+
+from .video_unmask import VideoUnmask
 
 
 class VideoUnmaskSwap(ExchangeFamily, VideoUnmask):

@@ -1,0 +1,227 @@
+"""Clips of rollouts: the lesson, what was given of the history, and how it went, side by side."""
+
+import textwrap
+import traceback
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
+from functools import wraps
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FPS, MAX_STEPS
+from robomme_interference_data.data.buffer import Buffer
+from robomme_interference_data.errors import MissingExtraError
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.sampling import spread
+from robomme_interference_data.schema.subgoal import Subgoal
+from robomme_interference_data.simulators.base import EpisodeInfo, Observation
+from robomme_interference_data.storage.encode import CLIP, VideoEncoder
+from robomme_interference_data.viz.figure import Hue
+from robomme_interference_data.viz.filmstrip import session_colors
+
+_VIEW = 256  # side of a camera's picture
+_HEADS = ("lesson", "given", "front", "wrist")
+_WIDTH = (len(_HEADS) + 1) * _VIEW  # and the facts
+_HEAD = 24
+_HEIGHT = _VIEW + _HEAD
+_COLUMNS = 8
+_THUMB = _VIEW // _COLUMNS
+_SMALL = _THUMB - 4  # of a frame; its session's line is under it
+_COLORS = {
+    Status.ONGOING: "#555555",
+    Status.SUCCESS: Hue.GREEN,
+    Status.FAIL: Hue.VERMILION,
+    Status.TIMEOUT: Hue.ORANGE,
+    Status.ERROR: "#000000",
+}
+_LAST = 10
+"""Frames for which the end stays."""
+
+_LETTERS = 34
+"""Letters in a line of the facts."""
+
+_LINES = 14
+"""Lines of the facts."""
+
+
+def check_drawing() -> None:
+    """Check that clips can be drawn.
+
+    Raises:
+        MissingExtraError: pillow, which draws the words, is not installed.
+    """
+    try:
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError.needs("--videos", "pillow", "retrieval") from error
+
+
+def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:
+    """Keep what goes wrong in a method of a clip as its `problem`."""
+
+    @wraps(method)
+    def attempt(*arguments: P.args, **named: P.kwargs) -> None:
+        clip: Any = arguments[0]
+        if clip.problem is None:
+            try:
+                method(*arguments, **named)
+            except Exception:
+                clip.problem = f"the clip failed:\n{traceback.format_exc()}"
+                with suppress(Exception):  # a full disk fails once more
+                    clip._file.close()
+
+    return attempt
+
+
+class Clip:
+    """Draws a rollout as it goes, 10 pictures a second, and has them encoded at once.
+
+    What goes wrong with the clip never reaches the rollout: its traceback is kept as `problem`,
+    and there is no clip.
+
+    Attributes:
+        data: The clip, an MP4 file, once it is closed; None if there is none.
+        problem: What went wrong, or None.
+    """
+
+    def __init__(self, item: WorkItem, system: str, folder: str | None = None):
+        self._folder = folder
+        self.data: bytes | None = None
+        self.problem: str | None = None
+        names = (system, str(item.episode), f"condition {item.condition}")
+        self._heading = [line for name in names for line in textwrap.wrap(name, _LETTERS)]
+        self._goal = self._given = ""
+        self._views: dict[str, NDArray[np.uint8]] = {}
+        self._lesson: Iterator[NDArray[np.uint8]] = iter(())
+        self._subgoal: Subgoal | None = None
+        self._steps = 0
+        self._file = ExitStack()
+        self._path = Path()
+        self._encoder: VideoEncoder | None = None
+
+    @_harmless
+    def begin(
+        self, buffer: Buffer, given: Sequence[int], first: Observation, info: EpisodeInfo
+    ) -> None:
+        """Take what is known before the first step, and which frames of the buffer were given."""
+        self._goal = info.goal
+        self._given = f"history given: {len(given)} frames" if given else "no history"
+        self._views = {"given": history_picture(buffer, given)}
+        self._lesson = self._file.enter_context(closing(_lesson_of(buffer)))
+        self._show(first)
+        self._path = Path(
+            self._file.enter_context(TemporaryDirectory(dir=self._folder)), "clip.mp4"
+        )
+        self._encoder = VideoEncoder(self._path, CLIP, FPS, _HEIGHT, _WIDTH, container="mp4")
+        self._encoder.add(self._picture(Status.ONGOING))
+
+    @_harmless
+    def step(self, observation: Observation, status: Status, subgoal: Subgoal | None) -> None:
+        """Take what came of a step, with the images of both cameras, and the subgoal of it."""
+        if self._encoder is not None:
+            self._steps += 1
+            self._subgoal = subgoal
+            self._show(observation)
+            self._encoder.add(self._picture(status))
+
+    @_harmless
+    def close(self, status: Status, error: str | None = None) -> None:
+        """Hold the end for a second, and end the clip.
+
+        There is none of a rollout that broke before its first observation.
+        """
+        if self._encoder is not None:
+            picture = self._picture(status, error=error)
+            for _ in range(_LAST):
+                self._encoder.add(picture)
+            self._encoder.close()
+            self.data = self._path.read_bytes()
+            self._file.close()
+
+    def _show(self, observation: Observation) -> None:
+        """Take what is seen, and the lesson's next frame, while there is one."""
+        self._views |= observation.images
+        for frame in islice(self._lesson, 1):
+            self._views["lesson"] = frame
+
+    def _picture(self, status: Status, *, error: str | None = None) -> NDArray[np.uint8]:
+        """Return the clip's present picture, `(280, 1280, 3) uint8`."""
+        canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+        for place, name in enumerate(_HEADS):
+            if name in self._views:
+                view = self._views[name][:_VIEW, :_VIEW]
+                x = place * _VIEW
+                canvas[_HEAD : _HEAD + view.shape[0], x : x + view.shape[1]] = view
+        front = _HEADS.index("front") * _VIEW
+        for y, x in self._subgoal.points if self._subgoal else ():
+            _cross(canvas[_HEAD:, front : front + _VIEW], y, x)
+        lines = [*self._heading, "", *textwrap.wrap(self._goal, _LETTERS)]
+        subgoal = self._subgoal and self._subgoal.simple
+        for head, text in (("subgoal:", subgoal), ("what broke:", error)):
+            if text:
+                lines += ["", head, *textwrap.wrap(text, _LETTERS)]
+        # The last two lines always have their place, however long the words before them are.
+        lines = [*lines[: _LINES - 3], "", f"step {self._steps} of {MAX_STEPS}", str(status)]
+        heads = ["lesson" if "lesson" in self._views else "no lesson", self._given, *_HEADS[2:]]
+        return _lettered(canvas, heads, lines, _COLORS[status])
+
+
+def _lesson_of(buffer: Buffer) -> Generator[NDArray[np.uint8]]:
+    """Yield the front frames of a buffer's lesson, `(H, W, 3) uint8`, as they are wanted."""
+    lesson = [one for one in buffer.sessions if one.role == "lesson"]
+    indices = [index for one in lesson for index in range(one.start, one.stop)]
+    for chunk in buffer.stream(1, ("front",), indices):
+        yield chunk.frames["front"][0]
+
+
+def _cross(view: NDArray[np.uint8], y: int, x: int) -> None:
+    """Mark a point of a view, black on white: seen on any ground."""
+    for wide, colour in ((2, 255), (1, 0)):
+        view[max(y - 5, 0) : y + 6, max(x - wide + 1, 0) : x + wide] = colour
+        view[max(y - wide + 1, 0) : y + wide, max(x - 5, 0) : x + 6] = colour
+
+
+def history_picture(buffer: Buffer, given: Sequence[int]) -> NDArray[np.uint8]:
+    """Return 64 of some frames of a buffer, evenly spread, `(256, 256, 3) uint8`.
+
+    Each has a line under it in the colour of its session, the lesson's as in the film strip.
+    Without frames the picture is white.
+    """
+    picture = np.full((_VIEW, _VIEW, 3), 255, np.uint8)
+    colors, sessions = session_colors(buffer.sessions), buffer.session_index
+    for place, chosen in enumerate(spread(0, len(given), _COLUMNS * _COLUMNS)):
+        index = given[chosen]
+        y, x = (_THUMB * part for part in divmod(place, _COLUMNS))
+        frame = buffer.frame(index, "front")
+        step = max(1, frame.shape[0] // _SMALL)
+        small = frame[step // 2 :: step, step // 2 :: step][:_SMALL, :_SMALL]
+        picture[y : y + small.shape[0], x : x + small.shape[1]] = small
+        color = bytes.fromhex(colors[sessions[index]][1:])
+        picture[y + _SMALL : y + _THUMB - 1, x : x + _THUMB - 2] = tuple(color)
+    return picture
+
+
+def _lettered(
+    canvas: NDArray[np.uint8], heads: Sequence[str], lines: Sequence[str], color: str
+) -> NDArray[np.uint8]:
+    """Write the lines beside the views, and what the parts are above them."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(13)
+    for place, head in enumerate(heads):
+        draw.text((place * _VIEW + 4, 4), head, fill="#333333", font=font)
+    y, left = _HEAD + 4, len(_HEADS) * _VIEW
+    for line in lines[:-1]:
+        draw.text((left + 10, y), line, fill="black", font=font)
+        y += 17
+    draw.rectangle((left + 8, y + 2, left + _VIEW - 8, y + 24), fill=color)
+    draw.text((left + 14, y + 5), lines[-1], fill="white", font=font)
+    return np.asarray(image)

@@ -1,0 +1,209 @@
+"""What a worker of a run does: one rollout after the other."""
+
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from robomme_interference_data.cli.console import say
+from robomme_interference_data.constants import CAMERA_PREFIX
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.errors import (
+    PolicyServerError,
+    ServerKeepaliveError,
+    WorkerRetiredError,
+    first_line,
+)
+from robomme_interference_data.evaluate.policies.identity import plain
+from robomme_interference_data.evaluate.policies.policy import Policy
+from robomme_interference_data.evaluate.policies.registry import make_policy
+from robomme_interference_data.evaluate.run.config import RetrievalConfig, Run, RunConfig
+from robomme_interference_data.evaluate.run.log import clip_name
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.versions import package_versions
+from robomme_interference_data.evaluate.subgoals.registry import make_writer
+from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
+from robomme_interference_data.runtime.executor import Worker
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import Rollout, Status
+from robomme_interference_data.simulators.base import CAMERAS, Simulator
+from robomme_interference_data.simulators.registry import make_simulator, simulator_versions
+
+from .clips import Clip
+from .rollout import run_rollout
+from .transcripts import record_file
+
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selector
+
+
+class RolloutTask:
+    """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.
+
+    What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
+    that broke is used again. Clips, subgoals and the log of a server that it started are handed
+    in.
+
+    Args:
+        run: The run.
+        said: What the policy said of itself when the run began.
+    """
+
+    def __init__(self, run: Run[RunConfig], said: Mapping[str, Any]):
+        self._run, self._said = run, said
+        self._simulator: Simulator | None = None
+        self._policy: Policy | None = None
+        self._writer: SubgoalWriter | None = None
+        self._split: Split | None = None
+        self._logs: dict[str, bytes] = {}
+        self._selector: Selector | None = None
+
+    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
+        """Run a rollout; return its row, and what befell its clip, or None.
+
+        Raises:
+            WorkerRetiredError: The policy's server is gone, or another than when the run began.
+            Exception: Whatever broke in the rollout.
+        """
+        clip = Clip(task, self._run.system, worker.folder) if self._run.config.videos else None
+        try:
+            row = self._roll(task, worker, clip)
+        except Exception as error:
+            what = f"{type(error).__name__}: {first_line(error)}"
+            self._hand_in(task, worker, clip, Status.ERROR, what)
+            self.close()
+            if isinstance(error, ServerKeepaliveError):
+                say(f"{task}: {error.message}. A rollout that ends so is begun again, once.")
+            if isinstance(error, PolicyServerError) and self._run.config.serve is None:
+                self._check_server(worker)
+            raise
+        # Whatever became of what is to be looked at, the rollout ended as it did.
+        self._hand_in(task, worker, clip, Status(row.status))
+        return row, clip.problem if clip else None
+
+    def _roll(self, item: WorkItem, worker: Worker, clip: Clip | None) -> Rollout:
+        config = self._run.config
+        if self._split is None:
+            self._split = load_split(config.split, cache=config.cache, threads=1)
+            self._selector = make_selector(config)
+        if self._policy is None:
+            self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
+            self._check_served(self._policy)
+            self._hand_in_logs(worker)
+        if self._writer is None:
+            self._writer = make_writer(config)
+        if self._simulator is None:
+            options = simulator_options(config, self._policy.cameras)
+            with worker.limit(config.simulator_timeout, "the simulator's start"):
+                self._simulator = make_simulator(config.simulator, **options)
+        return run_rollout(
+            self._run,
+            item,
+            simulator=self._simulator,
+            policy=self._policy,
+            split=self._split,
+            selector=self._selector,
+            writer=self._writer,
+            clip=clip,
+            worker=worker,
+        )
+
+    def describe(self) -> dict[str, str]:
+        """Return the split's revision and all versions, where it would run."""
+        config = self._run.config
+        versions = simulator_versions(config.simulator, config.robomme_python)
+        revision = load_split(config.split).revision
+        return package_versions(config) | versions | {"the split's revision": revision}
+
+    def close(self) -> None:
+        """Release simulator, policy and what writes subgoals."""
+        for thing in (self._policy, self._simulator, self._writer):
+            # It may be broken already, and the first error is the one to tell.
+            with suppress(Exception):
+                if thing is not None:
+                    thing.close()
+        self._policy = self._simulator = self._writer = None
+
+    def _hand_in(
+        self,
+        item: WorkItem,
+        worker: Worker,
+        clip: Clip | None,
+        status: Status,
+        error: str | None = None,
+    ) -> None:
+        """Hand in the subgoals of a rollout, its clip, and logs of servers that it started."""
+        self._hand_in_logs(worker)
+        if status is not Status.ERROR:
+            self._logs.clear()
+        if self._writer is not None:
+            worker.hand_in(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
+        if clip is not None:
+            clip.close(status, error)
+            if clip.data is not None:
+                worker.hand_in(clip_name(item), clip.data)
+
+    def _hand_in_logs(self, worker: Worker) -> None:
+        """Hand in what servers that the worker started have printed.
+
+        Of one that broke again with the next rollout: what an attempt hands in may be lost.
+        """
+        server: Any = self._policy
+        if self._run.config.serve is not None and server is not None:
+            self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
+        for log in self._logs.items():
+            worker.hand_in(*log)
+
+    def _check_served(self, policy: Policy) -> None:
+        """Retire the worker if the server that it reaches is not what the run began with."""
+        if "server_metadata" not in self._said:
+            return
+        said, first = (one["server_metadata"] for one in (plain(policy.metadata()), self._said))
+        if said != first:
+            raise WorkerRetiredError(
+                f"a worker's policy server says {said} of itself; the run began with {first}",
+                "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
+            )
+
+    def _check_server(self, worker: Worker) -> None:
+        """Retire the worker unless the policy's server is still there."""
+        config = self._run.config
+        policy = make_policy(config.policy, config.policy_options, worker=worker.number)
+        try:
+            policy.metadata()  # connects
+        except PolicyServerError as error:
+            raise WorkerRetiredError(error.message, error.hint) from error
+        finally:
+            policy.close()
+
+
+def make_selector(config: RetrievalConfig) -> "Selector | None":
+    """Make the retrieval step of a run, None if it has none; see `Selector` for its errors."""
+    if config.retrieval is None:
+        return None
+    from robomme_interference_data.retrieval.selector import Selector
+
+    return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
+
+
+def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, Any]:
+    """Return the options of a run's simulator: it draws only what somebody looks at.
+
+    `watched` has the cameras that the policy wants.
+    """
+    wanted = {*watched}
+    if config.subgoals not in (None, ORACLE):
+        wanted.add(CAMERA)
+    if config.retrieval is not None:
+        wanted.add(config.retrieval_camera.removeprefix(CAMERA_PREFIX))
+    if config.videos or config.check_lesson:
+        wanted |= {*CAMERAS}
+    cameras = tuple(name for name in CAMERAS if name in wanted)
+    if config.simulator == "robomme":
+        # Its own limit ends a little before the worker's: its error shows what RoboMME printed.
+        limit = 0.9 * config.simulator_timeout
+        options = {"python": config.robomme_python, "cameras": cameras, "answer_s": limit}
+        return options | {"subgoals": config.subgoals == ORACLE}
+    if config.simulator == "tabletop":
+        return {"cameras": cameras, "shift": config.shift}
+    return {}

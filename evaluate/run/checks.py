@@ -1,0 +1,273 @@
+"""All that can be known to be wrong with a run before its first rollout."""
+
+import math
+import re
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    SimulatorCrashError,
+)
+from robomme_interference_data.evaluate.policies.policy import Policy
+from robomme_interference_data.evaluate.policies.registry import (
+    BUILTINS,
+    parse_policy,
+    policy_options,
+)
+from robomme_interference_data.evaluate.rollout.clips import check_drawing
+from robomme_interference_data.evaluate.rollout.worker import simulator_options
+from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
+from robomme_interference_data.evaluate.subgoals.writer import ORACLE
+from robomme_interference_data.evaluate.systems import (
+    System,
+    base_of,
+    check_history,
+    known_system,
+    name_system,
+)
+from robomme_interference_data.retrieval.select import Rule
+from robomme_interference_data.runtime.executor import Executor, Worker
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.simulators.registry import (
+    SIMULATORS,
+    check_shift,
+    find_simulator,
+    make_simulator,
+)
+
+from .config import RunConfig, WorkConfig, unusual_retrieval
+from .plan import Plan, WorkItem
+
+READS_SUBGOALS = ("websocket", "python", "obey")
+"""Kinds of policies that may read subgoals."""
+
+
+def default_system(config: RunConfig) -> str:
+    """Return the name under which rows stand if none is given.
+
+    That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
+    step behind it, such as `retrieval-replay-window-oracle`; with the simulator's subgoals
+    `…-oracle`, and of `replay` that goes on `…-go-on`.
+
+    Raises:
+        InvalidOptionError: It does not follow from the policy, or from what writes its subgoals.
+    """
+    spec = parse_policy(config.policy)
+    # Folders are called alike, and so are revisions; and served models.
+    learned = config.policy if spec.kind in ("websocket", "lerobot") else config.subgoals
+    if learned not in (None, ORACLE):
+        raise InvalidOptionError(
+            f"the rows of {learned} need a name: it does not tell one checkpoint from another",
+            "Give --system, such as perceptual-framesamp-modul, or a name of your own: see "
+            "docs/systems.md.",
+        )
+    name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
+    if spec.kind == "replay" and policy_options(config.policy, config.policy_options)["go_on"]:
+        name += "-go-on"
+    if spec.kind == "python":
+        name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
+    if config.retrieval is None:
+        return name
+    return "-".join(("retrieval", name, *unusual_retrieval(config).values())).replace("/", "-")
+
+
+def check_positive(config: WorkConfig) -> None:
+    """Check numbers that have to be above 0.
+
+    Raises:
+        InvalidOptionError: One is not.
+    """
+    for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
+        value = getattr(config, name, 1)
+        if not 0 < value < math.inf:
+            raise InvalidOptionError.expected(
+                "--" + name.replace("_", "-"), value, "more than 0", "Leave it out for the default."
+            )
+
+
+def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
+    """Check the settings against each other, the split and the policy.
+
+    Raises:
+        UnknownNameError: There is no such simulator or camera, or a name passes for a system.
+        InvalidOptionError: A setting is out of range or does not go with another: a shift with a
+            simulator that has none, for one.
+        MissingExtraError: A library for videos or retrieval is not installed.
+    """
+    find_simulator(config.simulator)
+    check_shift(config.simulator, config.shift)
+    check_positive(config)
+    if config.episode_split not in SPLITS:
+        raise InvalidOptionError.one_of("--episode-split", config.episode_split, SPLITS)
+    if policy.privileged and config.simulator == "robomme":
+        raise InvalidOptionError(
+            f"the policy {config.policy} asks the simulator for actions, and robomme gives none",
+            "Run it on --simulator tabletop, or take another policy.",
+        )
+    Rule.parse(config.retrieval_rule)
+    unusual_retrieval(config)
+    step = [] if config.retrieval is None else [config.retrieval_camera]
+    for camera in (*policy.history_cameras, *step):
+        split.datasets[DEMONSTRATIONS].shape(camera)  # refuses one that is not there
+    _check_name(config, name_system(system))
+    _check_subgoals(config, name_system(system))
+    if config.videos:
+        check_drawing()
+
+
+def _check_name(config: RunConfig, system: System) -> None:
+    """Refuse a name of the table for a policy, or a retrieval step, that is not that system's."""
+    kind, step = parse_policy(config.policy).kind, config.retrieval is not None
+    why = None
+    if not system.paper:
+        if known_system(system.name) is not None and (
+            kind not in BUILTINS or default_system(config) != system.name
+        ):
+            why = f"the policy {config.policy} is not the control {system.name}"
+            why += " with a retrieval step in front" if step else ""
+    elif kind not in ("websocket", "python"):
+        why = f"the policy {config.policy} is not the paper's system {system.name}"
+    elif (system.subgoals is None) is (config.subgoals is not None) and kind == "websocket":
+        needs = "no subgoals" if system.subgoals is None else "subgoals of a model (--subgoals)"
+        why = f"system {system.name} acts on {needs}, and --subgoals is {config.subgoals}"
+    elif config.subgoals == ORACLE:
+        why = f"the subgoals of {system.name} are a model's, and {ORACLE} knows the answer"
+    elif system.retrieval != step:
+        has, given = ("a", "none is given") if system.retrieval else ("no", "one is given")
+        why = f"system {system.name} has {has} retrieval step, and {given} (--retrieval)"
+    elif step and Rule.parse(config.retrieval_rule).method != "max":
+        why = f"the retrieval step of {system.name} chooses by max, not by {config.retrieval_rule}"
+    if why is not None:
+        raise InvalidOptionError(why, "Give --system a name of your own: see docs/systems.md.")
+
+
+def _check_subgoals(config: RunConfig, system: System) -> None:
+    """Refuse subgoals that nobody reads, and settings of them that say nothing."""
+    for name in ("subgoal_prompt", "subgoal_options"):
+        if getattr(config, name) and config.subgoals in (None, ORACLE):
+            option = {"subgoal_options": "--subgoal-option"}.get(name, "--subgoal-prompt")
+            raise InvalidOptionError(
+                f"{option} says nothing without a model that writes subgoals",
+                "Add --subgoals openai:URL#MODEL, or leave it out.",
+            )
+    if config.subgoals is None:
+        return
+    kind = parse_policy(config.policy).kind
+    if kind not in READS_SUBGOALS:
+        raise InvalidOptionError(
+            f"the policy {config.policy} reads no subgoals",
+            f"Take {', '.join(READS_SUBGOALS)}, or leave out --subgoals.",
+        )
+    if config.subgoals != ORACLE:
+        keeps = load_prompt(config.subgoal_prompt or system.prompt)[0].watches
+        if system.subgoals is not None and keeps is not (system.prompt == "memer"):
+            raise InvalidOptionError(
+                f"the prompt {config.subgoal_prompt} shows the model "
+                f"{'' if keeps else 'no '}recent frames; that of {system.name} "
+                f"{'does not' if keeps else 'does'}",
+                "Give that system's prompt, or --system a name of your own.",
+            )
+
+
+def applicable(config: RunConfig, system: System, split: Split, policy: Policy) -> tuple[str, ...]:
+    """Return the conditions that the split has and that apply to system and policy."""
+    reads = _reads_history(config, policy)
+    return tuple(name for name in split.conditions if _refusal(system, reads, name) is None)
+
+
+def _reads_history(config: RunConfig, policy: Policy) -> bool:
+    """Whether the policy, or a model that writes its subgoals, does anything with a history."""
+    return policy.wants_history or config.subgoals is not None
+
+
+def check_plan(
+    config: RunConfig, system: System, split: Split, policy: Policy, plan: Plan
+) -> tuple[WorkItem, ...]:
+    """Check every rollout of a plan, and return them.
+
+    Raises:
+        InvalidOptionError: A condition does not apply, or the split is of another simulator.
+        UnknownNameError: The split has no buffers for a condition.
+        HistoryTooLongError: A buffer exceeds the system's position limit.
+    """
+    items = plan.items()
+    for name in plan.conditions:
+        if (refusal := _refusal(system, _reads_history(config, policy), name)) is not None:
+            raise refusal
+        split.manifest(split.episode_ids[0], name)  # is refused with what there is
+    recalls = parse_policy(config.policy).kind == "recall"
+    own = ":" in config.simulator  # a simulator of one's own may serve any episodes
+    for episode in dict.fromkeys(item.episode for item in items):
+        record = split.query(episode).record
+        if recalls and record.evidence is None:
+            raise InvalidOptionError(
+                f"{config.policy} needs to know which frames show the answer, and of {episode} "
+                "this is unknown",
+                "Build the demonstrations from a source with evidence: see docs/sources.md.",
+            )
+        recorded = record.simulator
+        if not own and recorded not in (None, config.simulator):
+            raise InvalidOptionError(
+                f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
+                f"Give --simulator {recorded}, or a split of {config.simulator}."
+                if recorded in SIMULATORS
+                else "No simulator plays the episodes of this split: give one whose demonstrations "
+                f"are of {' or '.join(SIMULATORS)}, or a simulator of your own that plays them.",
+            )
+    if system.position_limit is not None and config.retrieval is None:
+        planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
+        for manifest in split.manifests():
+            name = manifest.condition
+            if WorkItem(name, manifest.episode_id) in planned:
+                longest[name] = max(manifest.history_frames, longest[name])
+        check_history(system, longest)
+    return items
+
+
+def check_simulator(config: RunConfig, watched: Iterable[str], executor: Executor) -> None:
+    """Make the simulator once, by the executor, as a broken driver may end its process.
+
+    One of the user's own is made by the workers only.
+
+    Raises:
+        NoRendererError: This machine cannot draw its pictures.
+        MissingExtraError: Its libraries are not installed, or RoboMME's interpreter lacks it.
+        SimulatorCrashError: It cannot be made for another reason.
+    """
+    if config.simulator not in SIMULATORS:
+        return
+    tasks = [simulator_options(config, watched)]
+    make = partial(_make_once, config.simulator)
+    for outcome in executor.run(make, tasks, time_limit=config.simulator_timeout, attempts=1):
+        if isinstance(outcome.error, InterferenceError):
+            raise outcome.error
+        if outcome.error is not None:
+            raise SimulatorCrashError(
+                f"the {config.simulator} simulator cannot be made: {outcome.error}",
+                "robomme-interference doctor tells what works on this machine.",
+            )
+
+
+def _make_once(name: str, options: dict[str, Any], worker: Worker) -> None:
+    make_simulator(name, **options).close()
+
+
+def _refusal(system: System, reads_history: bool, condition: str) -> InterferenceError | None:
+    """Return why a condition does not apply, or None."""
+    if condition != NO_HISTORY and not (system.with_history and reads_history):
+        who = "the policy" if system.with_history else system.name
+        return InvalidOptionError(
+            f"{who} takes no history, so {condition} says nothing of it",
+            f"Give --conditions {NO_HISTORY}.",
+        )
+    if not system.applies(condition):
+        return InvalidOptionError(
+            f"{system.name} has nothing to retrieve from under {NO_HISTORY}",
+            f"Run {base_of(system.name)} under {NO_HISTORY}: there the two are the same system.",
+        )
+    return None

@@ -1,0 +1,345 @@
+"""The folder of a run: one record, a line a rollout, and what was asked of it in `run.json`.
+
+A line of `rollouts.jsonl` is on the disk before the next rollout is counted; one that a crash cut
+short is dropped, and only that one. Of a rollout that broke and ran again, the last row counts;
+what is finished never runs again. The tables beside it are exported when a run ends.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.errors import FormatError, RunFolderError, first_line
+from robomme_interference_data.schema.codec import (
+    arrow_schema,
+    from_dict,
+    read_header,
+    to_dict,
+    to_table,
+)
+from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
+from robomme_interference_data.storage.files import (
+    atomic_path,
+    canonical_json,
+    hold,
+    parse_json,
+    read_bytes,
+    write_json,
+)
+from robomme_interference_data.storage.parquet import writing
+
+from .plan import Plan, WorkItem
+
+ERRORS_LOG = "errors.log"
+
+MOST_BYTES = 2 << 30
+"""Bytes of a file of rows, at most: two million rollouts have less."""
+
+_MOST_ROLLOUTS = 1 << 20
+"""Rollouts that all plans of a run ask for, at most: the paper's grid has 25,200."""
+
+
+def item_name(item: WorkItem) -> str:
+    """Return what a rollout's own files are called, such as `MoveCube_test_3_k7`."""
+    return f"{str(item.episode).replace('/', '_')}_{item.condition}"
+
+
+def clip_name(item: WorkItem) -> str:
+    """Return the path of a rollout's clip inside the run's folder."""
+    return f"videos/{item_name(item)}.mp4"
+
+
+@dataclass(frozen=True)
+class Start:
+    """One start of the command: its settings, what was asked for, and where it ran.
+
+    Attributes:
+        command: The command line; empty from Python.
+        versions: Of Python, this package, what it used, and the simulator.
+        git: Commit of the source tree, with `-dirty` if it was changed; None if there is none.
+        policy: What the policy said of itself.
+        started: When, UTC, `2026-01-31T12:00:00Z`.
+        ended: When; None while it runs, or if it was killed.
+        stopped: Why it ended early, or None.
+    """
+
+    command: tuple[str, ...]
+    settings: dict[str, Any]
+    plan: Plan
+    versions: dict[str, str]
+    git: str | None
+    machine: str
+    policy: dict[str, Any]
+    started: str
+    ended: str | None = None
+    stopped: str | None = None
+
+
+@dataclass(frozen=True)
+class RunHeader:
+    """`run.json`.
+
+    Attributes:
+        identity: What can change a result: it makes the run the one that it is.
+        split: Label of the split in all rows.
+        plans: What was asked for, each plan once.
+        status: `running`; or `complete` or, if something is missing or broke, `incomplete`.
+        planned: Rollouts that were asked for by all plans together.
+        counts: Rows by status.
+        merged: Names of the folders that a joined run is made of.
+    """
+
+    format_version: int
+    identity: dict[str, Any]
+    split: str
+    plans: tuple[Plan, ...] = ()
+    status: str = "running"
+    planned: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    starts: tuple[Start, ...] = ()
+    merged: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        planned = sum(plan.most for plan in self.plans)
+        if planned > _MOST_ROLLOUTS:
+            raise FormatError(f"plans of {planned} rollouts; expected at most {_MOST_ROLLOUTS}")
+
+    @property
+    def items(self) -> tuple[WorkItem, ...]:
+        """All rollouts that were asked for, each once, in canonical order."""
+        return tuple(sorted({item for plan in self.plans for item in plan.items()}))
+
+    def standing(self, rows: Mapping[WorkItem, Rollout], status: str = "") -> "RunHeader":
+        """Return the header with how the folder stands, over all of its plans."""
+        items = self.items
+        whole = all(item in rows and is_done(rows[item]) for item in items)
+        status = status or ("complete" if whole else "incomplete")
+        counts = count_statuses(rows.values())
+        return replace(self, status=status, planned=len(items), counts=counts)
+
+
+class RunLog:
+    """A run's folder that is written, see `open_log`.
+
+    Attributes:
+        rows: The row that counts of each rollout, as of the opening, and of the end once that is
+            written: rows between are on the disk, and not in memory.
+    """
+
+    def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
+        self.folder, self.header, self.rows = folder, header, rows
+
+    def begin(self, start: Start) -> None:
+        """Note a start of the command."""
+        plans = self.header.plans
+        plans += () if start.plan in plans else (start.plan,)
+        header = replace(self.header, plans=plans, starts=(*self.header.starts, start))
+        self._write_header(header.standing(self.rows, "running"))
+
+    def append(self, row: Rollout, trace: str | None = None) -> None:
+        """Write a row, and where it broke; when this returns, the row is on the disk.
+
+        Raises:
+            OSError: The file cannot be written; it is named.
+        """
+        path = self.folder / RUN_RECORD
+        try:
+            with path.open("ab") as file:
+                file.write(_line(row))
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:  # from writing, it names no file
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        if trace:
+            log = self.folder / ERRORS_LOG
+            with log.open("a", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(f"{row.finished_at} {WorkItem.of(row)}, attempt {row.attempt}\n")
+                file.write(f"{trace.rstrip()}\n\n")
+
+    def write_all(self, rows: Iterable[Rollout]) -> None:
+        """Write all rows anew, whole or not at all."""
+        with atomic_path(self.folder / RUN_RECORD) as partial:
+            partial.write_bytes(b"".join(map(_line, rows)))
+
+    def end(self, header: RunHeader) -> None:
+        """Export the tables, in canonical order, and write a header with how the folder stands."""
+        # As they are on the disk: Ctrl-C may have come between a row's writing and its counting.
+        self.rows = dict(sorted(read_record(self.folder).items()))
+        table = to_table(self.rows.values(), arrow_schema(Rollout))
+        parquet, text = (self.folder / name for name in RUN_TABLES)
+        with writing(parquet) as file:
+            pq.write_table(table, file, compression="zstd")
+        with writing(text) as file:
+            pa_csv.write_csv(table, file)
+        self._write_header(header.standing(self.rows))
+
+    def _write_header(self, header: RunHeader) -> None:
+        write_json(self.folder / RUN_HEADER, to_dict(header))
+        self.header = header
+
+
+@contextmanager
+def open_log(
+    folder: Path, identity: Mapping[str, Any], split: str, *, resume: bool = True
+) -> Iterator[RunLog]:
+    """Open or make the folder of a run, and hold it.
+
+    Args:
+        folder: The folder.
+        identity: What makes the run the one that it is, as plain values.
+        split: Label of the split in rows; a run that is there keeps its own.
+        resume: Whether a run that is there may be gone on with.
+
+    Raises:
+        RunFolderError: The folder holds another run or something else, is being written by
+            another process, or may not be resumed.
+        MissingFileError: The record is gone.
+        FormatError: Its files are damaged or of another format version.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    if there == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:
+        there = []  # a full disk, or a kill, came before the header
+    if there and RUN_HEADER not in there:
+        raise RunFolderError(
+            f"{folder} holds other files ({', '.join(there[:3])}) and no {RUN_HEADER}",
+            "Give a new folder to --out.",
+        )
+    busy = RunFolderError(
+        f"another process is writing {folder}", "Wait for it to end, or give another --out."
+    )
+    with hold(folder / ".lock", busy):
+        if not there:
+            (folder / RUN_RECORD).touch()
+            header = RunHeader(FORMAT_VERSION, dict(identity), split)
+            write_json(folder / RUN_HEADER, to_dict(header))
+        elif not resume:
+            raise RunFolderError(
+                f"{folder} holds a run already", "Give another --out, or leave out --no-resume."
+            )
+        header, rows = read_run(folder)
+        check_same_run(folder, header.identity, identity)
+        os.truncate(folder / RUN_RECORD, len(whole_lines(folder / RUN_RECORD)))
+        yield RunLog(folder, header, rows)
+
+
+def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
+    """Read a run: its header, standing as its record says, and its rows.
+
+    Raises:
+        RunFolderError: The folder holds no run, or its record is gone.
+        FormatError: Its files are damaged or of another format version.
+    """
+    for name in (RUN_HEADER, RUN_RECORD):
+        if not (folder / name).is_file():
+            raise RunFolderError(
+                f"{folder} holds no run: {name} is missing",
+                "Give a folder that robomme-interference evaluate wrote, all of it.",
+            )
+    header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
+    return header.standing(rows), rows
+
+
+def read_record(folder: Path) -> dict[WorkItem, Rollout]:
+    """Read a run's record: the row that counts of each rollout; empty where there is none.
+
+    Raises:
+        FormatError: A line is damaged, or a finished rollout has two rows.
+    """
+    path = folder / RUN_RECORD
+    rows: dict[WorkItem, Rollout] = {}
+    if not path.exists():
+        return rows
+    for number, line in enumerate(whole_lines(path).splitlines(), 1):
+        try:
+            row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
+            if b"\\u" in line:  # half of a character, which no table can hold
+                canonical_json(to_dict(row)).encode()
+            item = WorkItem.of(row)
+            if item in rows and is_done(rows[item]):
+                raise ValueError(f"it is a second one of {item}")
+            if row.video not in (None, clip_name(item)):  # which would be read and written there
+                raise ValueError(f"video {row.video!r}; expected {clip_name(item)} or null")
+        except ValueError as error:
+            raise FormatError(
+                f"{path}, line {number} is no row of a rollout: {first_line(error)}",
+                "Remove the line to run that rollout again.",
+            ) from None
+        rows[item] = row
+    return rows
+
+
+def rows_that_count(rollout: NDArray[np.int64], broke: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the numbers of a record's rows that count, as `read_record` has it.
+
+    Of a rollout that is finished twice both are among them: whoever asks refuses that.
+
+    Args:
+        rollout: A number for the rollout that each row is of, `(N,)`.
+        broke: Whether it broke, `(N,)`.
+    """
+    _, last = np.unique(rollout[::-1], return_index=True)
+    count = ~broke
+    count[len(rollout) - 1 - last] = True
+    return np.flatnonzero(count)
+
+
+def whole_lines(record: Path) -> bytes:
+    """Return a record's bytes, without a last line that a crash cut short."""
+    data = read_bytes(record, MOST_BYTES)
+    return data[: data.rfind(b"\n") + 1]
+
+
+def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Check that a folder's run is the one that is wanted, by their identities.
+
+    Raises:
+        RunFolderError: It is another; names every difference.
+    """
+    there, here = _flat(found), _flat(wanted)
+    told = [
+        f"{name} is {there.get(name, 'unknown')} there, {here.get(name, 'unknown')} here"
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
+    ]
+    if told:
+        raise RunFolderError(
+            f"{folder} holds another run: {'; '.join(told)}",
+            f"Give another --out, or the settings of the run that is there (see {RUN_HEADER}).",
+        )
+
+
+def is_done(row: Rollout) -> bool:
+    """Tell whether a rollout need not be run again: all but errors."""
+    return row.status != Status.ERROR
+
+
+def count_statuses(rows: Iterable[Rollout]) -> dict[str, int]:
+    """Count rows by status."""
+    counts = Counter(row.status for row in rows)
+    return {str(status): counts[status] for status in FINAL}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return values as text, those of inner maps under names such as `policy_metadata.sha256`."""
+    flat: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = repr(value)
+    return flat
+
+
+def _line(row: Rollout) -> bytes:
+    return (canonical_json(to_dict(row)) + "\n").encode()

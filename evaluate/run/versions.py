@@ -1,0 +1,27 @@
+"""What of the packages that a run uses is installed."""
+
+import platform
+from importlib import metadata
+
+from .config import AskConfig, RunConfig
+
+
+def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
+    """Return the versions of Python and of what a run uses, by name; what is missing is left out.
+
+    RoboMME's interpreter has others: see `simulator_versions`.
+    """
+    names = ["robomme-interference-data", "numpy", "av", "torch"]
+    if isinstance(config, RunConfig) and config.policy.startswith("lerobot:"):
+        names.append("lerobot")
+    if config.retrieval is not None:
+        names.append("transformers")
+    if config.simulator == "tabletop":
+        names += ["mani-skill", "sapien"]
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,284 @@
+"""Two runs, or two conditions of one, paired over the episodes that both have."""
+
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.evaluate.score import Grid, power
+from robomme_interference_data.evaluate.score.outcomes import Cube, cubes_of
+from robomme_interference_data.evaluate.score.rows.checked import Rows, read_rows
+from robomme_interference_data.evaluate.score.rows.values import unshifted
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.viz.tables import Table, percent
+
+from .pairs import COLUMNS, Pairs, how_to_read, pair, tested
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A paired comparison of two runs.
+
+    Attributes:
+        table: A row per condition, or for the two that are compared, then the same by family.
+        notes: What a reader must know: that revisions differ, how many episodes flip between two
+            runs of one system, what only one of the runs holds.
+        runs: The rows of the runs.
+    """
+
+    table: Table
+    notes: tuple[str, ...]
+    runs: tuple[Rows, ...]
+
+
+def compare(
+    first: Path,
+    second: Path | None = None,
+    systems: tuple[str | None, str | None] = (None, None),
+    lenient: bool = False,
+    conditions: Sequence[str] = (),
+) -> Comparison:
+    """Compare two runs of one simulator over the conditions and episodes that both have.
+
+    A system that both runs hold is compared with itself, as a repeat is. If they hold none in
+    common and one each, these two are compared, as a system with and without retrieval are. Runs
+    under different shifts are compared as well: their scenes are the same.
+
+    Args:
+        first: Folder or file of rows.
+        second: The other one. Differences are its rate − the first's. None compares two
+            conditions of the first.
+        systems: Names of the systems of rows that name none.
+        lenient: Leave bad rows out, and count them.
+        conditions: The condition of the first and that of the second; none compares each
+            condition with itself.
+
+    Raises:
+        InvalidOptionError: They have no simulator, system, condition or episode in common, or
+            there is nothing to compare a single run with.
+        BadRowsError: Rows are bad.
+    """
+    if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
+        raise InvalidOptionError(
+            f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
+            "ones, or two runs",
+            f"To set k7 against k0 of one run: compare {first} --conditions k0 k7",
+        )
+    for name in conditions:
+        parse_condition(name)
+    if second is not None and first.exists() and second.exists() and first.samefile(second):
+        raise InvalidOptionError(
+            f"{first} is given twice",
+            f"To set two conditions of it against each other: compare {first} --conditions k0 k7",
+        )
+    one = read_rows([first], systems[0], lenient)
+    other = one if second is None else read_rows([second], systems[1], lenient)
+    _check_scenes(one, other)
+    sides = [_sides(rows) for rows in (one, other)]
+    met = list(_met((one, other), sides))
+    notes, own = list(_differing(one, other, met)), list[tuple[str, ...]]()
+    found = list[tuple[Pairs, Hashable, bool]]()
+    for a, b in met:
+        common = _asked(a, b, conditions)
+        pairs = {(part, two): _pairs(a, b, two, part) for part in ("", *FAMILIES) for two in common}
+        for (part, two), here in pairs.items():
+            if here.n:
+                own.append((a.cube.simulator, a.system, b.system, part or "all", *two))
+                complete = a.complete(two[0]) and b.complete(two[1])
+                found.append((here, (a.cube.simulator, bool(part)), complete))
+        if a.repeats(b, one, other) and not conditions:
+            notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in common})
+    if not found:
+        runs = " and ".join(str(path) for path in (first, second) if path)
+        under = " and ".join(conditions) or "a common condition"
+        there = [
+            "; ".join(f"{b.system}: {', '.join(b.conditions)}" for b in one.values())
+            for one in sides
+        ]
+        raise InvalidOptionError(
+            f"no episode of {runs} counts on both sides under {under}",
+            f"There are {' and '.join(dict.fromkeys(there))}. Compare the same episodes.",
+        )
+    notes += _left_out("a", sides[0].values(), dict(met), conditions)
+    notes += _left_out("b", sides[1].values(), {b: a for a, b in met}, conditions[::-1])
+    table = Table.make(
+        "compare",
+        "Two runs compared" if second else "Two conditions compared",
+        "simulator system_a system_b family condition_a condition_b n:count rate_a:rate "
+        f"rate_b:rate difference:points {COLUMNS} complete:flag",
+        (
+            (*names, pairs.n, pairs.first, pairs.second, *test, complete)
+            for names, (pairs, _, complete), test in zip(own, found, tested(found), strict=True)
+        ),
+        f"a: {first}; b: {second or first}. Over the n episodes that count in both; the difference "
+        "is b − a, gained and lost are from a to b. "
+        + how_to_read(found, "the rows of all families, and those of single ones, of a simulator")
+        + power.note(one[0] for one, names in zip(found, own, strict=True) if "all" in names),
+    )
+    return Comparison(table, tuple(notes), (one,) if other is one else (one, other))
+
+
+def _asked(a: "_Side", b: "_Side", conditions: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the condition of each side in every comparison of two systems."""
+    if conditions:
+        one, other = conditions
+        return [(one, other)] if one in a.conditions and other in b.conditions else []
+    return [(c, c) for c in a.conditions if c in b.conditions]
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """One system in one simulator of a run."""
+
+    cube: Cube
+    system: str
+
+    @property
+    def conditions(self) -> list[str]:
+        return self.cube.ran(self.system)
+
+    def complete(self, condition: str) -> bool:
+        return bool(self.cube.complete[self.cube.cell(self.system, condition)])
+
+    def repeats(self, other: "_Side", rows: Rows, others: Rows) -> bool:
+        """Whether another run's side is the same system, in the same scenes and histories."""
+        name = self.cube.simulator
+        same = (self.system, name) == (other.system, other.cube.simulator)
+        return same and rows.revisions.get(name) == others.revisions.get(name)
+
+    def counted(self, condition: str) -> set[EpisodeId]:
+        if condition not in self.conditions:
+            return set()
+        return {*self.cube.chosen(self.cube.counted[self.cube.cell(self.system, condition)])}
+
+
+_Sides = dict[tuple[str, str], _Side]
+
+
+def _sides(rows: Rows) -> _Sides:
+    """Return the systems of a run by simulator and name, in the order of tables."""
+    cubes = cubes_of(rows, Grid.GIVEN).values()
+    return {
+        (cube.simulator, system): _Side(cube, system) for cube in cubes for system in cube.systems
+    }
+
+
+def _met(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side, _Side]]:
+    """Yield what is compared, simulator by simulator, in the order of tables."""
+    simulators, systems = ([rows.names(name) for rows in runs] for name in ("simulator", "system"))
+    shared = {name: name for name in simulators[0] if name in simulators[1]}
+    plain = [{unshifted(name): name for name in names} for names in simulators]
+    # The same simulator, under a shift in one run and under another, or none, in the other.
+    shared = shared or {plain[0][name]: plain[1][name] for name in plain[0] if name in plain[1]}
+    if not shared:
+        raise InvalidOptionError(
+            f"the rows are of different simulators: {' and '.join(map(', '.join, simulators))}",
+            "Only rows of one simulator can be compared.",
+        )
+    common = {system: system for system in systems[0] if system in systems[1]}
+    if not common and max(map(len, systems)) > 1:
+        raise InvalidOptionError(
+            f"no system is in both: {' and '.join(map(', '.join, systems))}",
+            "Compare runs of the same systems, or of one system each.",
+        )
+    partners = common or dict(zip(*systems, strict=True))
+    for (simulator, system), a in sides[0].items():
+        if b := sides[1].get((shared.get(simulator, ""), partners.get(system, ""))):
+            yield a, b
+
+
+def _check_scenes(one: Rows, other: Rows) -> None:
+    """Check that the two runs' scenes are the same: an episode's seed is one."""
+    names = ("simulator", "family", "episode_split", "episode", "seed")
+    known, found = (
+        {
+            (unshifted(row[0]), *row[1:-1]): row[-1]
+            for row in zip(*map(rows.list, names), strict=True)
+            if row[-1] is not None
+        }
+        for rows in (one, other)
+    )
+    for key, seed in known.items():
+        if found.get(key, seed) != seed:
+            raise InvalidOptionError(
+                f"{'/'.join(map(str, key[1:]))} has the seed {seed} in one run and {found[key]} in "
+                "the other",
+                "Different scenes cannot be paired: compare runs over the same episodes.",
+            )
+
+
+def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pairs:
+    """Compare two sides, each under its condition, over shared episodes, all or a family's."""
+    places = [{one: at for at, one in enumerate(side.cube.episodes)} for side in (a, b)]
+    shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
+    first, second = (
+        side.cube.status[side.cube.cell(side.system, condition)][[at[one] for one in shared]]
+        for side, condition, at in zip((a, b), conditions, places, strict=True)
+    )
+    # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
+    seeds = a.cube.model_seeds, b.cube.model_seeds
+    matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]
+    matched = matched or [(place, place) for place in range(min(map(len, seeds)))]
+    return pair(first, second, matched)
+
+
+def _differing(one: Rows, other: Rows, met: Iterable[tuple[_Side, _Side]]) -> Iterator[str]:
+    names = dict.fromkeys((a.cube.simulator, b.cube.simulator) for a, b in met)
+    for two in names:
+        if two[0] != two[1]:
+            yield (
+                f"a is of {two[0]} and b of {two[1]}: the scenes are the same, and the difference "
+                "is what the shift costs."
+            )
+        revisions = [rows.revisions.get(name) for rows, name in zip((one, other), two, strict=True)]
+        if revisions[0] == revisions[1]:
+            continue
+        if None in revisions:
+            yield (
+                f"Only one of the runs names the revision of its split of {two[0]}: the "
+                "histories may differ."
+            )
+        else:
+            yield (
+                f"The rows of {two[0]} are of different splits (revisions {revisions[0]} and "
+                f"{revisions[1]}): the histories differ."
+            )
+
+
+def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
+    """Say how many episodes flip between two runs of the same system: the noise floor."""
+    shares = []
+    for condition, here in pairs.items():
+        if here.pairs:
+            low, high = wilson(here.gained + here.lost, here.pairs)
+            shares.append(
+                f"{condition} {percent(here.flips)} of {here.pairs} "
+                f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
+            )
+    other = "other" if set(a.cube.model_seeds).isdisjoint(b.cube.model_seeds) else "the same"
+    note = (
+        f"{a.system} ran in both, with {other} model seeds, in {a.cube.simulator}. If nothing else "
+        "differs, this share of episodes flips by itself, which is the noise floor: "
+        f"{', '.join(shares)}."
+    )
+    return [note] if shares else []
+
+
+def _left_out(
+    name: str, sides: Iterable[_Side], met: Mapping[_Side, _Side], conditions: Sequence[str]
+) -> list[str]:
+    """Say what one run has and the comparison leaves out, nothing if that is nothing.
+
+    `conditions` are this run's and the other's, or none where each is compared with itself.
+    """
+    parts = []
+    for side in sides:
+        other = met[side].counted if side in met else (lambda condition: set())
+        own = [tuple(conditions)] if conditions else [(c, c) for c in side.conditions]
+        counts = {c: len(side.counted(c) - other(there)) for c, there in own}
+        if lone := ", ".join(f"{c} ({count:,})" for c, count in counts.items() if count):
+            parts.append(f"{side.system} in {side.cube.simulator}, {lone}")
+    return [f"Only in {name}, and left out (episodes): {'; '.join(parts)}."] if parts else []

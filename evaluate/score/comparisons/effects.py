@@ -1,0 +1,173 @@
+"""What conditions do to a system: lift, decay, retention, kinds of interference, and noise.
+
+All comparisons are paired: they use the episodes that count under both conditions, and the
+episode is what is drawn in the bootstrap.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.evaluate.score.outcomes import Cube, counting, success
+from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
+from robomme_interference_data.stats.bootstrap import (
+    LEAST,
+    Floats,
+    Interval,
+    bootstrap,
+    enough,
+    slope_weights,
+)
+from robomme_interference_data.stats.intervals import fieller, wilson
+from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.viz.tables import Table
+
+from .contrasts import START, Contrast, asked
+from .pairs import pair
+
+
+def effects_of(
+    cube: Cube, system: str, base: str | None, ceiling: str | None, draws: int
+) -> tuple[list[Contrast], list[tuple[Any, ...]]]:
+    """Compare a system's conditions with each other, all intervals from the same draws.
+
+    Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as `QUESTIONS` has
+    it, and under each condition a system with retrieval with the one without, and any with the
+    ceiling of its memory.
+
+    Args:
+        cube: What came of the rollouts.
+        system: Name of the system.
+        base: For a system with retrieval the one without: its `no-history` is both systems'. None
+            if the two are not paired.
+        ceiling: The ideal observer with the same memory (see `access.ceiling_of`), or None.
+        draws: Bootstrap samples.
+
+    Returns:
+        The comparisons, and the row of `decay_table`, if there are at least two `k<n>`.
+    """
+    cells = [(name, c) for name in (system, base, ceiling) if name for c in cube.ran(name)]
+    at = {cell: place for place, cell in enumerate(cells)}
+    here = np.logical_or.reduce([cube.there[cube.systems.index(n)] for n in (system, base) if n])
+    sides = [cube.status[cube.cell(*cell)][here] for cell in cells]
+    values = np.stack([success(side) for side in sides], axis=1)
+    complete = [bool(cube.complete[cube.cell(*cell)]) for cell in cells]
+
+    own = cube.ran(system)
+    ks = [c for c in own if parse_condition(c).kind.name == "k"]
+    later = [c for c in ks if c != START] if START in ks else []
+    floors = ((name, NO_HISTORY) for name in (system, base) if name)
+    floor = next((one for one in floors if one in at), None)
+    compared = {(c, floor): "lift" for c in ks if floor}
+    compared |= {(c, (system, START)): "effects" for c in later}
+    compared |= {(c, (base, c)): "effects" for c in own if base and (base, c) in at}
+    compared |= {(c, (base, START)): "equivalence" for c in later if base and (base, START) in at}
+    compared |= {(c, there): "interference" for c, there in asked(system, own, floor)}
+    compared |= {(c, (ceiling, c)): "ceiling" for c in own if ceiling and (ceiling, c) in at}
+    pairs = {(c, there): pair(sides[at[there]], sides[at[system, c]]) for c, there in compared}
+    # A lift that is not above zero beyond doubt is nothing to have a share of.
+    lift = pairs.get((START, floor)) if floor else None
+    kept = {}
+    if floor and lift and lift.change.value > 0 and lift.p < SURE:
+        for c in later:
+            three = _together(values, (at[floor], at[system, START], at[system, c]))
+            none, start = pairs[c, floor], pairs[c, (system, START)]
+            kept[c, floor] = (retained(three, none.change, start.change), len(three))
+    contrasts = [
+        Contrast(
+            *(cube.simulator, system, c, there, table, pairs[c, there]),
+            complete[at[there]] and complete[at[system, c]],
+            *kept.get((c, there), ()),
+        )
+        for (c, there), table in compared.items()
+    ]
+    decays = []
+    if len(ks) > 1:
+        falling = [at[system, c] for c in ks]
+        each = values[:, falling] @ slope_weights([parse_condition(c).k for c in ks])
+        [fall] = bootstrap(each[:, None], cube.simulator, draws)
+        changing = each[~np.isnan(each)]
+        known = fall if enough(changing) else Interval(fall.value)
+        whole = all(complete[place] for place in falling)
+        decays.append((cube.simulator, system, " ".join(ks), len(changing), *known, whole))
+    return contrasts, decays
+
+
+def _together(values: Floats, places: Sequence[int]) -> Floats:
+    """Return some columns, of the episodes that count in all of them."""
+    chosen = values[:, list(places)]
+    return chosen[~np.isnan(chosen).any(axis=1)]
+
+
+def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
+    """Return the share of the lift at k0 that is left, with Fieller's interval.
+
+    Where the condition equals no-history, or k0, in every episode, the ratio is 0, or 1, without
+    any spread: there the interval is that of the lift, or of the fall, divided by the lift at k0.
+
+    Args:
+        values: Success under no-history, k0 and the condition, `(E, 3) float64`.
+        lift: The condition's change from no-history.
+        fall: Its change from k0.
+    """
+    none, start, end = values.T
+    whole, share = (start - none), (end - none)
+    if not len(values) or whole.mean() <= 0:
+        return Interval(math.nan)
+    ratio = float(share.mean() / whole.mean())
+    for sure, other, change in ((0.0, none, lift), (1.0, start, fall)):
+        if (end == other).all():
+            return Interval(sure, *(sure + bound / float(whole.mean()) for bound in change[1:]))
+    if len(values) < 2:
+        return Interval(ratio)
+    spread = np.cov(share, whole) / len(values)
+    bounds = fieller(
+        *(float(share.mean()), float(whole.mean())),
+        (float(spread[0, 0]), float(spread[1, 1])),
+        float(spread[0, 1]),
+    )
+    return Interval(ratio, *bounds)
+
+
+# --- tables ------------------------------------------------------------------------------------
+
+
+def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:
+    """Return each system's log-linear decay over the sessions in the buffer (see `effects_of`)."""
+    return Table.make(
+        "decay",
+        "Decay over sessions",
+        "simulator system conditions n:count slope:points low:points high:points complete:flag",
+        rows,
+        "slope: change of the success rate with each doubling of the sessions in the buffer, the "
+        "lesson included: the least-squares line over log2(k + 1). 95% BCa bootstrap interval, "
+        f"clustered by episode, where at least {LEAST} episodes add to the slope.",
+    )
+
+
+def noise_table(cubes: Iterable[Cube]) -> Table:
+    """Return how often two repeats of the same rollout disagree, where there are repeats."""
+    rows = []
+    for cube in cubes:
+        for s, c in np.argwhere(cube.has_rows).tolist():
+            status = cube.status[s, c]
+            counts = counting(status)
+            order = counts.cumsum(axis=-1) * counts  # 1 for the lowest model seed that counts, …
+            repeated = (order == 2).any(axis=-1)
+            if pairs := int(repeated.sum()):
+                one, other = (((order == n) & (status == 0)).any(axis=-1) for n in (1, 2))
+                flips = int((one != other)[repeated].sum())
+                cell = (cube.simulator, cube.systems[s], cube.conditions[c])
+                rows.append((*cell, pairs, flips, flips / pairs, *wilson(flips, pairs)))
+    return Table.make(
+        "noise",
+        "Flips between repeats",
+        "simulator system condition pairs:count flips:count rate:rate low:rate high:rate",
+        rows,
+        "Repeats differ in the model seed alone; in each episode the two lowest that count are "
+        "compared. A share of flips between conditions (flips in the tables of effects) that is "
+        "not above this rate is noise. A flip rate is gross, a difference is net, gained less "
+        "lost: one that is smaller than this rate can still be real, and p tells.",
+    )

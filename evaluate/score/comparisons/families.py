@@ -1,0 +1,188 @@
+"""Comparisons family by family, whether families differ, and what is said beyond these nine."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.evaluate.score.outcomes import Cube, success
+from robomme_interference_data.stats.bootstrap import LEAST, Floats, enough, generator_of
+from robomme_interference_data.viz.tables import Provisional, Table
+
+from .contrasts import Contrast
+from .pairs import (
+    COLUMNS,
+    corrected,
+    how_to_read,
+    pair,
+    tested,
+)
+
+DRAWS = 2000
+"""Permutations, and draws of families and episodes."""
+
+_CHUNK = 2**18  # numbers that are dealt out at a time
+
+_TABLES = ("lift", "effects", "interference")
+
+
+def family_effects_table(cubes: Iterable[Cube], contrasts: Sequence[Contrast]) -> Table:
+    """Return each comparison of conditions in each family."""
+    own, tests = [], []
+    for cube in cubes:
+        parts = {name: cube.of_family(name) for name in FAMILIES}
+        for one in _of(cube, contrasts):
+            cells = [cube.cell(*one.against), cube.cell(one.system, one.condition)]
+            for name, here in parts.items():
+                pairs = pair(*(cube.status[cell][here] for cell in cells))
+                if pairs.n:
+                    whole = not any((cube.missing | cube.other)[c][here].any() for c in cells)
+                    names = (cube.simulator, one.system, one.condition, *one.against, name)
+                    own.append((*names, pairs.n, pairs.second, pairs.first))
+                    tests.append((pairs, cube.simulator, whole))
+    rows = (
+        (*names, *test, complete)
+        for names, test, (_, _, complete) in zip(own, tested(tests), tests, strict=True)
+    )
+    return Table.make(
+        "family_effects",
+        "Effects by family",
+        "simulator system condition against_system against_condition family n:count rate:rate "
+        f"against_rate:rate difference:points {COLUMNS} complete:flag",
+        rows,
+        "The lifts, effects and kinds of interference of the tables of those names, in each family "
+        "alone, over the n episodes that count on both sides. "
+        + how_to_read(tests, "the tests of this table in one simulator"),
+    )
+
+
+def families_table(cubes: Iterable[Cube], contrasts: Sequence[Contrast]) -> Table:
+    """Return each comparison with families weighing alike, and whether it differs over them."""
+    rows = []
+    for cube in cubes:
+        found = _of(cube, contrasts)
+        labels = np.array([FAMILIES.index(one.family) for one in cube.episodes])
+        values = [
+            success(cube.status[cube.cell(one.system, one.condition)])
+            - success(cube.status[cube.cell(*one.against)])
+            for one in found
+        ]
+        shown = [n for n, one in enumerate(values) if len({*labels[~np.isnan(one)].tolist()}) > 1]
+        if not shown:
+            continue
+        numbers = over_families(
+            np.stack([values[n] for n in shown], axis=1), labels, cube.simulator
+        )
+        holms = corrected([float(p) for *_, p in numbers], [0] * len(shown))
+        for n, (*told, p), p_holm in zip(shown, numbers, holms, strict=True):
+            one, known = found[n], ~np.isnan(values[n])
+            ps = [q if one.complete else Provisional(q) for q in (p, p_holm)]
+            counts = (int(known.sum()), len({*labels[known].tolist()}))
+            names = (cube.simulator, one.system, one.condition, *one.against)
+            rows.append((*names, *counts, one.pairs.change.value, *told, *ps, one.complete))
+    return Table.make(
+        "families",
+        "Effects over families",
+        "simulator system condition against_system against_condition n:count families:count "
+        "difference:points alike:points alike_low:points alike_high:points sample_low:points "
+        "sample_high:points p_families:p p_families_holm:p complete:flag",
+        rows,
+        "difference: over all episodes, as in the other tables and the headline, which speak of "
+        "these families as they are. alike: the mean of the families' own differences. alike_low "
+        "to alike_high: 95% bootstrap interval of it for these families, episodes drawn within "
+        "each. sample_low to sample_high: the same where families are drawn too, as a sample of "
+        "such families: what holds for tasks beyond these, and much wider; of so few families "
+        f"still too narrow. Both from {DRAWS:,} draws, where at least {LEAST} episodes differ. "
+        "p_families: whether the difference is another one in other families, by a permutation "
+        f"test of {DRAWS:,} draws; p_families_holm: corrected by Holm's method within a simulator.",
+    )
+
+
+def _of(cube: Cube, contrasts: Iterable[Contrast]) -> list[Contrast]:
+    return [one for one in contrasts if one.simulator == cube.simulator and one.table in _TABLES]
+
+
+def over_families(
+    values: Floats, labels: NDArray[np.int64], key: str, draws: int = DRAWS
+) -> list[tuple[float, ...]]:
+    """Return what families have in common and what not, of several comparisons.
+
+    The permutation test: with the sum Sᶠ of a family's nᶠ differences, Σ Sᶠ² / nᶠ is the larger the
+    more families differ; p is the share of the draws that deal the episodes out to the families
+    anew and reach the observed value, itself counted as one of them. Families and episodes that are
+    not known take no part in any draw.
+
+    Source: Davison and Hinkley (1997), Bootstrap Methods and their Application, sections 3.8 (draws
+    of clusters, then within them) and 4.3 (permutations).
+
+    Args:
+        values: Second − first of each episode, NaN where not both count, `(E, K) float64`.
+        labels: Number of each episode's family, `(E,) int64`.
+        key: Text that seeds the draws.
+        draws: Their number.
+
+    Returns:
+        Of each comparison: the mean of the families' means; its 95% interval for these families,
+        and for a sample of such families, NaN where fewer than ten episodes differ; p.
+    """
+    masks, place = np.unique(~np.isnan(values), axis=1, return_inverse=True)
+    found: list[tuple[float, ...]] = [()] * values.shape[1]
+    # Most comparisons lack the same episodes, mostly none: each set of them is drawn from once.
+    for at, known in enumerate(masks.T):
+        mine = np.flatnonzero(place == at)
+        told = _over(values[np.ix_(known, mine)], labels[known], key, draws)
+        for column, one in zip(mine.tolist(), told, strict=True):
+            found[column] = one
+    return found
+
+
+def _over(
+    values: Floats, labels: NDArray[np.int64], key: str, draws: int
+) -> Iterator[tuple[float, ...]]:
+    """Yield what `over_families` returns, of values without a hole."""
+    order = np.argsort(labels, kind="stable")
+    labels, values = labels[order], values[order]
+    starts = np.flatnonzero(np.diff(labels, prepend=-1))
+    sizes = np.diff(starts, append=len(labels))[:, None]
+    generator = generator_of(f"{key}, families")
+
+    def spread(deals: NDArray[np.int64]) -> Floats:
+        sums = np.add.reduceat(values[deals], starts, axis=1)
+        return np.asarray((sums * sums / sizes).sum(axis=1).round(9))
+
+    every = np.arange(len(values))[None]
+    observed, step = spread(every), max(1, _CHUNK // values.size)
+    reached = sum(
+        (spread(generator.permuted(every.repeat(size, 0), axis=1)) >= observed).sum(axis=0)
+        for size in (min(step, draws - at) for at in range(0, draws, step))
+    )
+    p = (1 + np.asarray(reached)) / (1 + draws)
+
+    alike = (np.add.reduceat(values, starts, axis=0) / sizes).mean(axis=0)
+    taken = generator.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), draws)
+    parts, intervals = np.split(values, starts[1:]), []
+    for often in (np.ones_like(taken), taken):
+        drawn = sum(_resampled(part, often[:, n], generator) for n, part in enumerate(parts))
+        intervals.append(np.quantile(drawn / len(starts), (0.025, 0.975), axis=0))
+    for n, column in enumerate(values.T):
+        bounds = np.concatenate(intervals)[:, n].tolist()
+        yield (
+            float(alike[n]),
+            *(bounds if enough(column) else [math.nan] * len(bounds)),
+            float(p[n]),
+        )
+
+
+def _resampled(values: Floats, often: NDArray[np.int64], generator: np.random.Generator) -> Floats:
+    """Return the sums of so many resampled means of a family's episodes, `(D, K)`.
+
+    Args:
+        values: Of the family, `(N, K) float64`; equal rows are drawn together.
+        often: How many means each draw adds up, `(D,) int64`.
+        generator: Random numbers.
+    """
+    rows, counts = np.unique(values, axis=0, return_counts=True)
+    drawn = generator.multinomial(often * len(values), counts / len(values))
+    return np.asarray(drawn @ rows / len(values))

@@ -1,0 +1,96 @@
+"""Does one system fall more than another: the difference of their differences, paired."""
+
+import numpy as np
+
+from robomme_interference_data.evaluate.score.outcomes import Cube, Flags, Statuses, success
+from robomme_interference_data.evaluate.systems import base_of, is_bound
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.stats.bootstrap import Interval
+from robomme_interference_data.stats.intervals import combined
+from robomme_interference_data.stats.significance import sign_flip
+
+from .contrasts import START, Contrast
+from .pairs import NO_PAIRS, Pairs, pair
+from .ranks import ranked, to_best
+
+
+def interactions_of(cube: Cube) -> list[Contrast]:
+    """Compare the change of systems from k0 with that of the best at k0, and of their base.
+
+    The change is to the most sessions under which both have rows. Systems whose histories may
+    differ are left out, and so are bounds.
+    """
+    leader = _leader(cube)
+    found = []
+    for system in cube.systems:
+        if is_bound(system):
+            continue
+        others = dict.fromkeys(one for one in (leader, base_of(system)) if one and one != system)
+        for other in others:
+            if other in cube.systems and cube.pairable(system, other):
+                found += _contrasts(cube, system, other)
+    return found
+
+
+def _leader(cube: Cube) -> str | None:
+    """Return the system that leads at k0, None where no cell there is complete."""
+    systems = dict(ranked(cube)).get(START)
+    if not systems:
+        return None
+    every: Flags = np.ones(len(cube.episodes), bool)
+    compared = to_best(cube, START, systems, every)
+    return next(system for system, pairs in compared.items() if pairs is None)
+
+
+def _contrasts(cube: Cube, system: str, other: str) -> list[Contrast]:
+    common = [parse_condition(c) for c in cube.ran(system) if c in cube.ran(other)]
+    ks = sorted(one.k for one in common if one.kind.name == "k")
+    if len(ks) < 2 or ks[0]:
+        return []
+    last = next(one.name for one in common if one.kind.name == "k" and one.k == ks[-1])
+    places = [cube.cell(name, c) for name in (other, system) for c in (START, last)]
+    sides = np.stack([cube.status[place] for place in places])
+    pairs = changes(sides[:2], sides[2:])
+    complete = all(bool(cube.complete[place]) for place in places)
+    against = (other, last)
+    return [
+        Contrast(
+            *(cube.simulator, system, last, against, "interaction", pairs),
+            complete=complete,
+        )
+    ]
+
+
+def changes(first: Statuses, second: Statuses) -> Pairs:
+    """Compare the change of one side with that of another, over the episodes that count in all.
+
+    The interval is `combined` of both changes' own, with the correlation of the changes over
+    episodes; the test is the exact sign-flip test of the episodes' differences of differences.
+
+    Args:
+        first: Outcomes before and after of the first side, `(2, E, M) int8`.
+        second: Of the second side.
+
+    Returns:
+        `first`, `second` and `change` are the changes and their difference; `pairs` are episodes,
+        gained and lost those whose change is higher, or lower, on the second side.
+    """
+    values = success(np.stack([*first, *second]))
+    known = ~np.isnan(values).any(axis=0)
+    n = int(known.sum())
+    one, other = (pair(*(part[known] for part in side)) for side in (first, second))
+    if not n:
+        return NO_PAIRS
+    old, new = values[1, known] - values[0, known], values[3, known] - values[2, known]
+    spread = float(old.std() * new.std())
+    phi = float(((old - old.mean()) * (new - new.mean())).mean()) / spread if spread else 0.0
+    gap = round(other.change.value - one.change.value, 12)
+    change, within = (
+        Interval(gap, *combined(b.value, (b.low, b.high), a.value, (a.low, a.high), phi, 2.0))
+        for a, b in ((one.change, other.change), (one.within, other.within))
+    )
+    steps = (new - old).round(12)
+    counts = (n, int((steps > 0).sum()), int((steps < 0).sum()))
+    kind = other.interval if one.interval == other.interval else "clusters"
+    sides = (one.change.value, other.change.value)
+    return Pairs(n, *sides, change, within, kind, *counts, *sign_flip(steps))

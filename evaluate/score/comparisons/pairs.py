@@ -1,0 +1,202 @@
+"""Two sides of a comparison, paired over the episodes that count on both."""
+
+import math
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.evaluate.score.outcomes import Statuses, counting, success, trials
+from robomme_interference_data.stats.bootstrap import Floats, Interval
+from robomme_interference_data.stats.intervals import (
+    LEVEL,
+    combined,
+    newcombe,
+    newcombe_paired,
+    wilson,
+)
+from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
+from robomme_interference_data.viz.tables import Provisional
+
+COLUMNS = (
+    "low:points high:points interval pairs:count gained:count lost:count flips:rate "
+    "p:p p_mid:p p_holm:p"
+)
+"""Columns of a table of comparisons, after the difference (see `tested`)."""
+
+WITHIN = 0.90
+"""Level of the interval that lies within a margin where two one-sided tests at 5% say so."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Two sides, paired over the episodes that count on both.
+
+    Attributes:
+        n: Episodes that count on both sides; of unpaired sides the fewer.
+        first: Mean success over them on the first side.
+        second: The same on the second side.
+        change: `second` − `first` with its 95% interval.
+        within: The same with its 90% interval.
+        interval: Kind of these intervals: `newcombe` of single rollouts, `clusters` with repeats,
+            `unpaired`; empty without an episode.
+        pairs: Pairs of rollouts, one an episode: of the lowest model seed that counts on both
+            sides; none of unpaired sides.
+        gained: Pairs that succeed on the second side alone.
+        lost: Pairs that succeed on the first side alone.
+        p: Two-sided p-value of the exact sign-flip test on the episodes' means, which of single
+            rollouts is McNemar's; of unpaired sides that of two proportions. NaN without episodes.
+        p_mid: Its mid-p; NaN of unpaired sides.
+    """
+
+    n: int
+    first: float
+    second: float
+    change: Interval
+    within: Interval
+    interval: str
+    pairs: int
+    gained: int
+    lost: int
+    p: float
+    p_mid: float
+
+    @property
+    def flips(self) -> float:
+        """Share of the pairs whose outcome differs, NaN without pairs."""
+        return (self.gained + self.lost) / self.pairs if self.pairs else math.nan
+
+
+NO_PAIRS = Pairs(
+    *(0, math.nan, math.nan, Interval(math.nan), Interval(math.nan), "", 0, 0, 0),
+    *(math.nan, math.nan),
+)
+"""What comes of no episode."""
+
+
+def pair(
+    first: Statuses, second: Statuses, matched: Sequence[tuple[int, int]] | None = None
+) -> Pairs:
+    """Compare two sides over the same episodes.
+
+    Args:
+        first: Outcomes by episode and model seed, `(E, M) int8`.
+        second: The same of the second side, `(E, N) int8`.
+        matched: Places of model seeds that are paired, of the first and the second side, in the
+            order in which a pair is looked for; None for equal places.
+    """
+    before, after = success(first), success(second)
+    known = ~np.isnan(before + after)
+    before, after, first, second = before[known], after[known], first[known], second[known]
+    n = len(before)
+    if n == counting(first).sum() == counting(second).sum():
+        return _of_single(before, after)
+    change, within = (_clusters(first, second, level) for level in (LEVEL, WITHIN))
+    tests = sign_flip(after - before)
+    rate, other_rate = float(before.mean()), float(after.mean())
+    if matched is not None:
+        one, other = zip(*matched, strict=True)
+        first, second = first[:, one], second[:, other]
+    both = counting(first) & counting(second)
+    found = np.flatnonzero(both.any(-1))
+    seed = both[found].argmax(-1)
+    old, new = (side[found, seed] == 0 for side in (first, second))
+    gained, lost = int((new & ~old).sum()), int((old & ~new).sum())
+    counts = (len(found), gained, lost)
+    return Pairs(n, rate, other_rate, change, within, "clusters", *counts, *tests)
+
+
+def _of_single(before: Floats, after: Floats) -> Pairs:
+    """Compare single rollouts, success 0 or 1 in each episode: four counts say it all."""
+    n = len(before)
+    if not n:
+        return NO_PAIRS
+    one, other, both = (int(part) for part in (before.sum(), after.sum(), before @ after))
+    gained, lost = other - both, one - both
+    gap, neither = round((other - one) / n, 12), n - both - gained - lost
+    change, within = (
+        Interval(gap, *newcombe_paired(both, gained, lost, neither, level))
+        for level in (LEVEL, WITHIN)
+    )
+    counts = (n, gained, lost)
+    return Pairs(
+        *(n, one / n, other / n), change, within, "newcombe", *counts, *mcnemar(gained, lost)
+    )
+
+
+def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
+    """Return second − first with the interval of means of repeats."""
+    values = [success(side) for side in (first, second)]
+    before, after = (float(side.mean()) for side in values)
+    spread = float(values[0].std() * values[1].std())
+    phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
+    worth = [trials(side) for side in (first, second)]
+    old, new = (wilson(r * m, m, level) for r, m in zip((before, after), worth, strict=True))
+    return Interval(round(after - before, 12), *combined(after, new, before, old, phi))
+
+
+def apart(sides: Sequence[tuple[float, float, int]]) -> Pairs:
+    """Compare two sides that cannot be paired: rate, trials that it is worth, and episodes."""
+    (first, worth, n), (second, other_worth, m) = sides
+    counts = (second * other_worth, other_worth, first * worth, worth)
+    gap, p = round(second - first, 12), two_proportions(*counts)
+    change, within = (Interval(gap, *newcombe(*counts, level)) for level in (LEVEL, WITHIN))
+    return Pairs(min(n, m), first, second, change, within, "unpaired", 0, 0, 0, p, math.nan)
+
+
+def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
+    """Return p-values by Holm's method, those of one group corrected among themselves."""
+    adjusted = [math.nan] * len(p_values)
+    for group in dict.fromkeys(groups):
+        places = [place for place, one in enumerate(groups) if one == group]
+        for place, p in zip(places, holm([p_values[at] for at in places]), strict=True):
+            adjusted[place] = p
+    return adjusted
+
+
+def tested(found: Sequence[tuple[Pairs, Hashable, bool]]) -> list[tuple[Any, ...]]:
+    """Return for each comparison of a table the difference and the values of `COLUMNS`.
+
+    Args:
+        found: The comparison, the group that it is corrected in, and whether it is complete: of
+            one that is not, every p is provisional.
+    """
+    holms = corrected([pairs.p for pairs, _, _ in found], [group for _, group, _ in found])
+    rows = []
+    for (one, _, complete), p_holm in zip(found, holms, strict=True):
+        ps = [p if complete else Provisional(p) for p in (one.p, one.p_mid, p_holm)]
+        counts = (one.pairs, one.gained, one.lost) if one.interval != "unpaired" else (None,) * 3
+        rows.append((*one.change, one.interval, *counts, one.flips, *ps))
+    return rows
+
+
+def how_to_read(found: Iterable[tuple[Pairs, Hashable, bool]], groups: str) -> str:
+    """Return how a table of comparisons is to be read.
+
+    Args:
+        found: As in `tested`.
+        groups: In words, which tests are corrected among themselves.
+    """
+    found = list(found)
+    kinds = {pairs.interval for pairs, _, _ in found}
+    note = (
+        "95% intervals (interval): newcombe, Newcombe's paired score interval. p: McNemar's exact "
+        "test; p_mid: its mid-p, which is less cautious; p_holm: p corrected by Holm's method "
+        f"among {groups}. pairs: one an episode; gained and lost: those whose outcome differs; "
+        "flips: their share."
+    )
+    if "clusters" in kinds:
+        note += (
+            " With repeats (clusters) interval and p are of the episodes' means: the score "
+            "interval from Wilson's of each side by clusters, and the exact sign-flip test; pairs "
+            "are of the lowest model seed that counts on both sides."
+        )
+    if "unpaired" in kinds:
+        note += (
+            " Where histories may differ (unpaired) nothing is paired: Newcombe's hybrid score "
+            "interval, and the test of two proportions."
+        )
+    if not all(complete for _, _, complete in found):
+        note += " p†: provisional, as a cell is not complete: looking early finds too much."
+    return note

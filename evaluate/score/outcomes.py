@@ -1,0 +1,219 @@
+"""What came of every rollout in one simulator, as one array."""
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, name_system
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
+from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.stats.intervals import effective
+
+from . import Grid
+from .rows.checked import Rows
+
+STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
+"""By their numbers in a cube."""
+
+TEST_EPISODES = 50
+_SUCCESS, _ERROR = 0, 3
+
+Statuses = NDArray[np.int8]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Cube:
+    """What came of every rollout in one simulator: S systems, C conditions, E episodes, M seeds.
+
+    Attributes:
+        simulator: Name of the simulator.
+        systems: Those that have rows, in the order of tables.
+        conditions: Those that have rows or are expected, in the order of tables.
+        episodes: Those that have rows or are expected, in the canonical order.
+        model_seeds: Seeds that policies were given, ascending.
+        status: Place in `STATUSES` of each rollout, −1 where there is none, `(S, C, E, M) int8`.
+        evidence: Share of the lesson's evidence that the memory kept, NaN where that is not known,
+            `(S, C, E, M) float64`.
+        difficulty: Place of each episode's in `DIFFICULTIES`, −1 unknown, `(E,) int64`.
+        chance: Of each episode's question, the share of right answers that drawing at random has,
+            NaN where nothing was asked, `(E,) float64`.
+        expected: The episodes of a complete cell, `(E,) bool`.
+        due: The cells that are expected or have rows, `(S, C) bool`.
+        unpinned: Whether rows of a system name no revision of a split, `(S,) bool`.
+    """
+
+    simulator: str
+    systems: tuple[str, ...]
+    conditions: tuple[str, ...]
+    episodes: tuple[EpisodeId, ...]
+    model_seeds: tuple[int, ...]
+    status: Statuses
+    evidence: NDArray[np.float64]
+    difficulty: NDArray[np.int64]
+    chance: NDArray[np.float64]
+    expected: Flags
+    due: Flags
+    unpinned: Flags
+
+    def cell(self, system: str, condition: str) -> tuple[int, int]:
+        """Return the place of a cell on the first two axes."""
+        return self.systems.index(system), self.conditions.index(condition)
+
+    def ran(self, system: str) -> list[str]:
+        """Return the conditions under which a system has rows."""
+        there = self.has_rows[self.systems.index(system)]
+        return [condition for condition, has in zip(self.conditions, there, strict=True) if has]
+
+    def pairable(self, one: str, other: str) -> bool:
+        """Whether two systems had the same histories, as far as their rows tell."""
+        # Of a split that one names and the other does not, nobody knows whether it is one.
+        same = self.unpinned[[self.systems.index(name) for name in (one, other)]]
+        return bool(same[0] == same[1])
+
+    def of_family(self, family: str) -> Flags:
+        """Whether each episode is of a family, `(E,) bool`."""
+        return np.array([one.family == family for one in self.episodes], bool)
+
+    def chosen(self, flags: Flags) -> list[EpisodeId]:
+        """Return the episodes of some flags, `(E,) bool`, in the canonical order."""
+        return [self.episodes[place] for place in np.flatnonzero(flags).tolist()]
+
+    @cached_property
+    def has_rows(self) -> Flags:
+        """Whether a system has rows under a condition, `(S, C) bool`."""
+        return np.asarray((self.status >= 0).any(axis=(2, 3)))
+
+    @cached_property
+    def counts(self) -> NDArray[np.int64]:
+        """Rollouts by status, `(S, C, E, 4) int64`."""
+        return np.stack([(self.status == place).sum(-1) for place in range(len(STATUSES))], -1)
+
+    @cached_property
+    def there(self) -> Flags:
+        """Whether a system has any row of an episode, `(S, E) bool`."""
+        return np.asarray((self.status >= 0).any(axis=(1, 3)))
+
+    @cached_property
+    def counted(self) -> Flags:
+        """Whether a rollout of the episode counts: any that is no error, `(S, C, E) bool`."""
+        return np.asarray(counting(self.status).any(-1))
+
+    @cached_property
+    def missing(self) -> Flags:
+        """Expected episodes that do not count with every seed of the cell, `(S, C, E) bool`."""
+        seeds = (self.status >= 0).any(axis=2).sum(-1)[..., None]
+        return self.expected & (~self.counted | (counting(self.status).sum(-1) < seeds))
+
+    @cached_property
+    def other(self) -> Flags:
+        """Episodes that count without being expected, `(S, C, E) bool`."""
+        return self.counted & ~self.expected
+
+    @cached_property
+    def complete(self) -> Flags:
+        """Whether exactly the expected episodes count, with every model seed, `(S, C) bool`."""
+        return np.asarray(self.counted.any(-1) & ~(self.missing | self.other).any(-1))
+
+
+def counting(status: Statuses) -> Flags:
+    """Whether rollouts count: an error is neither success nor failure."""
+    return (status >= 0) & (status < _ERROR)
+
+
+def success(status: Statuses) -> NDArray[np.float64]:
+    """Return the mean success of an episode's repeats, NaN where none counts.
+
+    Args:
+        status: Repeats on the last axis, `(…, M) int8`.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
+
+
+def rate_of(status: Statuses) -> float:
+    """Return the mean of `success` over the episodes that count, NaN of none.
+
+    It is exact: of repeats, too, means that are equal are equal numbers.
+
+    Args:
+        status: The rate's rollouts, `(E, M) int8`.
+    """
+    won, of = (status == _SUCCESS).sum(-1), counting(status).sum(-1)
+    counts, episodes = np.unique(of[of > 0], return_counts=True)
+    total = sum(Fraction(int(won[of == count].sum()), count) for count in counts.tolist())
+    return float(total / int(episodes.sum())) if len(counts) else math.nan
+
+
+def trials(status: Statuses) -> float:
+    """Return how many independent trials a rate is worth: with repeats, more than its episodes.
+
+    Args:
+        status: The rate's rollouts, `(E, M) int8` (see `stats.effective`).
+    """
+    rates = success(status)
+    rates = rates[~np.isnan(rates)]
+    if len(rates) < 2:
+        return len(rates)
+    rollouts = int(counting(status).sum())
+    return effective(float(rates.mean()), float(rates.var(ddof=1)), len(rates), rollouts)
+
+
+def cubes_of(rows: Rows, grid: Grid) -> dict[str, Cube]:
+    """Return simulator to the outcomes in it, by name, with the cells that are expected."""
+    return {name: _cube(part, name, grid) for name, part in rows.by("simulator").items()}
+
+
+def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
+    systems = tuple(sorted(rows.names("system"), key=_table_order))
+    given, model_seeds = rows.names("condition"), tuple(rows.names("model_seed"))
+    due = given if grid is Grid.GIVEN else DEFAULT_CONDITIONS
+    conditions = tuple(one.name for one in in_order({*given, *due}))
+    ids = list(zip(*map(rows.list, ("family", "episode_split", "episode")), strict=True))
+    wanted = {*ids}
+    if grid is Grid.BENCHMARK:
+        wanted = {(family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)}
+    episodes = sorted((EpisodeId(*one) for one in {*ids, *wanted}), key=lambda one: one.sort_key)
+    places = {(one.family, one.split, one.index): place for place, one in enumerate(episodes)}
+    at = np.array([places[one] for one in ids])
+
+    shape = (len(systems), len(conditions), len(episodes), len(model_seeds))
+    status, evidence = np.full(shape, -1, np.int8), np.full(shape, np.nan)
+    cell = (rows.places("system", systems), rows.places("condition", conditions))
+    axes = (*cell, at, rows.places("model_seed", model_seeds))
+    status[axes] = rows.places("status", STATUSES)
+    evidence[axes] = np.array(rows.list("evidence_kept"), float)  # None becomes NaN
+    difficulty = np.full(len(episodes), -1)
+    found = rows.places("difficulty", DIFFICULTIES)
+    difficulty[at[found >= 0]] = found[found >= 0]
+    chance, drawn = np.full(len(episodes), np.nan), np.array(rows.list("chance"), float)
+    chance[at[~np.isnan(drawn)]] = drawn[~np.isnan(drawn)]
+    known = [name_system(system) for system in systems]
+    applies = np.array([[one.applies(c) and c in due for c in conditions] for one in known])
+    return Cube(
+        simulator,
+        systems,
+        conditions,
+        tuple(episodes),
+        model_seeds,
+        status,
+        evidence,
+        difficulty,
+        chance,
+        expected=np.array([key in wanted for key in places]),
+        due=applies | (status >= 0).any(axis=(2, 3)),
+        unpinned=np.array([(simulator, system) in rows.unpinned for system in systems]),
+    )
+
+
+def _table_order(system: str) -> tuple[int, str]:
+    known = known_system(system)
+    if known is None:
+        return len(SYSTEMS), system
+    return [*SYSTEMS].index(system.removesuffix(f"-{known.step}")), system

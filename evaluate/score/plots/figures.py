@@ -1,0 +1,246 @@
+"""Figures of a score, one set for each simulator."""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations, product
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.systems import base_of
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
+from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.viz.figure import INK, ink_on, open_figure, save_figure
+
+from . import curves, forests
+from .curves import FEW, Data, curve, explained, legend
+
+_PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
+_ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")
+"""Figures of all kinds of conditions; the others show the paper's."""
+
+_ALL = "All families"
+
+FIGURES = {
+    "effects": "What each condition changes, paired over episodes",
+    "success": "Success by condition, all families",
+    "families": "Success by condition, family by family",
+    "difficulty": "Success by condition, by difficulty",
+    "retention": "What is left of the lift at the most sessions",
+    "heatmap": "Success by family and condition",
+    "retrieval": "Retrieval against the same system without it",
+    "kinds": "Success by condition, kind by kind",
+    "interference": "What kind of interference hurts",
+    "access": "Success where all, some or none of the evidence was kept",
+    "ceiling": "Gap to the ideal observer with the same memory",
+    "matrix": "Which systems can be told apart",
+}
+"""Name to what a figure shows."""
+
+
+def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, Path]:
+    """Draw every figure for which there is data, as `<figure>-<simulator>.svg`.
+
+    Args:
+        score: What is drawn.
+        folder: Where to write.
+        png: Whether to write each as `.png`, too.
+
+    Returns:
+        Name without suffix to the SVG, in the order of `FIGURES`.
+    """
+    drawn = {}
+    for simulator in score.cubes:
+        data = Data(score, simulator)
+        for kind in FIGURES:
+            with open_figure() as figure:
+                if draw_figure(kind, figure, data):
+                    name = f"{kind}-{simulator}"
+                    for suffix in (".svg", *[".png"] * png):
+                        save_figure(figure, folder / (name + suffix))
+                    drawn[name] = folder / f"{name}.svg"
+    return drawn
+
+
+def draw_figure(kind: str, figure: Any, data: Data) -> bool:
+    """Draw one of `FIGURES`, and tell whether there is data for it."""
+    drawers = (
+        *(forests.effects, _success, _families, _difficulty, forests.retention, _heatmap),
+        *(_retrieval, _kinds, forests.interference, forests.access, forests.ceiling, _matrix),
+    )
+    shown = data if kind in _ALL_KINDS else data.of(_PAPER)
+    figure.set_layout_engine("constrained")
+    if not (shown.cells and dict(zip(FIGURES, drawers, strict=True))[kind](figure, shown)):
+        return False
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine("none")  # once, not again for each file
+    for number, artist in enumerate(figure.findobj(lambda one: one.get_gid())):
+        artist.set_gid(f"{artist.get_gid()}:{number}")  # in a file an id occurs once
+    return True
+
+
+def _success(figure: Any, data: Data) -> bool:
+    few = len(data.systems) <= FEW
+    places = curves.shifts([*data.systems, *data.absent])
+    high = 4.2 if few else 5.5
+    figure.set_size_inches(9, high)
+    axes = figure.subplots()
+    ends: dict[str, float] = {}
+    for name, shift in places.items():
+        ends |= curve(axes, data, name, "", shift, bars=few)
+    # Beside many systems' own points the published ones would only clutter.
+    beside = data.beside if few else []
+    for name in beside:
+        shift = places[name.removesuffix(", published")]
+        curve(axes, data, name, "", shift, bars=False)
+    ends |= curves.chance_level(axes, data, "")
+    curves.set_axes(axes, data, [*places, *beside], "success, %")
+    curves.label_ends(axes, ends, data.looks, high - 1, 8)
+    note = "published rates: in the table “paper”" if len(beside) < len(data.beside) else ""
+    legend(figure, explained(data, [*places, *beside], [""], note))
+    bars = "with 95% Wilson intervals" if few else "intervals in the table “main”"
+    title = f"Success by condition, {data.simulator}, {bars}"
+    axes.set_title(title, loc="left", size=10, color=INK)
+    return True
+
+
+def _families(figure: Any, data: Data) -> bool:
+    panels = {part: (data, part) for part in data.parts(FAMILIES)}
+    few = len(data.systems) <= FEW
+    published = [name for name in (*data.absent, *data.beside) if few and data.has_parts(name)]
+    return _panels(figure, data, panels, [*data.systems, *published])
+
+
+def _difficulty(figure: Any, data: Data) -> bool:
+    panels = {part: (data, part) for part in data.parts(DIFFICULTIES)}
+    return _panels(figure, data, panels, data.systems)
+
+
+def _retrieval(figure: Any, data: Data) -> bool:
+    systems = []
+    for system in data.systems:
+        for base in (base_of(system), f"{base_of(system)}, published"):
+            systems += [system, base] if base in (*data.systems, *data.absent) else []
+    panels = {part or _ALL: (data, part) for part in ("", *data.parts(FAMILIES))}
+    return _panels(figure, data, panels, systems)
+
+
+def _kinds(figure: Any, data: Data) -> bool:
+    if _PAPER.issuperset(data.kinds):
+        return False
+    plain = [kind for kind in data.kinds if not kind.counted]  # in each panel, as the floor
+    counted = [kind for kind in data.kinds if kind.counted]
+    panels = {kind.pattern: (data.of([*plain, kind]), "") for kind in counted}
+    return _panels(figure, data, panels, data.systems)
+
+
+def _panels(
+    figure: Any, data: Data, panels: Mapping[str, tuple[Data, str]], systems: Sequence[str]
+) -> bool:
+    """Draw panels, three in a row, on the axes of `data`.
+
+    `panels` has for each title which of the data it shows, and which part of the episodes.
+    """
+    if not (panels and systems):
+        return False
+    wide, bars = 3, len(systems) <= FEW
+    rows, high = -(-len(panels) // wide), 2.0 if bars else 2.4
+    figure.set_size_inches(10.5, 0.9 + high * rows)
+    grid = figure.subplots(rows, wide, sharex=True, sharey=True, squeeze=False)
+    ends: list[dict[str, float]] = []
+    for axes, (title, (shown, part)) in zip(grid.flat, panels.items(), strict=False):
+        ends.append({})
+        for system, shift in curves.shifts(systems).items():
+            ends[-1] |= curve(axes, shown, system, part, shift, bars=bars)
+        ends[-1] |= curves.chance_level(axes, shown, part)
+        axes.set_title(title, size=9, color=INK, weight="bold" if title == _ALL else "normal")
+    for number, axes in enumerate(grid.flat):
+        if number < len(panels):
+            curves.set_axes(axes, data, systems, "" if number % wide else "success, %")
+            axes.tick_params(labelbottom=number + wide >= len(panels))  # nothing below
+    for axes, found in zip(grid.flat, ends, strict=False):
+        curves.label_ends(axes, found, data.looks, high - 0.45, 6.5)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    note = f"95% {'Wilson intervals' if bars else 'intervals: in the table'}"
+    legend(figure, explained(data, systems, [p for _, p in panels.values()], note))
+    return True
+
+
+def _heatmap(figure: Any, data: Data) -> bool:
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    names, conditions = data.parts(FAMILIES), data.shown(data.systems)
+    labels = [curves.short(condition) for condition in conditions]
+    turned = 90 if max(map(len, labels)) > len("none") else 0
+    many = max(5, len(conditions))
+    rows = -(-len(data.systems) // max(1, 25 // many))
+    wide = -(-len(data.systems) // rows)
+    figure.set_size_inches(1.3 + 1.65 * wide * many / 5, 0.6 + (0.6 + 0.24 * len(names)) * rows)
+    panels = figure.subplots(rows, wide, sharey=True, squeeze=False)
+    colours = colormaps["cividis"]  # the same to the colour-blind, and even in grey
+    highest = max(cell.rate for (*_, part), cell in data.cells.items() if part in names)
+    for axes, system in zip(panels.flat, data.systems, strict=False):
+        rates = np.full((len(names), len(conditions)), np.nan)
+        for (y, name), (x, condition) in product(enumerate(names), enumerate(conditions)):
+            if cell := data.cells.get((system, condition, name)):
+                rates[y, x] = cell.rate
+                text = f"{100 * cell.rate:.0f}" + ("" if cell.complete else "†")
+                ink = ink_on(to_hex(colours(cell.rate / highest if highest else 0.0)))
+                inside: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
+                axes.text(x, y, text, **inside, size=7, color=ink)
+        axes.imshow(rates, cmap=colours, vmin=0, vmax=highest, aspect="auto")
+        axes.set_xticks(range(len(conditions)), labels, size=7, rotation=turned)
+        axes.set_yticks(range(len(names)), names, size=7)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        axes.set_title(fill(data.looks[system].label, 26), size=8, color=INK)
+    for axes in panels.flat[len(data.systems) :]:
+        axes.set_axis_off()
+    figure.suptitle(f"Success in %, {data.simulator}", size=9, color=INK)
+    return True
+
+
+def _matrix(figure: Any, data: Data) -> bool:
+    """Draw all pairs of systems at k0 and at the most sessions: the row's rate − the column's."""
+    pairs = [one for one in data.contrasts if one.table == "matrix"]
+    last = max((parse_condition(one.condition).k for one in pairs), default=0)
+    shown = [c.name for c in data.conditions if c.kind.counted and c.k in (0, last)]
+    panels = {name: found for name in shown if (found := [p for p in pairs if p.condition == name])}
+    if not panels:
+        return False
+    many = max(len({one.system for one in found}) for found in panels.values()) + 1
+    figure.set_size_inches(1.6 + 5.2 * len(panels), 2.1 + 0.3 * many)
+    widest = 100 * max(abs(one.pairs.change.value) for one in pairs)
+    for axes, (condition, found) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+    ):
+        changes = {(one.system, one.against[0]): 100 * one.pairs.change.value for one in found}
+        changes |= {(other, one): -change for (one, other), change in changes.items()}
+        systems = sorted(
+            {one for one, _ in changes}, key=lambda s: -data.cells[s, condition, ""].rate
+        )
+        values = np.full((len(systems), len(systems)), np.nan)
+        for y, x in combinations(range(len(systems)), 2):
+            row, column = systems[x], systems[y]
+            apart = (condition, frozenset((row, column))) in data.apart
+            change = changes[column, row]
+            if apart:
+                values[y, x] = change
+            look: dict[str, Any] = {"weight": "bold", "color": "black"} if apart else {"color": INK}
+            look |= {"ha": "center", "va": "center", "in_layout": False}
+            axes.text(x, y, f"{change:.0f}".replace("-", "−"), size=7, **look)
+        axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
+        labels = [data.looks[system].label for system in systems]
+        axes.set_xticks(range(len(systems)), labels, size=7, rotation=90)
+        axes.set_yticks(range(len(systems)), labels, size=7)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        axes.set_title(condition, size=9, color=INK)
+    figure.suptitle(f"Row − column, points, {data.simulator}", size=10, color=INK)
+    legend(figure, f"filled and bold: told apart, p < {SURE} after Holm's correction; else not")
+    return True

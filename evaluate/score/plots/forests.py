@@ -1,0 +1,255 @@
+"""Figures of differences and shares, a row each, with their intervals."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from textwrap import fill
+from typing import Any
+
+from robomme_interference_data.evaluate.score.comparisons.contrasts import (
+    QUESTIONS,
+    START,
+    Contrast,
+)
+from robomme_interference_data.schema.conditions import KINDS, parse_condition
+from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.viz.figure import GREY, INK, Hue, tidy
+
+from .curves import (
+    Data,
+    label_ends,
+    legend,
+    mark,
+    set_axes,
+    short,
+)
+from .styles import Look
+
+_FLIPS = 0.06
+"""Share of outcomes that flip when RoboMME's episodes are repeated on a GPU, at the least."""
+
+_LEVELS = {
+    "all": Look("all kept", Hue.BLUE, "o", "-"),
+    "some": Look("some kept", Hue.ORANGE, "s", "--"),
+    "none": Look("none kept", Hue.VERMILION, "^", ":"),
+}
+
+_HOLLOW = "hollow: cell not complete"
+
+
+def effects(figure: Any, data: Data) -> bool:
+    """Draw what each condition with sessions changes, system by system, over a band of noise."""
+    own = [c for c in data.contrasts if c.pairs.n and parse_condition(c.condition).kind.name == "k"]
+    last = max((parse_condition(c.condition).k for c in own), default=0)
+    found: dict[str, dict[str, Contrast]] = {}
+    for one in own:
+        name = ""
+        if one.table == "lift" and one.condition == START:
+            name = f"{START} − {short(one.against[1])}"
+        elif one.table == "effects" and one.against == (one.system, START):
+            name = f"{one.condition} − {START}"
+        elif one.table == "effects" and parse_condition(one.condition).k == last:
+            name = f"{one.condition}, with − without retrieval"
+        if name:
+            found.setdefault(name, {})[one.system] = one
+    if not found:
+        return False
+    flips = _FLIPS if data.flips is None else data.flips
+    said = "assumed, there are no repeats" if data.flips is None else "measured over repeats"
+    most = max(c.pairs.n for group in found.values() for c in group.values())
+    band = 196 * math.sqrt(flips / most)
+    note = (
+        f"grey: ±{band:.1f} points, which chance alone stays within in 95% of comparisons of "
+        f"{most} episodes if {100 * flips:.0f}% of outcomes flip between repeats ({said})"
+    )
+    title = f"What each condition changes, paired over episodes, {data.simulator}"
+    _forest(figure, data, found, title, "difference of success, points", band, note)
+    return True
+
+
+def ceiling(figure: Any, data: Data) -> bool:
+    """Draw how far systems stay below the ideal observer with their memory."""
+    found: dict[str, dict[str, Contrast]] = {}
+    for one in data.contrasts:
+        if one.table == "ceiling" and one.pairs.n:
+            found.setdefault(one.condition, {})[one.system] = one
+    if not found:
+        return False
+    title = f"Gap to the ideal observer with the same memory, {data.simulator}"
+    _forest(figure, data, found, title, "system − ideal observer, points")
+    return True
+
+
+def _forest(
+    figure: Any,
+    data: Data,
+    found: Mapping[str, Mapping[str, Contrast]],
+    title: str,
+    xlabel: str,
+    band: float = 0.0,
+    note: str = "",
+) -> None:
+    """Draw a panel for each comparison, named by what is compared, and a row for each system.
+
+    The band, in points, lies around zero. The systems whose last comparison in common with most
+    is the highest stand first.
+    """
+    sizes = [len(group) for group in found.values()]
+    leading = next(group for group in reversed([*found.values()]) if len(group) == max(sizes))
+    systems = [one for one in data.systems if any(one in group for group in found.values())]
+    ranked = sorted(
+        systems, key=lambda s: -leading[s].pairs.change.value if s in leading else math.inf
+    )
+    figure.set_size_inches(10, 1.5 + 0.27 * max(3, len(ranked)))
+    panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, (name, group) in zip(panels, found.items(), strict=True):
+        if band:
+            axes.axvspan(-band, band, color=GREY, alpha=0.2, linewidth=0, zorder=0)
+        axes.axvline(0, color=GREY, linewidth=0.8, zorder=0)
+        for system, contrast in group.items():
+            change = [100 * value for value in contrast.pairs.change]
+            _dot(axes, change, ranked.index(system), data, contrast)
+        tidy(axes)
+        axes.set_title(fill(name, 22), size=9, color=INK)
+    panels[0].set_yticks(range(len(ranked)), [data.looks[system].label for system in ranked])
+    panels[0].set_ylim(len(ranked) - 0.4, -0.6)
+    figure.suptitle(title, size=10, color=INK)
+    whole = all(c.complete for group in found.values() for c in group.values())
+    said = [f"{xlabel}; bars: 95% intervals", "" if whole else _HOLLOW, fill(note, 150)]
+    legend(figure, "\n".join(filter(None, said)))
+
+
+def _dot(axes: Any, interval: Sequence[float], place: int, data: Data, contrast: Contrast) -> None:
+    """Draw a value with its bounds, as far as it has any; hollow where a cell is not complete."""
+    look, (value, low, high) = data.looks[contrast.system], interval
+    drawn = []
+    if not math.isnan(low):
+        drawn += axes.plot((low, high), (place, place), color=look.colour, linewidth=1.5)
+    face = look.colour if contrast.complete else "white"
+    drawn += axes.plot(value, place, **look.point | {"markerfacecolor": face})
+    mark(drawn, contrast.system)
+
+
+def retention(figure: Any, data: Data) -> bool:
+    """Draw what is left of each system's lift at the most sessions."""
+    lifts = (one for one in data.contrasts if one.table == "lift")
+    found = [c for c in lifts if not math.isnan(c.retention.value)]
+    if not found:
+        return False
+    last = max((c.condition for c in found), key=lambda name: parse_condition(name).k)
+    found = sorted(
+        (c for c in found if c.condition == last), key=lambda c: (c.complete, c.retention.value)
+    )
+    shown = {contrast.system for contrast in found}
+    absent = [data.looks[system].label for system in data.systems if system not in shown]
+    note = fill(
+        f"Not shown (no lift at k0 with p < {SURE}, or rows missing at {last}): "
+        f"{', '.join(absent)}",
+        110,
+    )
+    figure.set_size_inches(8, 1.4 + 0.3 * max(2, len(found)))
+    axes = figure.subplots()
+    for place, contrast in enumerate(found):
+        _dot(axes, contrast.retention, place, data, contrast)
+    for value, style in ((0, "-"), (1, "--")):
+        axes.axvline(value, color=GREY, linewidth=0.8, linestyle=style, zorder=0)
+    tidy(axes)
+    axes.grid(visible=False)
+    labels = [data.looks[c.system].label + ("" if c.complete else " † not ranked") for c in found]
+    axes.set_yticks(range(len(found)), labels)
+    axes.set_ylim(-0.6, len(found) - 0.4)
+    scale = f"({last} − no history) / (k0 − no history); 0 nothing left, 1 all; bars: 95% intervals"
+    axes.set_xlabel(scale, size=8, color=INK)
+    axes.set_title(f"Retention at {last}, {data.simulator}", loc="left", size=10, color=INK)
+    legend(figure, note if absent else "")
+    return True
+
+
+def access(figure: Any, data: Data) -> bool:
+    """Draw success where all, some and none of the evidence was kept, system by system."""
+    names = {one.name for one in data.conditions}
+    rows = [row for row in data.access if row[1] in names]
+    systems = list(dict.fromkeys(row[0] for row in rows))
+    if not systems:
+        return False
+    wide = min(3, len(systems))
+    high = -(-len(systems) // wide)
+    figure.set_size_inches(max(6.0, 3.6 * wide), 0.9 + 2.3 * high)
+    panels = figure.subplots(high, wide, sharex=True, sharey=True, squeeze=False)
+    ends: dict[str, dict[str, float]] = {system: {} for system in systems}
+    for axes, system in zip(panels.flat, systems, strict=False):
+        for number, (level, look) in enumerate(_LEVELS.items()):
+            points = [row[1:2] + row[4:] for row in rows if row[0] == system and row[2] == level]
+            if not points:
+                continue
+            xs = [data.x(point[0]) + 0.09 * (number - 1) for point in points]
+            rates, *bounds = zip(*([100 * v for v in point[1:]] for point in points), strict=True)
+            style = look.point | {"linestyle": look.line, "linewidth": look.width}
+            drawn = [*axes.plot(xs, rates, **style, clip_on=False, zorder=3)]
+            drawn.append(axes.vlines(xs, *bounds, color=look.colour, linewidth=0.9, alpha=0.7))
+            mark(drawn, system)
+            ends[system][level] = rates[-1]
+        axes.set_title(data.looks[system].label, size=9, color=INK)
+    for number, axes in enumerate(panels.flat):
+        if number < len(systems):
+            set_axes(axes, data, systems, "" if number % wide else "success, %")
+            axes.tick_params(labelbottom=number + wide >= len(systems))  # nothing below
+            label_ends(axes, ends[systems[number]], _LEVELS, 1.8, 7, systems[number])
+        else:
+            axes.set_axis_off()
+    note = "Different episodes: nothing is paired. Bars: 95% Wilson intervals; n in the table."
+    legend(figure, f"Where all, some or none of the evidence was in the memory. {note}")
+    return True
+
+
+def interference(figure: Any, data: Data) -> bool:
+    """Draw which kind of interference hurts, at equally many sessions."""
+    asked = {one.system for one in data.contrasts if one.asks and one.pairs.n}
+    systems = [system for system in data.systems if system in asked]
+    if not systems:
+        return False
+    shown = _most_asked([one for one in data.contrasts if one.system in asked])
+    wide = min(3, len(systems))
+    rows = -(-len(systems) // wide)
+    figure.set_size_inches(7.5, 0.7 + (0.5 + 0.34 * len(shown)) * rows)
+    panels = figure.subplots(rows, wide, sharex=True, sharey=True, squeeze=False)
+    for number, (axes, system) in enumerate(zip(panels.flat, systems, strict=False)):
+        axes.axvline(0, color=GREY, linewidth=0.8, zorder=0)
+        for place, found in enumerate(shown.values()):
+            if contrast := found.get(system):
+                change = [100 * value for value in contrast.pairs.change]
+                _dot(axes, change, place, data, contrast)
+        tidy(axes)
+        axes.tick_params(labelbottom=number + wide >= len(systems))  # nothing below
+        axes.set_yticks(range(len(shown)), list(shown), size=7)
+        axes.set_title(fill(data.looks[system].label, 26), size=9, color=INK)
+    panels[0, 0].set_ylim(len(shown) - 0.5, -0.5)  # downwards, as in the table
+    for axes in panels.flat[len(systems) :]:
+        axes.set_axis_off()
+    figure.supxlabel("difference of success, points, with 95% intervals", size=8, color=INK)
+    whole = all(contrast.complete for found in shown.values() for contrast in found.values())
+    legend(figure, "" if whole else _HOLLOW)
+    return True
+
+
+def _most_asked(contrasts: Iterable[Contrast]) -> dict[str, dict[str, Contrast]]:
+    """Return what is asked, in words, to each system's comparison, of equally many sessions.
+
+    They are as many as most questions are answered with, of several the most; where a question is
+    not answered with so many, the most that it is answered with.
+    """
+    found: dict[str, dict[int, list[Contrast]]] = {}
+    for one in contrasts:
+        condition = parse_condition(one.condition)
+        asks = one.asks or condition.kind.asks * (one.against == (one.system, START))
+        if asks and one.pairs.n:
+            found.setdefault(asks, {}).setdefault(condition.k, []).append(one)
+    counts = Counter(k for by_k in found.values() for k in by_k)
+    most = max(counts, key=lambda k: (counts[k], k))
+    shown = {}
+    for asks in (KINDS["k"].asks, *(question.asks for question in QUESTIONS.values())):
+        if by_k := found.get(asks):
+            chosen = by_k.get(most) or by_k[max(by_k)]
+            name = f"{asks}\n{chosen[0].condition} − {chosen[0].against[1]}"
+            shown[name] = {one.system: one for one in chosen}
+    return shown

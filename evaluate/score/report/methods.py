@@ -1,0 +1,70 @@
+"""How a score was made, as a paragraph that can go into a paper, with what it cites."""
+
+import re
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.evaluate.score.comparisons import families
+from robomme_interference_data.evaluate.score.outcomes import Cube
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.viz.templates import fill
+
+from .page import versions
+
+_CITED = re.compile(r"\[@([a-z0-9]+)\]")
+
+
+def methods(score: Score) -> tuple[str, str]:
+    """Return the paragraph as Markdown, citing as Pandoc reads it, and what it cites as BibTeX.
+
+    It tells nothing that the score does not hold: a method that no table needed is not named.
+
+    Raises:
+        MissingExtraError: jinja2 is not installed.
+    """
+    intervals = {
+        record["interval"]
+        for table in score.tables.values()
+        for record in table.records()
+        if record.get("interval")
+    }
+    lifts = score.tables["lift"].records()
+    values: dict[str, Any] = {
+        "parts": [_part(score, cube) for cube in score.cubes.values()],
+        "repeats": bool(score.tables["noise"].rows),
+        "tables": {name for name, table in score.tables.items() if table.rows},
+        "intervals": intervals,
+        "retention": any(one["retention"] is not None for one in lifts),
+        "margin": score.settings.margin,
+        "draws": score.draws,
+        "family_draws": families.DRAWS,
+        "versions": versions(),
+        "notes": " ".join(score.notes),
+    }
+    text = fill(__package__, "methods.md.j2", values, what="the methods")
+    cited = set(_CITED.findall(text))
+    file = resources.files(__package__).joinpath("data", "methods.bib")
+    entries = file.read_text(encoding="utf-8").strip().split("\n\n")
+    chosen = [one for one in entries if one.partition("{")[2].partition(",")[0] in cited]
+    return text, "\n\n".join(chosen) + "\n"
+
+
+def _part(score: Score, cube: Cube) -> dict[str, Any]:
+    there = np.flatnonzero(cube.there.any(axis=0)).tolist()
+    cells = [one for one in score.cells if one.simulator == cube.simulator and not one.part]
+    return {
+        "simulator": cube.simulator,
+        "asked": bool((cube.chance >= 0).any()),
+        "systems": list(map(display_name, cube.systems)),
+        "conditions": list(dict.fromkeys(one.condition for one in cells if one.n)),
+        "rollouts": sum(sum(one.counts) for one in cells),
+        "episodes": len(there),
+        "families": len({cube.episodes[place].family for place in there}),
+        "seeds": len(cube.model_seeds),
+        "complete": sum(one.complete for one in cells),
+        "cells": len(cells),
+        "errors": sum(one.errors for one in cells),
+    }

@@ -1,0 +1,236 @@
+"""One self-contained page about a score. It needs no network and no other file."""
+
+import json
+import math
+import os
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import metadata
+from itertools import pairwise
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.comparisons.contrasts import START
+from robomme_interference_data.evaluate.score.outcomes import STATUSES, success
+from robomme_interference_data.evaluate.score.plots.curves import FEW
+from robomme_interference_data.evaluate.score.plots.figures import FIGURES
+from robomme_interference_data.evaluate.score.rows.checked import Rows
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.conditions import in_order, parse_condition
+from robomme_interference_data.storage.files import sha256_file, write_text
+from robomme_interference_data.viz.templates import fill
+
+from .headline import headline
+
+_LIBRARIES = ("robomme-interference-data", "numpy", "pyarrow", "matplotlib")
+"""What the numbers and pictures depend on."""
+
+_SHOWN_IN = {
+    **{"effects": ("lift", "effects"), "success": ("main", "chance", "paper")},
+    **{"families": ("family", "paper_family"), "heatmap": ("family",)},
+    **{"difficulty": ("difficulty",), "retention": ("lift",)},
+    **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
+    **{"access": ("access",), "ceiling": ("ceiling",), "matrix": ("matrix", "systems", "ranks")},
+}
+"""Figure to the tables that have its numbers."""
+
+_GRIDS = {
+    Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
+    Grid.GIVEN: "those that any of the given rows is of",
+}
+
+
+def write_report(
+    score: Score, figures: Mapping[str, Path], out: Path, command: str | None = None
+) -> None:
+    """Write the page: the same bytes for the same rows, options and command.
+
+    Args:
+        score: What it shows.
+        figures: Names and SVG files, as `draw_figures` returns them.
+        out: The HTML file.
+        command: The command line that made the score; None shows the call of `score`.
+
+    Raises:
+        MissingExtraError: jinja2 is not installed.
+    """
+    cubes = score.cubes.values()
+    conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
+    values = {
+        "headlines": {simulator: headline(score, simulator) for simulator in score.cubes},
+        "grids": score.grids,
+        "tables": score.tables.values(),
+        "systems": _names(score),
+        "known": {name: system.display for name, system in SYSTEMS.items()},
+        "leader": _leader(score),
+        "figures": _inline(figures),
+        "titles": FIGURES,
+        "shown_in": _SHOWN_IN,
+        "number": _number,
+        "conditions": conditions,
+        "episodes": _episodes(score, conditions, out.parent),
+        "sources": {str(path): _source(path, run) for path, run in score.rows.sources.items()},
+        "facts": _facts(score, command),
+    }
+    html = fill(__package__, "report.html.j2", values, what="the report", autoescape=True)
+    write_text(out, html)
+
+
+def _number(text: str) -> str:
+    """Return what a cell of a grid is sorted by; empty without any rate."""
+    found = re.match(r"\**([0-9.]+)%", text)
+    return found[1] if found else ""
+
+
+def _leader(score: Score) -> str:
+    """Return the system that figures set apart at first; none of few."""
+    best = [c.system for c in score.cells if c.rank == 1 and not c.part and c.condition == START]
+    return best[0] if best and max(len(cube.systems) for cube in score.cubes.values()) > FEW else ""
+
+
+def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
+    """Return SVG as parts of one page: ids are their own, and what is drawn tells its system."""
+    found = {}
+    for number, (name, path) in enumerate(figures.items()):
+        kind, _, simulator = name.partition("-")
+        found[name] = _part(
+            path.read_text(encoding="utf-8"), number, f"{FIGURES[kind]}, {simulator}"
+        )
+    return found
+
+
+def _part(text: str, number: int, title: str) -> str:
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
+    text = re.sub(r' id="image[0-9a-f]+"', "", text)  # equal images share one
+    text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
+    return text.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
+
+
+def _names(score: Score) -> dict[str, str]:
+    """Return what the systems that have rows are called."""
+    systems = {one: None for cube in score.cubes.values() for one in cube.systems}
+    return {system: display_name(system) for system in systems}
+
+
+# --- single episodes ---------------------------------------------------------------------------
+
+
+def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
+    """Return what came of each episode as JSON that is safe inside a script element.
+
+    `names` has what systems are called; `rows` a row for each system and episode: simulator,
+    system, family, the rest of the id, difficulty, the outcome under each condition, where it
+    flips, and the address of a video, from the page's folder, under each.
+    """
+    videos = _videos(score.rows)
+    rows = []
+    for cube in score.cubes.values():
+        for place, system in enumerate(cube.systems):
+            counts = cube.counts[place].transpose(1, 0, 2).tolist()
+            rates = success(cube.status[place]).T.tolist()
+            for number in np.flatnonzero(cube.there[place]).tolist():
+                episode, hard = cube.episodes[number], int(cube.difficulty[number])
+                came = dict(zip(cube.conditions, counts[number], strict=True))
+                found = [videos.get((cube.simulator, system, c, str(episode))) for c in conditions]
+                row = (
+                    *(cube.simulator, system, episode.family),
+                    *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
+                    [_outcome(came[c]) if c in came else "" for c in conditions],
+                    flips(cube.conditions, rates[number]),
+                    [_address(one, folder) if one else "" for one in found],
+                )
+                rows.append(row)
+    told = {"names": _names(score), "rows": rows}
+    text = json.dumps(told, ensure_ascii=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _address(video: Path, folder: Path) -> str:
+    return quote(os.fsencode(os.path.relpath(video, folder)))  # not all names are UTF-8
+
+
+def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:
+    """Return where an outcome changes between conditions of a kind, as `k3 lost, k7 gained`.
+
+    Args:
+        conditions: In the order of tables.
+        rates: Mean success under each; NaN, which is left out, where nothing counts.
+    """
+    known = [(c, r) for c, r in zip(conditions, rates, strict=True) if not math.isnan(r)]
+    return ", ".join(
+        f"{condition} {'gained' if rate > before else 'lost'}"
+        for (last, before), (condition, rate) in pairwise(known)
+        if rate != before and parse_condition(last).kind == parse_condition(condition).kind
+    )
+
+
+def _outcome(counts: Sequence[int]) -> str:
+    if sum(counts) == 1:
+        return STATUSES[counts.index(1)]
+    won, *others, errors = counts
+    scored = won + sum(others)
+    return f"{won}/{scored}" if scored else "error" if errors else ""
+
+
+def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
+    """Return the videos that are there, by simulator, system, condition and episode.
+
+    Of repeats it is that of the lowest model seed.
+    """
+    chosen = rows.chosen(rows.places("video", [None]) < 0)
+    names = ("model_seed", "simulator", "system", "condition", "family", "episode_split", "episode")
+    columns = (chosen.list(name) for name in (*names, "video"))
+    found: dict[tuple[str, ...], Path] = {}
+    for _, *cell, family, split, index, video in sorted(zip(*columns, strict=True)):
+        key = (*cell, f"{family}/{split}/{index}")
+        if key not in found and video.is_file():
+            found[key] = video
+    return found
+
+
+# --- how it was made ---------------------------------------------------------------------------
+
+
+def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
+    """Return what there is to say of a file: commands to be copied, and all of `run.json`."""
+    facts = {"SHA-256": [sha256_file(path)]}
+    if run is not None:
+        lines = [line for start in run.starts for line in start.command]
+        facts |= {"command": [*dict.fromkeys(lines)]} if lines else {}
+        facts["run.json"] = [json.dumps(to_dict(run), indent=2, sort_keys=True, ensure_ascii=False)]
+    return facts
+
+
+def versions() -> str:
+    """Return what a score is computed with, in its versions."""
+    libraries = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
+    return ", ".join([f"Python {platform.python_version()}", *libraries])
+
+
+def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
+    rows, settings = score.rows, score.settings
+    call = {"command": command} if command else {"call": f"score({settings}, draws={score.draws})"}
+    seeds = rows.names("model_seed")
+    told = {
+        **call,
+        "scored with": versions(),
+        "rows": f"{len(rows):,}",
+        "episodes of a complete cell": _GRIDS[settings.grid],
+        "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
+        "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
+        **{f"revision of the split, {name}": rev for name, rev in sorted(rows.revisions.items())},
+        "note": " ".join(score.notes),
+        "bad rows left out": f"{rows.refused:,}: {'; '.join(rows.refusals)}" * bool(rows.refused),
+    }
+    return {name: [text] for name, text in told.items() if text}

@@ -1,0 +1,55 @@
+"""Access against use: what came of rollouts whose memory kept the evidence, and of the others.
+
+A memory fails because the frames that show the answer are no longer in it (access), or because
+they are not used. Success where all of the evidence was kept tells the second; the gap to the
+ideal observer with the same memory is all that better use could win.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from robomme_interference_data.evaluate.score.outcomes import Cube, counting, rate_of, trials
+from robomme_interference_data.evaluate.systems import known_system
+from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.viz.tables import Table
+
+
+def ceiling_of(system: str) -> str | None:
+    """Return the ideal observer with a system's memory; None for bounds, and where none is known.
+
+    Of a system with retrieval it is the observer behind the same step.
+    """
+    known = known_system(system)
+    if known is None or known.sampling is None or known.bound:
+        return None
+    name = f"{'retrieval-' * known.retrieval}recall-{known.sampling}{'-' * bool(known.step)}"
+    return name + known.step
+
+
+def access_table(cubes: Iterable[Cube]) -> Table:
+    """Return the rates where all, some and none of the evidence was kept, by system and condition.
+
+    Cells of which no rollout tells what was kept are left out, and so are levels without episodes.
+    """
+    rows = []
+    for cube in cubes:
+        kept = cube.evidence
+        levels = {"all": kept == 1, "some": (kept > 0) & (kept < 1), "none": kept == 0}
+        for s, c in np.argwhere(cube.has_rows).tolist():
+            for name, chosen in levels.items():
+                status = np.where(chosen[s, c], cube.status[s, c], np.int8(-1))
+                if n := int(counting(status).any(axis=-1).sum()):
+                    cell = (cube.simulator, cube.systems[s], cube.conditions[c], name)
+                    rate, worth = rate_of(status), trials(status)
+                    rows.append((*cell, n, rate, *wilson(rate * worth, worth)))
+    return Table.make(
+        "access",
+        "Success by the evidence that was kept",
+        "simulator system condition kept n:count rate:rate low:rate high:rate",
+        rows,
+        "kept: whether all, some or none of the lesson's evidence spans have a frame in the memory "
+        "at the first step. Rates over the n episodes of which that is known, with 95% Wilson "
+        "intervals. They are of different episodes. Where all was kept, a failure is one of use; "
+        "where none was, a success is luck, or needs no memory.",
+    )

@@ -1,0 +1,274 @@
+"""Commands that fetch and look at splits, and at this machine."""
+
+from dataclasses import asdict
+from operator import attrgetter
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from robomme_interference_data.data.fetch import FetchConfig
+from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.schema.settings import with_settings
+from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
+
+from .console import (
+    AsJson,
+    ConditionName,
+    Conditions,
+    Families,
+    Picture,
+    QueryName,
+    SplitFolder,
+    SplitOption,
+    check_output,
+    print_json,
+    say,
+    stoppable,
+)
+
+
+def list_buffers(
+    split: SplitFolder,
+    families: Families = [],  # noqa: B006 - typer copies it
+    conditions: Conditions = [],  # noqa: B006
+    difficulty: Annotated[str | None, typer.Option(help="Only easy, medium or hard.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the buffers of a split.
+
+    Examples:
+    ```
+    robomme-interference list my-split --conditions k3 k7
+    robomme-interference list my-split --families MoveCube --json
+    ```
+    """
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.schema.codec import to_dict
+    from robomme_interference_data.viz.tables import Table
+
+    opened = load_split(split)
+    found = opened.manifests(family=families, condition=conditions, difficulty=difficulty)
+    if as_json:
+        print_json([to_dict(manifest) for manifest in found])
+        return
+    values = attrgetter(
+        "episode_id", "condition", "difficulty", "lesson_frames", "history_frames", "lesson_share"
+    )
+    table = Table.make(
+        "buffers",
+        opened.location,
+        "episode condition difficulty lesson:count history:count share:ratio",
+        map(values, found),
+        "lesson, history: frames; share: of lesson in an even 32-frame sample",
+    )
+    typer.echo(table.text())
+
+
+def list_conditions(as_json: AsJson = False) -> None:
+    """List the kinds of conditions: what history each gives a query, and what it asks.
+
+    Examples:
+    ```
+    robomme-interference conditions
+    robomme-interference build manifests my-split --conditions no-history k0 k7 before-k7 held-k7
+    ```
+    """
+    from robomme_interference_data.constants import MAX_K
+    from robomme_interference_data.schema.conditions import KINDS
+    from robomme_interference_data.viz.tables import Table
+
+    table = Table.make(
+        "conditions",
+        "Conditions",
+        "condition sessions asks needs",
+        ((kind.pattern, kind.holds, kind.asks, " ".join(kind.needs)) for kind in KINDS.values()),
+        f"n: 0 to {MAX_K}. units: of other families, the same ones for every kind. needs: datasets "
+        "beside demonstrations and distractors.",
+    )
+    if as_json:
+        print_json(table.records())
+    else:
+        typer.echo(table.text())
+
+
+def show(
+    episode: QueryName,
+    condition: ConditionName,
+    split: SplitOption = Path(),
+    out: Picture = None,
+    camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
+    shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Drawn with --out.")] = NO_SHIFT,
+    as_json: AsJson = False,
+) -> None:
+    """Show one buffer: its sessions as a table, or as a film strip with --out.
+
+    Examples:
+    ```
+    robomme-interference show VideoRepick/test/7 k3 --split my-split
+    robomme-interference show VideoRepick/test/7 k7 --split my-split --out strip.png
+    robomme-interference show MoveCube/test/0 k1 --split my-split --shift light:2 --out strip.png
+    ```
+    """
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.views import live_frame
+    from robomme_interference_data.schema.codec import to_dict
+    from robomme_interference_data.viz.tables import Table
+
+    check_output(out)
+    under = parse_shift(shift)
+    if under is not None and out is None:
+        raise InvalidOptionError(
+            f"--shift {shift} says nothing where nothing is drawn",
+            "Add --out strip.png, or leave it out.",
+        )
+    opened = load_split(split)
+    buffer = opened.load(episode, condition)
+    buffer.query.dataset.shape(camera)  # refuses an unknown one
+    if out is not None:
+        from robomme_interference_data.viz.filmstrip import draw_strip
+
+        live = live_frame(opened, buffer, under, camera)
+        draw_strip(buffer, out, camera=camera, live=live)
+        say(f"{out} written")
+    manifest, evidence = buffer.manifest, buffer.evidence
+    if as_json:
+        told = None if evidence is None else [one.told() for one in evidence]
+        print_json(to_dict(manifest) | {"evidence": told})
+        return
+    table = Table.make(
+        "sessions",
+        f"{manifest}: {manifest.goal}",
+        "session:count role family episode frames",
+        (
+            (number, one.role, one.family, str(one.source), f"{one.start} to {one.stop - 1}")
+            for number, one in enumerate(buffer.sessions)
+        ),
+        f"{len(buffer)} history frames; an even 32-frame sample at the first step holds "
+        f"{manifest.lesson_share:.0%} lesson",
+    )
+    typer.echo(table.text())
+    if evidence:
+        spans = Table.make(
+            "evidence",
+            "What shows the answer",
+            "part:count text session frames",
+            (
+                (one.span.part, one.span.text, one.session.role, f"{one.start} to {one.stop - 1}")
+                for one in evidence
+            ),
+            "frames: in the buffer",
+        )
+        typer.echo(f"\n{spans.text()}")
+
+
+def show_question(
+    episode: QueryName,
+    split: SplitOption = Path(),
+    out: Annotated[Path | None, typer.Option(help="Picture to write, .png.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the question about the past of one query: in words, and its picture with --out.
+
+    Example:
+    ```
+    robomme-interference question VideoUnmask/test/0 --split my-split --out question.png
+    ```
+    """
+    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.questions import read_questions
+    from robomme_interference_data.storage.files import atomic_path
+
+    check_output(out)
+    if out is not None and out.suffix.lower() != ".png":
+        raise InvalidOptionError.expected("--out", str(out), "a name that ends in .png")
+    opened = load_split(split)
+    query = opened.query(episode)
+    question = read_questions(opened)[query.episode_id]
+    if out is not None:
+        with atomic_path(out) as partial:
+            partial.write_bytes(question.picture)
+        say(f"{out} written")
+    told = {
+        "goal": query.goal,
+        "question": question.text,
+        "options": question.lines,
+        "right": question.letters[question.right],
+    }
+    if as_json:
+        print_json(told)
+        return
+    for name, text in told.items():
+        lines = text if isinstance(text, tuple) else (text,)
+        typer.echo("\n".join(f"{name if not n else '':8}  {line}" for n, line in enumerate(lines)))
+
+
+@with_settings
+def fetch(
+    split: Annotated[str, typer.Argument(help="Repository, namespace/name or …@data-1.0.0.")],
+    config: FetchConfig,
+    to: Annotated[
+        Path | None, typer.Option(help="Folder to copy the files to; by default only the cache.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option(help="Only tell what would be fetched.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fetch a split from the Hub, or the part of it that some buffers need.
+
+    What is there already is not fetched again; every file is checked against its digest.
+
+    Examples:
+    ```
+    robomme-interference fetch namespace/name@data-1.0.0
+    robomme-interference fetch namespace/name --conditions k3 --families MoveCube --cameras front
+    robomme-interference fetch namespace/name --index thumbnail --to my-split
+    ```
+    """
+    from robomme_interference_data.data.fetch import fetch as fetch_parts
+    from robomme_interference_data.data.fetch import plan_fetch
+    from robomme_interference_data.data.loading import load_split
+
+    check_output(to)
+    with stoppable("What was fetched is kept"):
+        opened = load_split(split)
+        parts = plan_fetch(opened, config)
+        told = [
+            {
+                "repository": part.files.describe(),
+                "files": len(part.sizes),
+                "bytes": sum(part.sizes.values()),
+                "missing_files": len(part.missing),
+                "missing_bytes": sum(part.sizes[path] for path in part.missing),
+            }
+            for part in parts
+        ]
+        for one in told:
+            say(
+                "{repository}: {files:,} files, {bytes:,} bytes; to fetch: {missing_files:,} "
+                "files, {missing_bytes:,} bytes".format(**one)
+            )
+        if not dry_run:
+            fetch_parts(parts, to)
+    if as_json:
+        print_json({"to": None if to is None else str(to), "repositories": told})
+    elif not dry_run:
+        say(f"Next: robomme-interference list {to or opened.location}")
+
+
+def doctor(as_json: AsJson = False) -> None:
+    """Tell what works on this machine, and the command that mends what does not.
+
+    Example:
+    ```
+    robomme-interference doctor
+    ```
+    """
+    from . import doctor as module
+
+    rows = module.checks()
+    if as_json:
+        print_json([asdict(row) for row in rows])
+    else:
+        typer.echo(module.report(rows).text())
+    if module.any_failed(rows):
+        raise typer.Exit(1)

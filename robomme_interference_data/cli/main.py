@@ -1,0 +1,169 @@
+"""The `robomme-interference` command: a thin root, and how errors are shown.
+
+Each area has its own commands file; only this one sees all of them.
+"""
+
+import os
+import signal
+import sys
+from importlib import metadata
+from typing import Annotated, Any
+
+import typer
+
+from robomme_interference_data.build_dataset import commands as building
+from robomme_interference_data.cards import commands as publishing
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate import commands as evaluating
+from robomme_interference_data.evaluate.score import commands as scoring
+from robomme_interference_data.retrieval import commands as retrieving
+from robomme_interference_data.schema.settings import spread_values
+from robomme_interference_data.simulators import commands as simulating
+from robomme_interference_data.storage.hub_errors import check_endpoint
+
+from . import commands
+from .console import Group, say
+
+
+class _Root(Group):
+    """Keeps the order of `_GROUPS`, and lets options take several values: `--conditions k0 k7`."""
+
+    @property
+    def sections(self) -> dict[str, list[str]]:
+        return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        command: Any = self
+        several: set[str] = set()
+        for arg in args:
+            command = getattr(command, "commands", {}).get(arg)
+            if command is None:
+                break
+            several |= {o for p in command.params if getattr(p, "multiple", False) for o in p.opts}
+        return super().parse_args(ctx, spread_values(args, tuple(several)))
+
+
+app = typer.Typer(
+    cls=_Root,
+    name="robomme-interference",
+    no_args_is_help=True,
+    rich_markup_mode=None,  # rich would take longer to load than all else
+    pretty_exceptions_enable=False,
+    help="History buffers for RoboMME-Interference: build, load, stream and score.",
+    epilog="""A split is a folder with demonstrations, distractor units and manifests of buffers.
+
+```
+robomme-interference doctor
+robomme-interference build all --source robomme-h5:recordings/ --out my-split
+robomme-interference verify my-split
+robomme-interference list my-split
+robomme-interference show MoveCube/train/0 k3 --split my-split --out strip.png
+```
+""",
+)
+
+_GROUPS = {
+    "Data": (
+        ("doctor", commands.doctor),
+        ("build", building.app),
+        ("new-split", building.new_split),
+        ("verify", building.verify),
+        ("audit", building.audit),
+        ("fetch", commands.fetch),
+    ),
+    "Look": (
+        ("conditions", commands.list_conditions),
+        ("list", commands.list_buffers),
+        ("show", commands.show),
+        ("question", commands.show_question),
+        ("simulate", simulating.simulate),
+    ),
+    "Retrieval": (
+        ("index", retrieving.index),
+        ("retrieve", retrieving.retrieve),
+        ("retrieval-score", retrieving.retrieval_score),
+        ("calibrate", retrieving.calibrate),
+    ),
+    "Rollouts": (
+        ("ceiling", evaluating.ceiling),
+        ("evaluate", evaluating.evaluate),
+        ("ask", evaluating.ask),
+        ("merge", evaluating.merge),
+    ),
+    "Scores": (("score", scoring.score), ("compare", scoring.compare), ("power", scoring.power)),
+    "Publish": (
+        ("card", publishing.card),
+        ("publish", publishing.publish),
+        ("publish-results", publishing.publish_results),
+    ),
+}
+"""Commands in the order in which one uses them."""
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"robomme-interference {metadata.version('robomme-interference-data')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
+    ] = False,
+) -> None:
+    check_endpoint()  # before a library that works with the Hub is imported
+
+
+for _commands in _GROUPS.values():
+    for _name, _command in _commands:
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, name=_name)
+        else:
+            app.command(name=_name)(_command)
+
+
+def _keep_lines(command: Any) -> Any:
+    """Keep the lines of fenced blocks in the help of a command and of those under it."""
+    for name in ("help", "epilog"):
+        prose, *blocks = (getattr(command, name) or "").split("```\n")
+        for number, text in enumerate(blocks):
+            prose += text if number % 2 else "\n\b\n" + text.replace("\n\n", "\n\n\b\n") + "\n"
+        setattr(command, name, prose.replace("```", "").replace("`", ""))
+    for inner in getattr(command, "commands", {}).values():
+        _keep_lines(inner)
+    return command
+
+
+def main() -> None:
+    """Run the command line; known errors are shown without a traceback."""
+    try:
+        _keep_lines(typer.main.get_command(app))(prog_name="robomme-interference")
+    except InterferenceError as error:
+        _fail(error.message, error.hint)
+    except KeyboardInterrupt:  # before the command itself has begun, see `stoppable`
+        sys.exit(128 + signal.SIGINT)
+    except BrokenPipeError:  # the reader of stdout (head, less) has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        if error.errno is None:  # not the system's word on a file
+            raise
+        names = [name for name in (error.filename, error.filename2) if name is not None]
+        where = f"{' -> '.join(map(str, names))}: " if names else ""
+        hint = "Check the path, its permissions and the space left on the disk."
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            hint = "A file lies where a folder is to be: give another path, or move the file away."
+        _fail(f"{where}{error.strerror}", hint)
+
+
+def _fail(message: str, hint: str | None) -> None:
+    typer.secho(f"Error: {message}", fg=typer.colors.RED, err=True)
+    if hint:
+        say(hint)
+    sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Bring a split from the Hub to this machine, or the part of it that some buffers need."""
+
+import filecmp
+import shutil
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robomme_interference_data.constants import (
+    FURTHER,
+    INDEX_DIR,
+    INDEX_HEADER,
+    MANIFEST_PATH,
+    MANIFESTS,
+    QUESTIONS_PATH,
+    SHIFTED,
+)
+from robomme_interference_data.errors import InvalidOptionError, MissingFileError
+from robomme_interference_data.ids import parse_numbers
+from robomme_interference_data.schema.settings import setting
+from robomme_interference_data.storage.files import atomic_path
+from robomme_interference_data.storage.hub import HubFiles
+
+if TYPE_CHECKING:
+    from .buffer_set import Split
+    from .dataset import Dataset
+
+
+@dataclass(frozen=True)
+class FetchConfig:
+    """Which buffers of a split are wanted, and what of them."""
+
+    families: tuple[str, ...] = setting((), help="Families of the queries; by default all.")
+    conditions: tuple[str, ...] = setting((), help="Conditions; by default all that are planned.")
+    episodes: str | None = setting(None, help="Numbers, such as 0-9 or 0,3,10-12; default: all.")
+    cameras: tuple[str, ...] = setting((), help="Cameras, such as front; by default all.")
+    index: str | None = setting(None, help="Also the embeddings of this encoder, as thumbnail.")
+    questions: bool = setting(False, help="Also the questions; all buffers come with them.")
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is wanted of one repository.
+
+    Attributes:
+        files: The repository.
+        folder: Where its files go inside a fetched split's folder: empty for its root.
+        sizes: Path to bytes of every file that is wanted.
+        missing: Those that are not in the cache yet.
+    """
+
+    files: HubFiles
+    folder: str
+    sizes: dict[str, int]
+    missing: tuple[str, ...]
+
+
+def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
+    """Return what is to be fetched of each repository: its files are listed, none is fetched.
+
+    Raises:
+        InvalidOptionError: The split is a folder, or nothing is wanted.
+        UnknownNameError: The split has no such family, condition or camera.
+        MissingFileError: A repository lacks files that buffers need, or the index.
+        HubError: The Hub cannot be reached.
+    """
+    if not isinstance(split.files, HubFiles):
+        raise InvalidOptionError(
+            f"{split.location} is a folder on this machine; only a repository can be fetched",
+            "Give the split as namespace/name.",
+        )
+    cameras = config.cameras or split.cameras
+    whole = replace(config, index=None, questions=False) == FetchConfig()
+    episodes = _episodes(split, config)
+    others = {n: d.files for n, d in split.datasets.items() if d.files is not split.files}
+    parts = []
+    for folder, files in {"": split.files, **others}.items():
+        assert isinstance(files, HubFiles)  # so is every place of a split on the Hub
+        sizes = files.sizes()
+        # What tells of a dataset or split is small: all in meta/ and manifests/, and at the root
+        # but for questions, which have pictures. All of a split is more than its buffers need:
+        # units that no query drew, too.
+        wanted = {
+            path
+            for path, (top, *below) in ((path, path.split("/")) for path in sizes)
+            if top in ("meta", MANIFESTS)
+            or (not below and (config.questions or top != QUESTIONS_PATH))
+            or (whole and top not in (INDEX_DIR, *FURTHER))
+        }
+        for name, dataset in split.datasets.items():
+            if dataset.files is files:
+                wanted |= {*_paths(dataset, episodes[name], cameras, config.index, sizes)}
+        if lacking := sorted(wanted - sizes.keys()):
+            more = f" and {len(lacking) - 1} more files" if len(lacking) > 1 else ""
+            hint = "Without --index, the frames can be fetched." if config.index else None
+            raise MissingFileError(f"{files.describe()} lacks {lacking[0]}{more}", hint)
+        chosen = {path: sizes[path] for path in sorted(wanted)}
+        parts.append(Part(files, folder, chosen, tuple(files.missing(chosen))))
+    return parts
+
+
+def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
+    """Fetch what is missing, every file against its digest.
+
+    Args:
+        parts: What `plan_fetch` returned.
+        to: Folder to copy the files to; None leaves them in the Hub client's cache. It becomes a
+            split at the very end.
+
+    Raises:
+        InvalidOptionError: `to` holds another split.
+        HubError, MissingFileError: A file cannot be fetched.
+        HashMismatchError: What came is not what the Hub has.
+    """
+    header = parts[0].files.path(MANIFEST_PATH)
+    there = None if to is None else to / MANIFEST_PATH
+    if there is not None and there.is_file() and there.read_bytes() != header.read_bytes():
+        raise InvalidOptionError(f"{to} holds another split", "Give another folder.")
+    for part in parts:
+        part.files.fetch(part.sizes)
+    if to is None:
+        return
+    for part in parts:
+        for path in part.sizes:
+            if part.folder or path != MANIFEST_PATH:
+                _copy(part.files.path(path), to / part.folder / path)
+    _copy(header, to / MANIFEST_PATH)
+
+
+def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
+    """Return the episodes of each dataset that the wanted buffers and their queries hold."""
+    numbers = None if config.episodes is None else {*parse_numbers(config.episodes)}
+    found: dict[str, set[int]] = {name: set() for name in split.header.datasets}
+    for manifest in split.manifests(family=config.families, condition=config.conditions):
+        episode = manifest.episode_id
+        if numbers is None or episode.index in numbers:
+            found[manifest.query.dataset].add(manifest.query.episode_index)
+            if SHIFTED in found:
+                found[SHIFTED].add(split.datasets[SHIFTED].index_of(episode))
+            for entry in manifest.sessions:
+                found[entry.dataset].add(entry.episode_index)
+    if not any(found.values()):
+        raise InvalidOptionError(
+            f"no buffer of {split.location} is of episodes {config.episodes}",
+            f"Its buffers: robomme-interference list {split.location}",
+        )
+    return found
+
+
+def _paths(
+    dataset: "Dataset",
+    episodes: Iterable[int],
+    cameras: Iterable[str],
+    encoder: str | None,
+    there: Container[str],
+) -> Iterator[str]:
+    from .embeddings import (
+        CENTRE_FILE,
+        INDEX_SUMS,
+        episode_file,
+        index_folder,
+    )
+
+    for index in episodes:
+        yield from dataset.files_of(index, cameras)
+    for camera in cameras if encoder is not None else ():
+        folder = index_folder(encoder or "", camera)
+        own = (INDEX_HEADER, INDEX_SUMS, *map(episode_file, episodes))
+        yield from (f"{folder}/{name}" for name in own)
+        if (centre := f"{folder}/{CENTRE_FILE}") in there:  # of units, if the encoder is centred
+            yield centre
+
+
+def _copy(source: Path, target: Path) -> None:
+    if not target.is_file() or not filecmp.cmp(source, target, shallow=False):
+        with atomic_path(target) as partial:
+            shutil.copyfile(source, partial)

@@ -1,0 +1,122 @@
+"""A query episode without its buffer: what is asked, and what the robot sees first."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import STATE
+from robomme_interference_data.errors import FormatError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.conditions import Condition
+from robomme_interference_data.schema.manifest import (
+    BufferManifest,
+    QueryFrame,
+    SessionEntry,
+    place_sessions,
+)
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
+
+from .dataset import Dataset
+
+
+@dataclass(frozen=True)
+class Query:
+    """A query episode; made by `Split.query`.
+
+    Attributes:
+        dataset: The demonstrations.
+        record: What is recorded of the episode.
+    """
+
+    dataset: Dataset
+    record: EpisodeRecord
+
+    def __repr__(self) -> str:
+        return f"Query({self.episode_id}, difficulty={self.difficulty}, goal={self.goal!r})"
+
+    @property
+    def episode_id(self) -> EpisodeId:
+        """Id of the episode."""
+        return self.record.episode_id
+
+    @property
+    def goal(self) -> str:
+        """The goal in words: the first of its wordings."""
+        return self.record.goal
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the episode in its simulator, or None."""
+        return self.record.seed
+
+    @property
+    def difficulty(self) -> str | None:
+        """`easy`, `medium`, `hard`, or None."""
+        return self.record.difficulty
+
+    @property
+    def simulator(self) -> str | None:
+        """Simulator that the episode belongs to, or None."""
+        return self.record.simulator
+
+    @property
+    def lesson_frames(self) -> int:
+        """Frames of its demonstration, the first live observation not among them."""
+        start = self.record.exec_start_idx
+        if start is None:
+            raise FormatError.damaged(
+                self.dataset.files.describe(), f"{self.episode_id}: no lesson"
+            )
+        return start
+
+    @property
+    def place(self) -> QueryFrame:
+        """Where the first live observation is stored."""
+        dataset, index = self.dataset, self.record.episode_index
+        return QueryFrame(dataset.kind, dataset.revision, index, self.lesson_frames)
+
+    def manifest(
+        self, condition: Condition, sessions: tuple[SessionEntry, ...], *, exact: bool
+    ) -> BufferManifest:
+        """Return the manifest of the query's buffer under a condition.
+
+        Args:
+            condition: The condition.
+            sessions: What the buffer holds, in order.
+            exact: Whether all frames are the recorded ones, bit for bit.
+        """
+        record, lessons = self.record, place_sessions(sessions, "lesson")
+        frames = sum(one.num_frames for one in sessions)
+        return BufferManifest(
+            episode_id=record.episode_id,
+            condition=condition.name,
+            k=condition.k,
+            goals=record.goals,
+            seed=record.seed,
+            difficulty=record.difficulty,
+            simulator=record.simulator,
+            exact=exact,
+            lesson_frames=lesson_frames(lessons, range(frames)),
+            history_frames=frames,
+            lesson_share=lesson_share(lessons, range(frames)),
+            query=self.place,
+            sessions=sessions,
+        )
+
+    def frame(self, camera: str = "front") -> NDArray[np.uint8]:
+        """Decode the first live observation, `(H, W, 3) uint8` RGB.
+
+        Raises:
+            UnknownNameError: There is no such camera.
+            MissingFileError, FormatError, TruncatedVideoError: Its video cannot be read.
+        """
+        start, index = self.lesson_frames, self.record.episode_index
+        [frame] = self.dataset.iter_frames(index, camera, start, start + 1)
+        return frame
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the state at the first live observation, `(8,) float32`; see `Buffer.states`."""
+        start, index = self.lesson_frames, self.record.episode_index
+        return self.dataset.read_vectors(index, STATE, start, start + 1)[0]

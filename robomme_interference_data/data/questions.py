@@ -1,0 +1,104 @@
+"""Questions about the past that a split may have: one for each query, with a marked picture."""
+
+import string
+from collections.abc import Iterable
+from dataclasses import dataclass
+from hashlib import sha256
+
+from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
+from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.codec import from_table, to_dict
+from robomme_interference_data.storage.files import LocalFiles, canonical_json
+from robomme_interference_data.storage.parquet import open_parquet, read_table
+
+from .buffer_set import Split
+
+LETTERS = string.ascii_uppercase[:8]
+"""Letters of options, in order."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A multiple-choice question about what a query's lesson showed.
+
+    Attributes:
+        episode_id: The query episode.
+        revision: Revision of the demonstrations that it was made for.
+        text: What is asked, beside the goal.
+        options: The options in words, in the order of `LETTERS`; empty words where only the
+            picture tells one.
+        answers: The number, among the scene's answers, of one that each option stands for.
+        right: Place of the right option, from 0.
+        picture: The first live view with the options marked and lettered, a PNG file.
+    """
+
+    episode_id: EpisodeId
+    revision: str
+    text: str
+    options: tuple[str, ...]
+    answers: tuple[int, ...]
+    right: int
+    picture: bytes
+
+    def __post_init__(self) -> None:
+        count = len(self.options)
+        if not 2 <= count <= len(LETTERS) or len(set(self.answers)) != count:
+            raise FormatError(f"{count} options of {len(set(self.answers))} answers")
+        if not 0 <= self.right < count or min(self.answers) < 0:
+            raise FormatError(f"right option {self.right} of {count}, answers {self.answers}")
+
+    @property
+    def letters(self) -> str:
+        """Letters of the options, such as `ABCD`."""
+        return LETTERS[: len(self.options)]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The options as they are read, such as `A: the red cube`."""
+        return tuple(
+            f"{letter}: {words or f'the one marked {letter}'}"
+            for letter, words in zip(self.letters, self.options, strict=True)
+        )
+
+    @property
+    def chance(self) -> float:
+        """Share of right answers that drawing at random has."""
+        return 1 / len(self.options)
+
+
+def digest_questions(questions: Iterable[Question]) -> str:
+    """Return the SHA-256 over all that is asked, and that is right: the pictures too."""
+    digest = sha256()
+    for one in sorted(questions, key=lambda one: one.episode_id):
+        told = to_dict(one) | {"picture": sha256(one.picture).hexdigest()}
+        digest.update(canonical_json(told).encode(errors="backslashreplace"))
+    return digest.hexdigest()
+
+
+def read_questions(split: Split) -> dict[EpisodeId, Question]:
+    """Read the questions of a split, by query episode.
+
+    Raises:
+        MissingFileError: It has none; says how they are made.
+        FormatError: The file is damaged, lacks a query, or was made for other demonstrations.
+        HubError: It is on the Hub, and cannot be fetched.
+    """
+    mend = "Ask its publisher to make them: robomme-interference build questions SPLIT"
+    if isinstance(split.files, LocalFiles):
+        mend = f"Type: robomme-interference build questions {split.location}"
+    try:
+        path = split.files.path(QUESTIONS_PATH)
+    except MissingFileError:
+        what = f"{split.location} has no questions ({QUESTIONS_PATH})"
+        raise MissingFileError(what, mend) from None
+    table = read_table(open_parquet(path), path)
+    found = {one.episode_id: one for one in from_table(Question, table, path)}
+    revision = split.datasets[DEMONSTRATIONS].identity.revision
+    if len(found) != len(table):
+        raise FormatError.damaged(path, "a query has two questions")
+    if any(one.revision != revision for one in found.values()):
+        raise FormatError(f"{path} has questions for other demonstrations", mend)
+    if lacking := sorted({*split.episode_ids} - found.keys()):
+        raise FormatError(f"{path} lacks the question of {lacking[0]}", mend)
+    return found

@@ -1,0 +1,77 @@
+"""The stored first live views of queries, those under shifts too, which a split may have."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, SHIFTED
+from robomme_interference_data.errors import MissingFileError
+from robomme_interference_data.schema.shifts import SHIFTS, Shift
+from robomme_interference_data.storage.files import LocalFiles
+
+from .buffer import Buffer
+from .buffer_set import Split
+from .buffer_set_index import SplitIndex
+from .dataset import Dataset
+
+
+def live_frame(
+    split: Split, buffer: Buffer, shift: Shift | None, camera: str = "front"
+) -> NDArray[np.uint8]:
+    """Decode the stored first live view of a buffer's query, `(H, W, 3) uint8` RGB.
+
+    Args:
+        split: The split.
+        buffer: A buffer of it.
+        shift: How the scene differs from the lesson's; None if it does not.
+        camera: Name of the camera.
+
+    Raises:
+        UnknownNameError: There is no such camera, or no view of the query.
+        MissingFileError: The split has no views under shifts, or a file is missing.
+        FormatError, TruncatedVideoError: Its video cannot be read.
+    """
+    if shift is None:
+        return buffer.query.frame(camera)
+    views, place = _views(split), SHIFTS.index(shift)
+    [frame] = views.iter_frames(views.index_of(buffer.episode_id), camera, place, place + 1)
+    return frame
+
+
+def live_embedding(
+    split: Split, buffer: Buffer, shift: Shift | None, encoder: str, camera: str = "front"
+) -> NDArray[np.float32]:
+    """Look up the embedding of the stored first live view of a buffer's query, `(D,) float32`.
+
+    For grading without a simulator: in a rollout, what the robot sees is embedded then.
+
+    Args:
+        split: The split.
+        buffer: A buffer of it.
+        shift: As for `live_frame`.
+        encoder: Name of the encoder.
+        camera: Name of the camera.
+
+    Raises:
+        UnknownNameError, MissingFileError: As for `live_frame`.
+        MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
+    """
+    if shift is None:
+        return buffer.query_embedding(encoder, camera)
+    views, place = _views(split), SHIFTS.index(shift)
+    index = SplitIndex({DISTRACTORS: split.datasets[DISTRACTORS], SHIFTED: views}, encoder, camera)
+    return index.span(SHIFTED, views.index_of(buffer.episode_id), place, place + 1)[0]
+
+
+def _views(split: Split) -> Dataset:
+    if SHIFTED not in split.datasets:
+        what = f"{split.location} has no first live views under shifts"
+        if "tabletop" not in split.datasets[DEMONSTRATIONS].identity.simulators:
+            raise MissingFileError(what, "Only a split that was built from tabletop can have them.")
+        if not isinstance(split.files, LocalFiles):
+            raise MissingFileError(what, "Ask its publisher to add them.")
+        raise MissingFileError(
+            what,
+            f"Type: robomme-interference build {SHIFTED} --source tabletop --split test --out "
+            f"{split.location}/{SHIFTED}, then build manifests and index again.",
+        )
+    return split.datasets[SHIFTED]

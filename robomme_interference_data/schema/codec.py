@@ -1,0 +1,276 @@
+"""Rows and headers as frozen dataclasses: their Arrow schema and JSON follow from the fields.
+
+A field is text, a whole number, a number, a truth value, bytes (in tables only), an `EpisodeId`,
+another such record, a tuple of one of these, a map from text to one of these, or one of these or
+None. A record with a field `episode_id` also has the columns `family`, `split` and `index`, to
+filter by.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from itertools import accumulate
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import pyarrow as pa
+
+from robomme_interference_data.constants import FORMAT_VERSION
+from robomme_interference_data.errors import FormatError, first_line
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.storage.files import read_json
+
+_SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
+    str: (pa.string(), (str,), "text"),
+    int: (pa.int64(), (int,), "a whole number"),
+    float: (pa.float64(), (float, int), "a number"),
+    bool: (pa.bool_(), (bool,), "true or false"),
+    bytes: (pa.binary(), (bytes,), "bytes"),
+}
+_LARGEST = 1 << 63
+"""No whole number in a table is as large, and none in JSON may be."""
+
+_PARTS = {"family": pa.string(), "split": pa.string(), "index": pa.int64()}
+"""Columns that the field `episode_id` has beside its own."""
+
+
+def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
+    """Return the columns of a record.
+
+    Args:
+        record: The dataclass.
+        keys: Names that maps of text to text have; Arrow has them as structs.
+    """
+    return pa.schema(list(_codec(record).arrow(keys)))
+
+
+def to_dict(record: Any) -> dict[str, Any]:
+    """Return a record as plain values, for JSON and Arrow: columns in order."""
+    write = _codec(type(record)).write
+    plain: dict[str, Any] = write(record, {}) if write else record
+    return plain
+
+
+def to_table(records: Iterable[Any], schema: pa.Schema) -> pa.Table:
+    """Return records as a table; parts that records share are converted once."""
+    kept = list(records)  # alive, so that an id is one object's
+    shared: dict[int, Any] = {}
+    return pa.table([_column(field, kept, shared) for field in schema], schema=schema)
+
+
+def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> pa.Array:
+    """Return a column; of lists, each record that several lists share goes in once."""
+    if not records:
+        return pa.array([], field.type)
+    known = _names(records[0])
+    if field.name not in known:  # a part of the id
+        return pa.array([getattr(one.episode_id, field.name) for one in records], field.type)
+    values = [getattr(one, field.name) for one in records]
+    codec = _codec(get_type_hints(type(records[0]))[field.name])
+    if codec.write is None:
+        return pa.array(values, field.type)
+    if codec.item is None:
+        return pa.array([codec.write(one, shared) for one in values], field.type)
+    listed = [one for value in values for one in value]
+    distinct = {id(one): one for one in listed}
+    place = dict(zip(distinct, range(len(distinct)), strict=True))
+    items = pa.array(
+        [codec.item(one, shared) for one in distinct.values()], field.type.value_type
+    ).take(pa.array([place[id(one)] for one in listed], pa.int64()))
+    offsets = pa.array([0, *accumulate(map(len, values))], pa.int32())
+    return pa.ListArray.from_arrays(offsets, items, type=field.type)
+
+
+def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:
+    """Yield the records of a table's rows; further columns are left aside.
+
+    Raises:
+        FormatError: A column is missing or of another type, or a value is not what it should be;
+            `path` is named.
+    """
+    names = _names(record)
+    if missing := [name for name in names if name not in table.column_names]:
+        raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
+    return (from_dict(record, row, path) for row in table.select(names).to_pylist())
+
+
+def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = False) -> T:
+    """Return the record that plain values stand for; the inverse of `to_dict`.
+
+    Args:
+        record: The dataclass.
+        value: What was read.
+        path: Where, for messages.
+        strict: Refuse names that the record does not have.
+
+    Raises:
+        FormatError: A value is missing, or not of its field's type, or contradicts another.
+    """
+    try:
+        if strict and isinstance(value, Mapping):
+            names = _names(record)
+            known = {*names, *_PARTS} if "episode_id" in names else {*names}
+            if unknown := sorted(map(str, value.keys() - known)):
+                raise ValueError(f"unknown {', '.join(unknown)}")
+        found: T = _codec(record).read(value)
+        return found
+    except ValueError as error:
+        raise FormatError.damaged(path, first_line(error)) from None
+
+
+def read_header[T](path: Path, record: type[T]) -> T:
+    """Read a JSON file with a `format_version` as a record.
+
+    Raises:
+        FormatError: It is damaged, or of a format version that this package does not know.
+    """
+    value = read_json(path)
+    if "format_version" in _names(record):
+        version = value.get("format_version")
+        if version != FORMAT_VERSION:
+            raise FormatError(
+                f"{path} has format version {version!r}; this package reads {FORMAT_VERSION}",
+                "Install the version of robomme-interference-data that wrote it, or make it again.",
+            )
+    return from_dict(record, value, path, strict=True)
+
+
+def _names(record: Any) -> list[str]:
+    return [field.name for field in fields(record)]
+
+
+# --- what follows from a type ------------------------------------------------------------------
+
+_Writer = Callable[[Any, dict[int, Any]], Any]
+"""From a value to a plain one; what is shared by many rows is remembered by its id."""
+
+
+@dataclass(frozen=True)
+class _Codec:
+    """How values of a type are kept: its Arrow type, given the keys of maps, and both ways.
+
+    There is no `write` where values are plain already. Of a list, `item` writes one of its values.
+    """
+
+    arrow: Callable[[Sequence[str]], pa.DataType]
+    read: Callable[[Any], Any]
+    write: _Writer | None = None
+    optional: bool = False
+    item: _Writer | None = None
+
+
+def _codec_of(hint: Any) -> _Codec:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (UnionType, Union):
+        return _or_none(_codec(next(part for part in arguments if part is not NoneType)))
+    if hint in _SCALARS:
+        kind, types, expected = _SCALARS[hint]
+
+        def scalar(value: Any) -> Any:
+            if type(value) is not hint:
+                _of(types, value, expected)
+            if type(value) is int and not -_LARGEST <= value < _LARGEST:
+                raise ValueError(f"a number of {value.bit_length()} bits; expected at most 64")
+            return value if type(value) is hint else hint(value)
+
+        return _Codec(lambda keys: kind, scalar)
+    if hint is EpisodeId:
+        write = _remembered(lambda value, shared: str(value))
+        return _Codec(lambda keys: pa.string(), EpisodeId.parse, write)
+    if is_dataclass(hint):
+        return _record(hint)
+    if origin in (tuple, dict):
+        return _list(_codec(arguments[0])) if origin is tuple else _map(_codec(arguments[1]))
+    return _Codec(lambda keys: pa.null(), lambda value: value)
+
+
+_codec: Callable[[Any], _Codec] = cache(_codec_of)
+
+
+def _or_none(plain: _Codec) -> _Codec:
+    read, write = plain.read, plain.write
+    return _Codec(
+        plain.arrow,
+        lambda value: None if value is None else read(value),
+        write and (lambda value, shared: None if value is None else write(value, shared)),
+        optional=True,
+    )
+
+
+def _list(item: _Codec) -> _Codec:
+    read, write = item.read, item.write
+    return _Codec(
+        lambda keys: pa.list_(pa.field("item", item.arrow(keys), nullable=False)),
+        lambda value: tuple(map(read, _of((list, tuple), value, "a list"))),
+        lambda value, shared: [write(one, shared) for one in value] if write else list(value),
+        item=write,
+    )
+
+
+def _map(item: _Codec) -> _Codec:
+    read, write = item.read, item.write
+
+    def checked(value: Any) -> Any:
+        items = _of((dict,), value, "a map").items()
+        return {_of((str,), key, "text"): read(one) for key, one in items}
+
+    return _Codec(
+        lambda keys: pa.struct([pa.field(key, item.arrow(keys), nullable=False) for key in keys]),
+        checked,
+        write and (lambda value, shared: {key: write(one, shared) for key, one in value.items()}),
+    )
+
+
+def _record(record: Any) -> _Codec:
+    hints = get_type_hints(record)
+    codecs = {name: _codec(hints[name]) for name in _names(record)}
+    identified = "episode_id" in codecs
+
+    def arrow(keys: Sequence[str]) -> pa.DataType:
+        found = []
+        for name, codec in codecs.items():
+            found.append(pa.field(name, codec.arrow(keys), nullable=codec.optional))
+            if name == "episode_id":
+                found += [pa.field(part, kind, nullable=False) for part, kind in _PARTS.items()]
+        return pa.struct(found)
+
+    def read(value: Any) -> Any:
+        given = _of((dict,), value, "a map")
+        found = {}
+        for name, codec in codecs.items():
+            if name not in given and not codec.optional:
+                raise ValueError(f"{name} is missing")
+            try:
+                found[name] = codec.read(given.get(name))
+            except ValueError as error:
+                raise ValueError(f"{name}: {first_line(error)}") from None
+        return record(**found)
+
+    def write(value: Any, shared: dict[int, Any]) -> Any:
+        found = {}
+        for name, codec in codecs.items():
+            one = getattr(value, name)
+            found[name] = one if codec.write is None else codec.write(one, shared)
+        if identified:
+            found |= {part: getattr(value.episode_id, part) for part in _PARTS}
+        return found
+
+    return _Codec(arrow, read, _remembered(write))
+
+
+def _remembered(write: _Writer) -> _Writer:
+    def found(value: Any, shared: dict[int, Any]) -> Any:
+        plain = shared.get(id(value))
+        if plain is None:
+            plain = shared[id(value)] = write(value, shared)
+        return plain
+
+    return found
+
+
+def _of(types: tuple[type, ...], value: Any, expected: str) -> Any:
+    if type(value) not in types:
+        shown = repr(value)
+        raise ValueError(f"{shown if len(shown) < 80 else shown[:77] + '…'}; expected {expected}")
+    return value

@@ -1,0 +1,230 @@
+"""Encode frames with PyAV: as video, for datasets and clips, and as PNG; decode single images."""
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.codec.codec import UnknownCodecError
+from numpy.typing import NDArray
+
+from robomme_interference_data.constants import KEY_FRAMES
+from robomme_interference_data.errors import BuildError, FormatError, InvalidOptionError
+
+from .video import MOST_PIXELS
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+
+
+@dataclass(frozen=True)
+class Codec:
+    """Video settings, in LeRobot's terms (`RGBEncoderConfig`).
+
+    Attributes:
+        name: Name on the command line.
+        vcodec: FFmpeg encoder.
+        pix_fmt: Pixel format.
+        settings: Further arguments of `RGBEncoderConfig`.
+        options: What they become for FFmpeg; a test holds the two against each other.
+        exact: Whether decoding gives back the very pixels.
+        min_side: Smallest height and width in pixels that the encoder takes.
+    """
+
+    name: str
+    vcodec: str
+    pix_fmt: str
+    settings: Mapping[str, Any]
+    options: Mapping[str, str]
+    exact: bool
+    min_side: int = 1
+
+
+_AOM_LOSSLESS = {"usage": 1, "cpu-used": 8, "row-mt": 1, "aom-params": "lossless=1"}
+
+CODECS = {
+    codec.name: codec
+    for codec in (
+        # Exact in PyAV, torchcodec and browsers; key frames are near and nothing is reordered, so
+        # that seeking is safe.
+        Codec(
+            name="av1-lossless",
+            vcodec="libaom-av1",
+            pix_fmt="gbrp",
+            settings={"g": KEY_FRAMES, "crf": None, "extra_options": _AOM_LOSSLESS},
+            options={"g": str(KEY_FRAMES)}
+            | {name: str(value) for name, value in _AOM_LOSSLESS.items()},
+            exact=True,
+        ),
+        Codec(
+            name="lerobot-default",
+            vcodec="libsvtav1",
+            pix_fmt="yuv420p",
+            settings={"g": 2, "crf": 30, "preset": 12},
+            options={"g": "2", "crf": "30", "preset": "12", "svtav1-params": "fast-decode=0"},
+            exact=False,
+            min_side=64,  # SVT-AV1 crashes on some smaller frames
+        ),
+    )
+}
+"""The codecs that a dataset can be built with, by name."""
+
+
+CLIP = Codec(
+    name="clip",
+    vcodec="libx264",
+    pix_fmt="yuv420p",
+    settings={},
+    # With its macroblock tree, x264 gives other bytes each time unless both sides are multiples of
+    # 16: it reads memory that nobody has written.
+    options={"crf": "22", "preset": "veryfast", "x264-params": "mbtree=0"},
+    exact=False,
+)
+"""Clips of rollouts, to look at in any player: H.264 in MP4; even heights and widths."""
+
+
+def get_codec(name: str) -> Codec:
+    """Return a codec by name.
+
+    Raises:
+        InvalidOptionError: There is no such codec.
+    """
+    if name not in CODECS:
+        raise InvalidOptionError.one_of("codec", name, CODECS)
+    return CODECS[name]
+
+
+class VideoEncoder:
+    """Writes frames to one video file, in the calling thread: none can be dropped.
+
+    Args:
+        path: File to write.
+        codec: Settings.
+        fps: Frame rate in Hz.
+        height: Rows of pixels.
+        width: Columns of pixels.
+        container: FFmpeg's name of the container; None if the path's suffix says it.
+
+    Raises:
+        BuildError: The file cannot be written, or the frames are too small for the codec.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        codec: Codec,
+        fps: int,
+        height: int,
+        width: int,
+        container: str | None = None,
+    ):
+        if min(height, width) < codec.min_side:
+            raise BuildError(
+                f"{path.stem}: frames of {width}×{height} pixels are too small for {codec.name}, "
+                f"which takes {codec.min_side}×{codec.min_side} and more",
+                "Use --codec av1-lossless.",
+            )
+        self._path = path
+        os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
+        with self._errors():
+            # No version of FFmpeg is written then.
+            self._container = av.open(
+                str(path), "w", format=container, container_options={"fflags": "+bitexact"}
+            )
+            self._stream = self._container.add_stream(
+                codec.vcodec, rate=fps, options=dict(codec.options)
+            )
+        self._stream.pix_fmt = codec.pix_fmt
+        self._stream.height = height
+        self._stream.width = width
+        self._stream.codec_context.thread_count = 1  # episodes are encoded side by side instead
+        self._time_base = Fraction(1, fps)
+        self._stream.time_base = self._time_base
+        self._count = 0
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Encode the next frame, `(H, W, 3) uint8` RGB."""
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame.pts = self._count
+        frame.time_base = self._time_base
+        with self._writing():
+            self._container.mux(self._stream.encode(frame))
+        self._count += 1
+
+    def close(self) -> None:
+        """Write what is pending and close the file."""
+        with self._writing():
+            self._container.mux(self._stream.encode(None))
+            self._container.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            with self._errors():
+                yield
+        except BuildError:
+            # PyAV would close it when it is collected, and print what fails once more by then.
+            with suppress(av.error.FFmpegError):
+                self._container.close()
+            raise
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (av.error.FFmpegError, UnknownCodecError) as error:
+            raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Return an image, `(H, W, 3) uint8` RGB, as PNG: nothing of it is lost."""
+    height, width, _ = image.shape
+    encoder = av.CodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = width, height, "rgb24"
+    packets = [*encoder.encode(av.VideoFrame.from_ndarray(image, "rgb24")), *encoder.encode(None)]
+    return b"".join(map(bytes, packets))
+
+
+def is_png(data: bytes) -> bool:
+    """Tell whether an encoded image is a PNG.
+
+    Raises:
+        FormatError: It is neither PNG nor JPEG.
+    """
+    if data.startswith(_PNG):
+        return True
+    if data.startswith(_JPEG):
+        return False
+    raise FormatError(
+        f"an image starts with the bytes {data[:8].hex(' ') or '(none)'}; expected PNG or JPEG",
+        "Store images as PNG: it is exact.",
+    )
+
+
+def decode_image(data: bytes) -> NDArray[np.uint8]:
+    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB; transparency is left out.
+
+    Raises:
+        FormatError: It is neither, damaged, or has more than 8 bits a channel.
+    """
+    codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
+    codec.thread_count = 1
+    # Without these, a PNG with a broken checksum is decoded as if nothing were wrong.
+    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(MOST_PIXELS)}
+    try:
+        frames = codec.decode(av.Packet(data)) + codec.decode(None)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise FormatError(f"an image is damaged: {error}") from None
+    if len(frames) != 1:
+        raise FormatError(f"an image is damaged: it decodes to {len(frames)} frames")
+    depth = max(component.bits for component in frames[0].format.components)
+    if depth > 8:
+        raise FormatError(
+            f"an image has {depth} bits a channel ({frames[0].format.name}); expected 8",
+            "Convert the images to 8 bits a channel.",
+        )
+    return frames[0].to_ndarray(format="rgb24")

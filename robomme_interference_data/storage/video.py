@@ -1,0 +1,183 @@
+"""Decode spans of frames from a video file: the only place that reads video.
+
+A LeRobot v3 video file holds many episodes one after the other at a constant frame rate, so a
+frame is named by its number in the file: its presentation time multiplied by the rate.
+"""
+
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import FormatError, MissingFileError, TruncatedVideoError
+
+from .untrusted.video_boxes import find_container, unreadable
+
+MOST_PIXELS = 1 << 24
+"""Pixels of a frame, at most: twice those of 3840 × 2160."""
+
+_LATEST = 1 << 62
+"""What FFmpeg can seek to, in ticks of a container."""
+
+_DECODERS = (
+    *("libdav1d", "libaom-av1", "av1", "h264", "hevc", "vp8", "vp9", "mpeg4", "mjpeg"),
+    *("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "qtrle"),
+)
+"""Decoders that are used, of FFmpeg's hundreds: those of LeRobot's codecs, and lossless ones."""
+
+
+def iter_frames(
+    path: Path,
+    start: int,
+    stop: int | None,
+    fps: float,
+    shape: tuple[int, ...] | None = None,
+) -> Generator[NDArray[np.uint8]]:
+    """Decode the frames `start` (included) to `stop` (excluded) of a video file, in order.
+
+    Decoding runs on the calling thread and holds one frame at a time. Every frame's presentation
+    time is checked, so that a frame can neither be missing nor come twice.
+
+    Args:
+        path: The video file.
+        start: Number of the first frame in the file.
+        stop: Number after the last frame; None for all that there are.
+        fps: Constant frame rate of the file, in Hz.
+        shape: Shape that every frame must have, `(H, W, 3)`; None for any.
+
+    Yields:
+        Frames, `(H, W, 3) uint8` RGB. The array is the caller's.
+
+    Raises:
+        MissingFileError: There is no such file.
+        FormatError: The file is not a video, its frames are not evenly spaced at `fps`, or they
+            are of another shape.
+        TruncatedVideoError: The file ends before `stop`, or a frame is missing.
+    """
+    expected = start
+    with closing(_indexed_frames(path, start, fps, shape)) as frames:
+        if stop is not None and start >= stop:
+            return
+        for number, frame in frames:
+            if number != expected:
+                raise TruncatedVideoError(
+                    f"{path}: frame {expected} is missing (the next one found is {number})",
+                    "The file is damaged: download or build it again.",
+                )
+            if shape is not None:
+                _check_shape(path, (frame.height, frame.width), shape)
+            yield _to_rgb(path, frame)
+            expected += 1
+            if expected == stop:
+                return
+    if stop is not None or expected == start:
+        wanted = "at least one frame" if stop is None else f"frames {start} to {stop - 1}"
+        raise TruncatedVideoError(
+            f"{path}: the video ends before frame {expected}; expected {wanted}",
+            "The file is damaged or incomplete: download or build it again.",
+        )
+
+
+def _to_rgb(path: Path, frame: av.VideoFrame) -> NDArray[np.uint8]:
+    try:
+        # Planar RGB (the lossless codec) is only re-arranged, without the colour converter.
+        planar = frame.format.name == "gbrp"
+        return frame.to_ndarray() if planar else frame.to_ndarray(format="rgb24")
+    except (av.error.FFmpegError, ValueError) as error:
+        raise FormatError.damaged(path, f"a frame has no colours: {error}") from None
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Open a video file and its first video stream, before anything is decoded.
+
+    Raises:
+        MissingFileError: There is no such file.
+        FormatError: It is not a video, or one that declares more than is read.
+    """
+    limits = {"max_pixels": str(MOST_PIXELS)}
+    allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
+    try:
+        kind = find_container(path)
+        container = av.open(str(path), format=kind, options=limits, container_options=allowed)
+    except FileNotFoundError:
+        raise MissingFileError(f"{path} does not exist") from None
+    except FormatError:
+        raise
+    except (av.error.FFmpegError, OSError, ValueError) as error:  # ValueError: a damaged header
+        raise unreadable(path, error) from error
+    with container:
+        if not container.streams.video:
+            raise FormatError(f"{path} holds no video stream")
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        if context is None:  # a header cut short; PyAV would crash the process
+            raise unreadable(path, "its codec is not known")
+        if context.name not in _DECODERS or not stream.time_base:
+            what = f"codec {context.name}, time base {stream.time_base}"
+            raise unreadable(path, what)
+        if context.width * context.height > MOST_PIXELS:
+            raise unreadable(path, f"frames of {context.width}×{context.height} pixels")
+        context.options = limits
+        stream.thread_count = 1  # sessions are decoded side by side instead
+        yield container, stream
+
+
+def _indexed_frames(
+    path: Path, start: int, fps: float, shape: tuple[int, ...] | None
+) -> Generator[tuple[int, av.VideoFrame]]:
+    """Yield `(number, frame)` from frame `start` on."""
+    with open_video(path) as (container, stream):
+        if shape is not None:
+            _check_shape(path, (stream.height, stream.width), shape)
+        tick = float(stream.time_base) * fps
+        if start / tick >= _LATEST:
+            raise FormatError.damaged(path, f"no video has a frame {start} at {fps:g} Hz")
+        try:
+            if start > 0:
+                container.seek(round(start / tick), stream=stream, backward=True)
+            first = True
+            for frame in container.decode(stream):
+                number = _number(path, frame, tick, fps)
+                if first and number > start:
+                    # The seek index was off (some muxers mark no earlier key frame): read from
+                    # the beginning instead, slower and always right.
+                    container.seek(0, stream=stream, backward=True)
+                    yield from (
+                        (n, f)
+                        for f in container.decode(stream)
+                        if (n := _number(path, f, tick, fps)) >= start
+                    )
+                    return
+                first = False
+                if number >= start:
+                    yield number, frame
+        except av.error.FFmpegError as error:
+            raise TruncatedVideoError(
+                f"{path}: decoding stopped: {error}",
+                "The file is damaged or incomplete: download or build it again.",
+            ) from error
+
+
+def _check_shape(path: Path, found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    if found != shape[:2]:
+        raise FormatError(
+            f"{path}: frames are {found[1]}×{found[0]} pixels; the dataset's info.json says "
+            f"{shape[1]}×{shape[0]}"
+        )
+
+
+def _number(path: Path, frame: av.VideoFrame, tick: float, fps: float) -> int:
+    if frame.pts is None:
+        raise FormatError(f"{path}: a frame has no presentation time")
+    position = frame.pts * tick
+    number = round(position)
+    if abs(position - number) > 0.1:
+        raise FormatError(
+            f"{path}: a frame lies at {position / fps:.4f} s, between frames {int(position)} and "
+            f"{int(position) + 1} at {fps:g} frames per second"
+        )
+    return number

@@ -1,0 +1,263 @@
+"""Figures saved as PNG or SVG with the same bytes each time, and a page to draw on by inches.
+
+`open_figure` is the one place where matplotlib is set up. On a page, lengths are inches from the
+upper left corner, y going down; font sizes and line widths are points.
+"""
+
+import gc
+import warnings
+from bisect import bisect_right
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from robomme_interference_data.errors import InvalidOptionError, MissingExtraError
+from robomme_interference_data.storage.files import atomic_path
+
+INK, GREY = "#222222", "#767676"
+
+
+class Hue:
+    """Okabe and Ito's colours, which people with a colour vision deficiency can tell apart, too."""
+
+    BLUE, SKY, GREEN, YELLOW = "#0072B2", "#56B4E9", "#009E73", "#F0E442"
+    ORANGE, VERMILION, PINK = "#E69F00", "#D55E00", "#CC79A7"
+
+
+_DPI = 180
+MAKER = "robomme-interference"
+"""What a picture says that it was made by."""
+
+_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": MAKER},
+    ".svg": {"Creator": MAKER, "Date": None, "Format": None, "Type": None},
+}
+"""For each suffix that can be written, what it says; without matplotlib's version and the date."""
+
+
+@contextmanager
+def open_page(out: Path, width: float) -> Iterator["Page"]:
+    """Give a page that is written to `out`, atomically, when the block ends without an error.
+
+    The reader's own matplotlib settings have no effect. The same drawing gives the same bytes
+    with the same version of matplotlib.
+
+    Args:
+        out: File to write, `.png` or `.svg`.
+        width: Width of the page in inches; its height is set in the block.
+
+    Raises:
+        InvalidOptionError: `out` has another suffix or cannot be written.
+        MissingExtraError: matplotlib is not installed.
+    """
+    _suffix(out)  # before anything is drawn
+    with open_figure() as figure:
+        page = Page(figure, width)
+        yield page
+        figure.set_size_inches(width, page.height)
+        page.axes.set(xlim=(0, width), ylim=(page.height, 0))
+        save_figure(figure, out)
+
+
+@contextmanager
+def open_figure() -> Iterator[Any]:
+    """Give an empty white matplotlib `Figure`; the reader's own settings have no effect.
+
+    It is drawn, and saved with `save_figure`, inside the block.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib.style
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError.needs("drawing", "matplotlib", "score") from error
+    settings: dict[str, Any] = {"svg.hashsalt": MAKER, "image.composite_image": False}
+    names = ("text.color", "axes.labelcolor", "xtick.color", "ytick.color")
+    settings |= dict.fromkeys(names, INK)
+    settings |= {"svg.fonttype": "none"}  # text stays text: small, quick, to be found and read out
+    settings |= {"font.sans-serif": ["DejaVu Sans", "Verdana"]}  # it is named with each text
+    with (
+        matplotlib.style.context("default"),
+        matplotlib.rc_context(settings),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        # Of so many objects the search for garbage takes a fifth of the time.
+        searched = gc.isenabled()
+        gc.disable()
+        try:
+            yield Figure(facecolor="white")
+        finally:
+            if searched:
+                gc.enable()
+
+
+def save_figure(figure: Any, out: Path) -> None:
+    """Write a figure to `.png` or `.svg`, atomically, without the date and the version.
+
+    Raises:
+        InvalidOptionError: `out` has another suffix or cannot be written.
+    """
+    suffix = _suffix(out)
+    try:
+        with atomic_path(out) as partial:
+            figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=_METADATA[suffix])
+    except OSError as error:
+        raise InvalidOptionError(
+            f"{out} cannot be written: {error.strerror or error}", "Choose another file."
+        ) from error
+
+
+def _suffix(out: Path) -> str:
+    suffix = out.suffix.lower()
+    if suffix not in _METADATA:
+        raise InvalidOptionError.expected(
+            "picture",
+            str(out),
+            f"a name that ends in {' or '.join(_METADATA)}",
+            f"For example: {out.with_suffix('.png') if out.name else out / 'strip.png'}",
+        )
+    return suffix
+
+
+class Page:
+    """A page to draw on; made by `open_page`. What is drawn later lies on top, text uppermost.
+
+    Attributes:
+        height: Height in inches; to be set before the page is saved.
+    """
+
+    def __init__(self, figure: Any, width: float):
+        self.figure = figure
+        self.height = width
+        self.axes = figure.add_axes((0, 0, 1, 1))
+        self.axes.set_axis_off()
+
+    def text_width(self, text: str, size: float, *, bold: bool = False) -> float:
+        """Return the width of a line of text in inches."""
+        from matplotlib.font_manager import FontProperties
+        from matplotlib.textpath import text_to_path
+
+        font = FontProperties(size=size, weight="bold" if bold else "normal")
+        return text_to_path.get_text_width_height_descent(text, font, ismath=False)[0] / 72
+
+    def wrap(self, text: str, size: float, width: float, *, most: int) -> list[str]:
+        """Break a text into at most `most` lines; what is too much stays in the last."""
+        lines: list[str] = []
+        for word in _printable(text).split():
+            longer = f"{lines[-1]} {word}" if lines else word
+            if lines and (len(lines) == most or self.text_width(longer, size) <= width):
+                lines[-1] = longer
+            else:
+                lines.append(word)
+        return lines
+
+    def text(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        size: float,
+        *,
+        width: float | None = None,
+        align: str = "center",
+        bold: bool = False,
+        color: str = "black",
+        turned: bool = False,
+    ) -> None:
+        """Write a line under `y`, in black or a colour.
+
+        Text that is wider than `width` gets smaller, by a quarter at most, and then loses its
+        middle. `turned` text reads upwards.
+        """
+        text = _printable(text)
+        if width is not None and (measured := self.text_width(text, size, bold=bold)) > width:
+            size *= max(0.75, width / measured)
+            if 0.75 * measured > width:
+                text = self._shortened(text, size, width, bold)
+        self.axes.text(
+            x,
+            y,
+            text,
+            size=size,
+            weight="bold" if bold else "normal",
+            color=color,
+            horizontalalignment=align,
+            verticalalignment="top",
+            rotation=90 if turned else 0,
+            parse_math=False,  # a goal may hold dollar signs
+        )
+
+    def _shortened(self, text: str, size: float, width: float, bold: bool) -> str:
+        def keep(count: int) -> str:
+            return text[: (count + 1) // 2] + "…" + text[len(text) - count // 2 :]
+
+        fitting = bisect_right(
+            range(1, len(text)), width, key=lambda n: self.text_width(keep(n), size, bold=bold)
+        )
+        return keep(fitting)
+
+    def picture(
+        self, image: NDArray[Any], x: float, y: float, width: float, *, line: float = 0.5
+    ) -> float:
+        """Draw an image, `(H, W, 3) uint8` RGB, with an outline; returns its height."""
+        height = width * image.shape[0] / image.shape[1]
+        extent = (x, x + width, y + height, y)
+        self.axes.imshow(image, extent=extent, aspect="auto", zorder=1)
+        self.box(x, y, width, height, fill="none", edge="black", line=line)
+        return height
+
+    def box(
+        self, x: float, y: float, width: float, height: float, *, fill: str, edge: str, line: float
+    ) -> None:
+        """Draw a rectangle."""
+        from matplotlib.patches import Rectangle
+
+        self.axes.add_patch(
+            Rectangle((x, y), width, height, facecolor=fill, edgecolor=edge, linewidth=line)
+        )
+
+    def tick(self, x: float, top: float, bottom: float) -> None:
+        """Draw a short upright line."""
+        self.axes.vlines(x, top, bottom, color="black", linewidth=0.7)
+
+    def arrow(self, left: float, right: float, y: float) -> None:
+        """Draw an arrow to the right."""
+        style = {"arrowstyle": "-|>", "facecolor": "black", "linewidth": 0.8, "shrinkA": 0}
+        self.axes.annotate(
+            "", (right, y), (left, y), arrowprops=style | {"shrinkB": 0, "mutation_scale": 7}
+        )
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def tidy(axes: Any) -> None:
+    """Take away from axes what carries nothing."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+    axes.tick_params(colors=INK, labelsize=8, length=3)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def tint(color: str, share: float) -> str:
+    """Return a colour (`#rrggbb`) mixed with white, of which it makes up `share`."""
+    return "#" + "".join(f"{round(255 * (1 - share * (1 - v))):02x}" for v in _rgb(color))
+
+
+def ink_on(color: str) -> str:
+    """Return the ink, black or white, that has the higher contrast (WCAG 2) on a colour."""
+    linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in _rgb(color)]
+    luminance = sum(w * v for w, v in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    return "black" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "white"
+
+
+def _rgb(color: str) -> list[float]:
+    return [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]

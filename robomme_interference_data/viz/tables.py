@@ -1,0 +1,209 @@
+"""Tables as data, for terminals, and as CSV and Markdown: the one renderer of all of them."""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from textwrap import wrap
+from typing import Any, Literal, Self, cast
+
+import pyarrow as pa
+
+from robomme_interference_data.errors import visible
+from robomme_interference_data.schema.codec import arrow_schema, to_dict
+
+Kind = Literal["text", "count", "rate", "points", "ratio", "p", "flag"]
+
+
+class Provisional(float):
+    """A p-value of what is not complete yet: readers see it marked †."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column.
+
+    Attributes:
+        name: Its name.
+        kind: How values are shown. `rate` and `points` are fractions: Markdown shows percent and
+            percentage points, CSV the fraction with six digits after the point.
+    """
+
+    name: str
+    kind: Kind = "text"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under columns; None and NaN are empty cells.
+
+    Attributes:
+        name: Name of its files.
+        title: What it shows, in a line.
+        columns: The columns.
+        rows: A tuple of values a row.
+        note: How to read it, in a sentence or two.
+    """
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    note: str = ""
+
+    @classmethod
+    def make(
+        cls, name: str, title: str, columns: str, rows: Iterable[tuple[Any, ...]], note: str = ""
+    ) -> Self:
+        """Return a table whose columns are given as text, such as `system n:count rate:rate`."""
+        named = (column.partition(":") for column in columns.split())
+        found = tuple(Column(name, cast(Kind, kind or "text")) for name, _, kind in named)
+        return cls(name, title, found, tuple(rows), note)
+
+    @classmethod
+    def of(cls, record: type, rows: Iterable[Any], name: str, title: str) -> Self:
+        """Return records of one type as a table: the columns are those of its Arrow schema."""
+        kinds: dict[Any, Kind] = {pa.int64(): "count", pa.float64(): "ratio", pa.bool_(): "flag"}
+        schema = arrow_schema(record)
+        columns = tuple(Column(field.name, kinds.get(field.type, "text")) for field in schema)
+        plain = map(to_dict, rows)
+        return cls(name, title, columns, tuple(tuple(map(r.get, schema.names)) for r in plain))
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return the rows by column name, NaN as None, for JSON."""
+        names = [column.name for column in self.columns]
+        return [dict(zip(names, map(_known, row), strict=True)) for row in self.rows]
+
+    def csv(self) -> str:
+        """Return the table as CSV."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow([column.name for column in self.columns])
+        for row in self.rows:
+            writer.writerow([_plain(v, c.kind) for v, c in zip(row, self.columns, strict=True)])
+        return out.getvalue()
+
+    def cells(self, row: Sequence[Any]) -> list[str]:
+        """Return a row as a reader sees it."""
+        return [_shown(v, c.kind) for v, c in zip(row, self.columns, strict=True)]
+
+    def markdown(self) -> str:
+        """Return the table as Markdown, under its title."""
+        return (
+            "\n\n".join(part for part in (f"# {self.title}", self.grid(), self.note) if part) + "\n"
+        )
+
+    def grid(self) -> str:
+        """Return the table as Markdown, without title and note."""
+        rule = ["---" if column.kind in ("text", "flag") else "---:" for column in self.columns]
+        heads = [column.name.replace("_", " ") for column in self.columns]
+        cells = ([cell.replace("|", "\\|") for cell in self.cells(row)] for row in self.rows)
+        return "\n".join(f"| {' | '.join(line)} |" for line in [heads, rule, *cells])
+
+    def latex(self) -> str:
+        """Return the table as LaTeX, for the package booktabs; title and note are comments."""
+        sides = ["l" if column.kind in ("text", "flag") else "r" for column in self.columns]
+        heads = [column.name.replace("_", " ") for column in self.columns]
+        head, *lines = (
+            " & ".join(map(_tex, line)) for line in [heads, *map(self.cells, self.rows)]
+        )
+        body = "".join(f"{line} \\\\\n" for line in lines)
+        note = "".join(f"% {line}\n" for line in wrap(self.note, 96))
+        return (
+            f"% {self.title}\n\\begin{{tabular}}{{{''.join(sides)}}}\n\\toprule\n{head} \\\\\n"
+            f"\\midrule\n{body}\\bottomrule\n\\end{{tabular}}\n{note}"
+        )
+
+    def html(self) -> str:
+        """Return the table as HTML, under its title."""
+        sides = ["left" if column.kind in ("text", "flag") else "right" for column in self.columns]
+
+        def line(tag: str, cells: Sequence[str]) -> str:
+            found = (
+                f'<{tag} style="text-align: {side}">{escape(cell)}</{tag}>'
+                for side, cell in zip(sides, cells, strict=True)
+            )
+            return f"<tr>{''.join(found)}</tr>"
+
+        heads = line("th", [column.name.replace("_", " ") for column in self.columns])
+        rows = "".join(line("td", self.cells(row)) for row in self.rows)
+        table = f"<table><thead>{heads}</thead><tbody>{rows}</tbody></table>"
+        return f"<p>{escape(self.title)}</p>{table}<p>{escape(self.note)}</p>"
+
+    def text(self) -> str:
+        """Return the table for a terminal: aligned, under its title, the note below."""
+        heads = [column.name.replace("_", " ") for column in self.columns]
+        lines = [heads, *(self.cells(row) for row in self.rows)]
+        widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+        sides = ["<" if column.kind in ("text", "flag") else ">" for column in self.columns]
+        laid = [
+            "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip()
+            for line in lines
+        ]
+        text = "\n".join([laid[0], "  ".join("-" * width for width in widths), *laid[1:]])
+        return visible("\n\n".join(part for part in (self.title, text, self.note) if part))
+
+
+_TEX = {one: f"\\{one}" for one in "&%$#_{}"}
+_TEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_TEX |= {"−": "$-$", "–": "--", "<": "$<$", ">": "$>$", "×": r"$\times$", "π": r"$\pi$"}
+_TEX |= {"†": r"\textdagger{}", "±": r"$\pm$", "₂": "$_2$"}
+
+
+def _tex(text: str) -> str:
+    """Return a cell as LaTeX; what stands between `**` is bold."""
+    plain, *bold = text.split("**")
+    told = "".join(_TEX.get(one, one) for one in plain)
+    if not bold:
+        return told
+    inner, *rest = bold
+    return f"{told}\\textbf{{{_tex(inner)}}}{_tex('**'.join(rest))}"
+
+
+def percent(value: float) -> str:
+    """Return a fraction as percent, `44.9%`."""
+    return f"{100 * value:.1f}%"
+
+
+def points(value: float) -> str:
+    """Return a difference of fractions in percentage points, `+27.1` or `−3.0`."""
+    text = f"{100 * value:+.1f}"
+    return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
+
+
+def p_text(value: float) -> str:
+    """Return a p-value as `0.031` or `< 0.001`, a provisional one with †."""
+    text = "< 0.001" if value < 0.001 else f"{value:.3f}"
+    return f"{text}†" if isinstance(value, Provisional) else text
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _plain(value: Any, kind: Kind) -> str:
+    value = _known(value)
+    if value is None:
+        return ""
+    if kind == "flag":
+        return "yes" if value else "no"
+    if kind in ("rate", "points", "ratio"):
+        text = f"{value:.6f}"
+        return "0.000000" if text == "-0.000000" else text
+    return f"{value:.6g}" if kind == "p" else str(value)
+
+
+def _shown(value: Any, kind: Kind) -> str:
+    value = _known(value)
+    if value is None:
+        return ""
+    shapes: dict[str, Callable[[Any], str]] = {
+        "rate": percent,
+        "points": points,
+        "ratio": lambda v: f"{round(v, 2) + 0.0:.2f}".replace("-", "−"),
+        "p": p_text,
+        "count": lambda v: f"{v:,}",
+    }
+    return shapes.get(kind, lambda v: _plain(v, kind))(value)
