@@ -31,21 +31,23 @@ demo: install  ## Set up, then go the whole way on real or recorded episodes.
 test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.
 	@$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-check: setup types  ## Lint, check the format and the types.
+check: setup types  ## Lint; check the format, the types and who imports whom.
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy build/typecheck/robomme_interference_data
+	@cd build/typecheck && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-logo
 
 format: setup  ## Mend what ruff can mend.
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-# Type checkers do not follow the mapping of pyproject.toml: links lay the package out as installed.
+# Type checkers and import-linter do not follow the mapping of pyproject.toml: this lays the package
+# out as it is installed, with hard links, as import-linter follows no folder that is a link.
 types:
 	@rm -rf build/typecheck
-	@mkdir -p build/typecheck/robomme_interference_data
-	@ln -s $(addprefix $(CURDIR)/,$(wildcard robomme_interference_data/*) $(AREAS)) \
-	  build/typecheck/robomme_interference_data/
+	@mkdir -p build/typecheck
+	@cp -al robomme_interference_data build/typecheck/
+	@cp -al $(AREAS) build/typecheck/robomme_interference_data/
 
 bench: setup  ## Run every benchmark.
 	@for file in $(sort $(wildcard benchmarks/*.py)); do echo "== $$file"; $(BIN)/python "$$file"; done
