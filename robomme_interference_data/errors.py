@@ -1,8 +1,8 @@
 """Every error that this package raises on purpose.
 
-Each is also a fitting builtin, so that callers can catch either, and carries a `hint`: what to
-do next, with the command to type where there is one. What is said often is said once, by a
-constructor of the type.
+Each is also a fitting builtin, so that callers can catch either, and carries a `hint` on what to do
+next. Messages and hints name settings as Python does: `workers`, `executor="ray"`. The command line
+prints those that stand in backticks, and any `name="value"`, as its options (`cli/hints.py`).
 """
 
 import re
@@ -28,22 +28,27 @@ class InterferenceError(Exception):
     Args:
         message: What was given and what was expected.
         hint: What to do next, or None.
+        command: Command of this package that helps, without the program's name, such as
+            `verify my-split`; only the command line shows it.
     """
 
-    def __init__(self, message: str, hint: str | None = None):
+    def __init__(self, message: str, hint: str | None = None, command: str | None = None):
         if len(message) > _LONGEST_MESSAGE:
             message = f"{message[:_LONGEST_MESSAGE]}… ({len(message):,} characters)"
         message = visible(message)
         super().__init__(message)
         self.message = message
-        self.hint = hint or None
+        self.hint = visible(hint) if hint else None
+        self.command = command
 
     def __str__(self) -> str:
         return self.message if self.hint is None else f"{self.message}\n{self.hint}"
 
     def about(self, what: object) -> Self:
         """Return the same error with what it is about in front, such as an episode."""
-        return type(self)(f"{what}: {self.message}", self.hint)
+        error = type(self)(f"{what}: {self.message}")
+        error.__dict__ |= {**self.__dict__, "message": error.message}
+        return error
 
 
 class InvalidIdError(InterferenceError, ValueError):
@@ -54,42 +59,76 @@ class UnknownNameError(InterferenceError, LookupError):
     """An episode, family, condition or camera that the data does not hold."""
 
     @classmethod
-    def among(cls, what: str, given: object, where: object, known: Iterable[object]) -> Self:
+    def among(
+        cls,
+        what: str,
+        given: object,
+        where: object,
+        known: Iterable[object],
+        command: str | None = None,
+    ) -> Self:
         """Return the error for a name that is not there: `what` it names, and what there is."""
-        return cls(f"{what} {given!r} is not in {where}", nearest(str(given), map(str, known)))
+        hint = nearest(str(given), map(str, known))
+        return cls(f"{what} {given!r} is not in {where}", hint, command)
 
     @classmethod
-    def none(cls, what: str, given: str, known: Iterable[str]) -> Self:
+    def none(cls, what: str, given: str, known: Iterable[str], command: str | None = None) -> Self:
         """Return the error for a name that nothing has: `what` it names, and what there is."""
-        return cls(f"there is no {what} {given!r}", nearest(given, known))
+        return cls(f"there is no {what} {given!r}", nearest(given, known), command)
 
 
 class InvalidOptionError(InterferenceError, ValueError):
-    """An option or argument outside what it may be."""
+    """An option or argument outside what it may be.
+
+    Args:
+        message: As for every error.
+        hint: As for every error.
+        command: As for every error.
+        option: Name of the setting in Python, such as `workers`, if the message contains it.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        hint: str | None = None,
+        command: str | None = None,
+        option: str | None = None,
+    ):
+        super().__init__(message, hint, command)
+        self.option = option
 
     @classmethod
-    def expected(cls, option: str, given: object, expected: str, hint: str | None = None) -> Self:
-        """Return the error for an option: its name, what was given, what was expected."""
-        return cls(f"{option} {given!r}; expected {expected}", hint)
+    def expected(
+        cls,
+        option: str,
+        given: object,
+        expected: str,
+        hint: str | None = None,
+        command: str | None = None,
+    ) -> Self:
+        """Return the error for a setting: its Python name, what was given, what was expected."""
+        return cls(f"{option} {given!r}; expected {expected}", hint, command, option)
 
     @classmethod
-    def one_of(cls, option: str, given: object, known: Iterable[str]) -> Self:
-        """Return the error for an option that is none of the known names."""
+    def one_of(
+        cls, option: str, given: object, known: Iterable[str], command: str | None = None
+    ) -> Self:
+        """Return the error for a setting that is none of the known names."""
         names = list(known)
-        return cls(
-            f"{option} {given!r} is none of {', '.join(names)}", nearest(str(given), names, more="")
-        )
+        message = f"{option} {given!r} is none of {', '.join(names)}"
+        return cls(message, nearest(str(given), names, more=""), command, option)
 
 
 class MissingExtraError(InterferenceError, ImportError):
     """A library of an optional extra is not installed."""
 
     @classmethod
-    def needs(cls, what: str, library: str, extra: str) -> Self:
+    def needs(cls, what: str, library: str, extra: str, command: str | None = None) -> Self:
         """Return the error for work that needs a library of an extra."""
         return cls(
             f"{what} needs {library}, which is not installed",
             f'Install it: pip install "robomme-interference-data[{extra}]"',
+            command,
         )
 
 
@@ -109,9 +148,10 @@ class FormatError(InterferenceError, ValueError):
     """A file that cannot be read as what it should be, or of an unknown format version."""
 
     @classmethod
-    def damaged(cls, path: object, what: object) -> Self:
+    def damaged(cls, path: object, what: object, command: str | None = None) -> Self:
         """Return the error for a file that holds what it should not: its path, and what."""
-        return cls(f"{path}: {what}", "The file is damaged: download or build it again.")
+        hint = "The file is damaged: download or build it again."
+        return cls(f"{path}: {what}", hint, command)
 
 
 class HashMismatchError(InterferenceError, ValueError):

@@ -1,6 +1,7 @@
 """What commands share: messages on stderr, JSON on stdout, parameters, and how they are stopped."""
 
 import json
+import logging
 import shlex
 import signal
 import sys
@@ -13,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, visible
 
 # Parameters that several commands have.
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
@@ -45,8 +46,22 @@ class Group(TyperGroup):
 
 
 def say(text: str, **style: Any) -> None:
-    """Print what a command says beside its output, to stderr; styles are those of `typer.secho`."""
-    typer.secho(text, err=True, **style)
+    """Print a message to stderr; styles are those of `typer.secho`."""
+    typer.secho(visible(text), err=True, **style)
+
+
+class _Messages(logging.Handler):
+    """Prints log records as plain messages, above a progress bar if there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(self.format(record))
+
+
+def log_to_stderr() -> None:
+    """Print what the package logs, from INFO on, to stderr."""
+    logger = logging.getLogger("robomme_interference_data")
+    logger.handlers = [_Messages()]
+    logger.setLevel(logging.INFO)
 
 
 def check_output(*paths: Path | None) -> None:

@@ -22,7 +22,8 @@ from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub_errors import check_endpoint
 
 from . import commands
-from .console import Group, say
+from .console import Group, log_to_stderr, say
+from .hints import PROGRAM, error_lines, option_names
 
 
 class _Root(Group):
@@ -45,7 +46,7 @@ class _Root(Group):
 
 app = typer.Typer(
     cls=_Root,
-    name="robomme-interference",
+    name=PROGRAM,
     no_args_is_help=True,
     rich_markup_mode=None,  # rich would take longer to load than all else
     pretty_exceptions_enable=False,
@@ -102,7 +103,7 @@ _GROUPS = {
 
 def _tell_version(asked: bool) -> None:
     if asked:
-        typer.echo(f"robomme-interference {metadata.version('robomme-interference-data')}")
+        typer.echo(f"{PROGRAM} {metadata.version('robomme-interference-data')}")
         raise typer.Exit
 
 
@@ -137,11 +138,13 @@ def _keep_lines(command: Any) -> Any:
 
 
 def main() -> None:
-    """Run the command line; known errors are shown without a traceback."""
+    """Run the command line; known errors are printed without a traceback."""
+    log_to_stderr()
+    command = _keep_lines(typer.main.get_command(app))
     try:
-        _keep_lines(typer.main.get_command(app))(prog_name="robomme-interference")
+        command(prog_name=PROGRAM)
     except InterferenceError as error:
-        _fail(error.message, error.hint)
+        _fail(*error_lines(error, option_names(command, sys.argv[1:])))
     except KeyboardInterrupt:  # before the command itself has begun, see `stoppable`
         sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
@@ -158,10 +161,10 @@ def main() -> None:
         _fail(f"{where}{error.strerror}", hint)
 
 
-def _fail(message: str, hint: str | None) -> None:
-    typer.secho(f"Error: {message}", fg=typer.colors.RED, err=True)
-    if hint:
-        say(hint)
+def _fail(message: str, *further: str) -> None:
+    say(f"Error: {message}", fg=typer.colors.RED)
+    for line in further:
+        say(line)
     sys.exit(1)
 
 

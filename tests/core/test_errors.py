@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data import errors
-from robomme_interference_data.errors import InterferenceError, nearest
+from robomme_interference_data.errors import InterferenceError, InvalidOptionError, nearest
 
 CLASSES = [
     value
@@ -25,13 +25,19 @@ def test_each_is_a_builtin_too_and_travels_between_processes(
 ) -> None:
     builtins = [base for base in error.__mro__ if base.__module__ == "builtins"]
     assert len(builtins) > 3  # beyond Exception, BaseException and object there is a telling one
-    raised = error("what was found", "what to do")
-    copy = pickle.loads(pickle.dumps(raised))
-    for one in (raised, copy):
+    raised = error("what was found", "what to do", "verify my-split")
+    for one in (raised, pickle.loads(pickle.dumps(raised))):
         assert type(one) is error
-        assert (one.message, one.hint) == ("what was found", "what to do")
         assert str(one) == "what was found\nwhat to do"
+        assert (one.hint, one.command) == ("what to do", "verify my-split")
     assert str(error("only this")) == "only this"
+
+
+def test_an_error_about_something_keeps_the_rest() -> None:
+    error = InvalidOptionError.expected("workers", 0, "1 or more", "a hint", "a command")
+    about = error.about("episode 7")
+    assert about.message == "episode 7: workers 0; expected 1 or more"
+    assert (about.hint, about.command, about.option) == ("a hint", "a command", "workers")
 
 
 @pytest.mark.parametrize(

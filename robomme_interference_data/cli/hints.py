@@ -1,0 +1,53 @@
+"""How the command line prints an error: settings as its options, and the command to type next."""
+
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    NoRendererError,
+)
+
+PROGRAM = "robomme-interference"
+
+NEXT_COMMANDS: dict[type[InterferenceError], str] = {NoRendererError: "doctor"}
+"""Commands that help against errors of a type, where the error itself names none."""
+
+_SETTING = re.compile(r'(?P<tick>`?)\b(?P<name>[a-z]\w*)="(?P<value>[^"\n]*)"(?P=tick)|`(\w+)`')
+
+
+def option_names(root: Any, arguments: Sequence[str]) -> dict[str, str]:
+    """Return the options of the command that `arguments` call, by the names of their settings."""
+    command = root
+    for word in arguments:
+        if word not in getattr(command, "commands", {}):
+            break
+        command = command.commands[word]
+    options = {one.name: max(one.opts, key=len) for one in command.params}
+    return {name: option for name, option in options.items() if option.startswith("--")}
+
+
+def error_lines(error: InterferenceError, options: Mapping[str, str]) -> list[str]:
+    """Return what is printed for an error: its message, its hint, and the command to type next.
+
+    Args:
+        error: The error.
+        options: Options by the names of their settings, as `option_names` returns them.
+    """
+
+    def typed(match: re.Match[str]) -> str:
+        option = options.get(match["name"] or match[4])
+        if option is None:
+            return match[0]
+        return option if match["name"] is None else f"{option} {shlex.quote(match['value'])}"
+
+    message = error.message
+    name = isinstance(error, InvalidOptionError) and error.option
+    if name and name in options:
+        message = re.sub(rf"(?<![\w-]){re.escape(name)}\b", options[name], message, count=1)
+    lines = [_SETTING.sub(typed, text) for text in (message, error.hint) if text]
+    command = error.command or NEXT_COMMANDS.get(type(error))
+    return lines if command is None else [*lines, f"Run: {PROGRAM} {command}"]
