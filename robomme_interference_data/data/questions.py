@@ -4,6 +4,7 @@ import string
 from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
+from typing import Annotated
 
 from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
 from robomme_interference_data.errors import FormatError, MissingFileError
@@ -20,26 +21,25 @@ LETTERS = string.ascii_uppercase[:8]
 
 @dataclass(frozen=True)
 class Question:
-    """A multiple-choice question about what a query's lesson showed.
+    """A multiple-choice question about what a query's lesson showed."""
 
-    Attributes:
-        episode_id: The query episode.
-        revision: Revision of the demonstrations that it was made for.
-        text: What is asked, beside the goal.
-        options: The options in words, in the order of `LETTERS`; empty words where only the
-            picture tells one.
-        answers: The number, among the scene's answers, of one that each option stands for.
-        right: Place of the right option, from 0.
-        picture: The first live view with the options marked and lettered, a PNG file.
-    """
-
-    episode_id: EpisodeId
-    revision: str
-    text: str
-    options: tuple[str, ...]
-    answers: tuple[int, ...]
-    right: int
-    picture: bytes
+    episode_id: Annotated[EpisodeId, "The query episode."]
+    revision: Annotated[str, "Revision of the demonstrations that it was made for."]
+    text: Annotated[str, "What is asked, beside the goal."]
+    options: Annotated[
+        tuple[str, ...],
+        "The options in words, in the order of `LETTERS`; empty words where only the picture "
+        "tells one.",
+    ]
+    answers: Annotated[
+        tuple[int, ...],
+        "The number, among the scene's answers, of one that each option stands for.",
+    ]
+    right: Annotated[int, "Place of the right option, from 0."]
+    picture: Annotated[
+        bytes,
+        "The first live view with the options marked and lettered, a PNG file.",
+    ]
 
     def __post_init__(self) -> None:
         count = len(self.options)

@@ -3,7 +3,7 @@
 A field is text, a whole number, a number, a truth value, bytes (in tables only), an `EpisodeId`,
 another such record, a tuple of one of these, a map from text to one of these, or one of these or
 None. A record with a field `episode_id` also has the columns `family`, `split` and `index`, to
-filter by.
+filter by. What a field means stands in its annotation: `Annotated[int, "Stored frames."]`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,8 +31,13 @@ _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
 _LARGEST = 1 << 63
 """No whole number in a table is as large, and none in JSON may be."""
 
-_PARTS = {"family": pa.string(), "split": pa.string(), "index": pa.int64()}
-"""Columns that the field `episode_id` has beside its own."""
+_PARTS = {
+    "family": (pa.string(), "Family of the episode: the first part of its id."),
+    "split": (pa.string(), "Split of the episode: the second part of its id."),
+    "index": (pa.int64(), "Number of the episode: the last part of its id."),
+}
+"""Columns that the field `episode_id` has beside its own: type and meaning."""
+_PART_FIELDS = [pa.field(name, kind, nullable=False) for name, (kind, _) in _PARTS.items()]
 
 
 def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
@@ -43,6 +48,16 @@ def arrow_schema(record: type, keys: Sequence[str] = ()) -> pa.Schema:
         keys: Names that maps of text to text have; Arrow has them as structs.
     """
     return pa.schema(list(_codec(record).arrow(keys)))
+
+
+def descriptions(record: type) -> dict[str, str]:
+    """Return what each column of a record means: the text of its field's `Annotated`."""
+    found = {}
+    for name, hint in get_type_hints(record, include_extras=True).items():
+        found[name] = next(iter(getattr(hint, "__metadata__", ())), "")
+        if name == "episode_id":
+            found |= {part: text for part, (_, text) in _PARTS.items()}
+    return found
 
 
 def to_dict(record: Any) -> dict[str, Any]:
@@ -232,7 +247,7 @@ def _record(record: Any) -> _Codec:
         for name, codec in codecs.items():
             found.append(pa.field(name, codec.arrow(keys), nullable=codec.optional))
             if name == "episode_id":
-                found += [pa.field(part, kind, nullable=False) for part, kind in _PARTS.items()]
+                found += _PART_FIELDS
         return pa.struct(found)
 
     def read(value: Any) -> Any:

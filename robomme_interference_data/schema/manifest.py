@@ -7,6 +7,7 @@ The columns of `buffers.parquet` and the fields of `manifest.json` follow from t
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Annotated
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
@@ -25,31 +26,18 @@ _MOST_SESSIONS = 1 << 12
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """One session of a history buffer: where its frames lie and what they must hash to.
+    """One session of a history buffer: where its frames lie and what they must hash to."""
 
-    Attributes:
-        role: One of `ROLES`.
-        family: Family of the recorded episode.
-        source: Id of the recorded episode.
-        dataset: Name of the dataset in the split, such as `demonstrations`.
-        revision: Identity of that dataset.
-        episode_index: Number of the episode in that dataset.
-        start: First stored frame of the span.
-        stop: Frame after the last one.
-        repeat: How often each frame is shown in a row; 1 but for held frames.
-        sha256: Digest over the span, each frame once, see `digest.py`.
-    """
-
-    role: str
-    family: str
-    source: EpisodeId
-    dataset: str
-    revision: str
-    episode_index: int
-    start: int
-    stop: int
-    repeat: int
-    sha256: str
+    role: Annotated[str, "One of `lesson`, `distractor`, `filler`, `contradiction`."]
+    family: Annotated[str, "Family of the recorded episode."]
+    source: Annotated[EpisodeId, "Id of the recorded episode."]
+    dataset: Annotated[str, "Name of the dataset in the split, such as `demonstrations`."]
+    revision: Annotated[str, "Identity of that dataset."]
+    episode_index: Annotated[int, "Number of the episode in that dataset."]
+    start: Annotated[int, "First stored frame of the span."]
+    stop: Annotated[int, "Frame after the last one."]
+    repeat: Annotated[int, "How often each frame is shown in a row; 1 but for held frames."]
+    sha256: Annotated[str, "Digest over the span, each frame once."]
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:
@@ -108,55 +96,41 @@ def place_sessions(entries: Sequence[SessionEntry], role: str | None = None) -> 
 
 @dataclass(frozen=True)
 class QueryFrame:
-    """Where the first live observation of a query episode is stored.
+    """Where the first live observation of a query episode is stored."""
 
-    Attributes:
-        dataset: Name of the dataset in the split.
-        revision: Identity of that dataset.
-        episode_index: Number of the episode in that dataset.
-        frame: The stored frame.
-    """
-
-    dataset: str
-    revision: str
-    episode_index: int
-    frame: int
+    dataset: Annotated[str, "Name of the dataset in the split."]
+    revision: Annotated[str, "Identity of that dataset."]
+    episode_index: Annotated[int, "Number of the episode in that dataset."]
+    frame: Annotated[int, "The stored frame."]
 
 
 @dataclass(frozen=True)
 class BufferManifest:
-    """A history buffer by name: what it holds, without the frames.
+    """A history buffer by name: what it holds, without the frames."""
 
-    Attributes:
-        episode_id: The query episode.
-        condition: Name of the condition: with `episode_id`, the buffer's key.
-        k: Number of sessions that the condition adds.
-        goals: Wordings of the query's goal; at least one.
-        seed: Seed of the query episode in its simulator, or None.
-        difficulty: `easy`, `medium`, `hard`, or None.
-        simulator: Simulator that the query episode belongs to, or None.
-        exact: Whether all frames are the recorded ones, bit for bit.
-        lesson_frames: Frames of the lesson in the buffer.
-        history_frames: Frames of the whole buffer: the `exec_start_idx` of the policy servers.
-        lesson_share: Share of lesson frames in an even 32-frame sample of history and first live
-            observation at the first step, see `sampling.lesson_share`.
-        query: Where the first live observation is stored; never part of the buffer.
-        sessions: The sessions in order.
-    """
-
-    episode_id: EpisodeId
-    condition: str
-    k: int
-    goals: tuple[str, ...]
-    seed: int | None
-    difficulty: str | None
-    simulator: str | None
-    exact: bool
-    lesson_frames: int
-    history_frames: int
-    lesson_share: float
-    query: QueryFrame
-    sessions: tuple[SessionEntry, ...]
+    episode_id: Annotated[EpisodeId, "The query episode."]
+    condition: Annotated[str, "Name of the condition: with `episode_id`, the buffer's key."]
+    k: Annotated[int, "Number of sessions that the condition adds."]
+    goals: Annotated[tuple[str, ...], "Wordings of the query's goal; at least one."]
+    seed: Annotated[int | None, "Seed of the query episode in its simulator, or None."]
+    difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
+    simulator: Annotated[str | None, "Simulator that the query episode belongs to, or None."]
+    exact: Annotated[bool, "Whether all frames are the recorded ones, bit for bit."]
+    lesson_frames: Annotated[int, "Frames of the lesson in the buffer."]
+    history_frames: Annotated[
+        int,
+        "Frames of the whole buffer: the `exec_start_idx` of the policy servers.",
+    ]
+    lesson_share: Annotated[
+        float,
+        "Share of lesson frames in an even 32-frame sample of history and first live "
+        "observation at the first step.",
+    ]
+    query: Annotated[
+        QueryFrame,
+        "Where the first live observation is stored; never part of the buffer.",
+    ]
+    sessions: Annotated[tuple[SessionEntry, ...], "The sessions in order."]
 
     def __post_init__(self) -> None:
         frames = sum(session.num_frames for session in self.sessions)
@@ -182,44 +156,31 @@ class BufferManifest:
 
 @dataclass(frozen=True)
 class ManifestDataset:
-    """A dataset that manifests name.
+    """A dataset that manifests name."""
 
-    Attributes:
-        kind: Name of the dataset in a split, such as `demonstrations`.
-        version: Its version.
-        revision: Its revision: sessions name it.
-        identity: SHA-256 of its `meta/interference.json`.
-        place: Where it lies: None for the folder of its name in the split, `.` for the split's own
-            root, `namespace/name@commit` for a repository on the Hub.
-    """
-
-    kind: str
-    version: str
-    revision: str
-    identity: str
-    place: str | None = None
+    kind: Annotated[str, "Name of the dataset in a split, such as `demonstrations`."]
+    version: Annotated[str, "Its version."]
+    revision: Annotated[str, "Its revision: sessions name it."]
+    identity: Annotated[str, "SHA-256 of its `meta/interference.json`."]
+    place: Annotated[
+        str | None,
+        "Where it lies: None for the folder of its name in the split, `.` for the split's own"
+        " root, `namespace/name@commit` for a repository on the Hub.",
+    ] = None
 
 
 @dataclass(frozen=True)
 class ManifestHeader:
-    """`manifests/manifest.json`: how the buffers of a split were planned.
+    """`manifests/manifest.json`: how the buffers of a split were planned."""
 
-    Attributes:
-        format_version: Of the files.
-        rule_version: Of the draw.
-        seed: Of the draw.
-        conditions: Names of the planned conditions, in order.
-        position_limit: Longest history and rollout together, or None.
-        datasets: The datasets by name, which are folders of the split.
-        counts: Numbers of `queries`, `buffers` and `sessions`.
-        rows: SHA-256 of `buffers.parquet`.
-    """
-
-    format_version: int
-    rule_version: int
-    seed: int
-    conditions: tuple[str, ...]
-    position_limit: int | None
-    datasets: dict[str, ManifestDataset]
-    counts: dict[str, int]
-    rows: str
+    format_version: Annotated[int, "Of the files."]
+    rule_version: Annotated[int, "Of the draw."]
+    seed: Annotated[int, "Of the draw."]
+    conditions: Annotated[tuple[str, ...], "Names of the planned conditions, in order."]
+    position_limit: Annotated[int | None, "Longest history and rollout together, or None."]
+    datasets: Annotated[
+        dict[str, ManifestDataset],
+        "The datasets by name, which are folders of the split.",
+    ]
+    counts: Annotated[dict[str, int], "Numbers of `queries`, `buffers` and `sessions`."]
+    rows: Annotated[str, "SHA-256 of `buffers.parquet`."]

@@ -5,7 +5,7 @@ The columns of every table and the fields of every header follow from these, and
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
@@ -28,36 +28,22 @@ _MOST_TEXT = 1 << 10
 
 @dataclass(frozen=True)
 class SpanDigests:
-    """SHA-256 over spans of a demonstration, all features but actions together.
+    """SHA-256 over spans of a demonstration, all features but actions together."""
 
-    Attributes:
-        first: The first half of the lesson.
-        second: The second half, which has a frame more where their number is odd.
-        last: The lesson's last frame.
-        query: The query frame.
-    """
-
-    first: str
-    second: str
-    last: str
-    query: str
+    first: Annotated[str, "The first half of the lesson."]
+    second: Annotated[str, "The second half, which has a frame more where their number is odd."]
+    last: Annotated[str, "The lesson's last frame."]
+    query: Annotated[str, "The query frame."]
 
 
 @dataclass(frozen=True)
 class EvidenceSpan:
-    """Stored frames of a lesson that show a part of the hidden answer.
+    """Stored frames of a lesson that show a part of the hidden answer."""
 
-    Attributes:
-        part: Number of the part, from 0.
-        text: The part in words, such as `lifts cube 2`.
-        start: First frame that shows it.
-        stop: Frame after the last one.
-    """
-
-    part: int
-    text: str
-    start: int
-    stop: int
+    part: Annotated[int, "Number of the part, from 0."]
+    text: Annotated[str, "The part in words, such as `lifts cube 2`."]
+    start: Annotated[int, "First frame that shows it."]
+    stop: Annotated[int, "Frame after the last one."]
 
     def __post_init__(self) -> None:
         if not 0 <= self.part < _MOST_PARTS or not 0 <= self.start < self.stop:
@@ -74,39 +60,42 @@ class EvidenceSpan:
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """An episode of a dataset, with what its source recorded of it.
+    """An episode of a dataset, with what its source recorded of it."""
 
-    Attributes:
-        episode_index: Number of the episode in the dataset, from 0.
-        episode_id: Id of the episode that was recorded; of a unit, the one it was made of.
-        length: Stored frames. A demonstration's last one is the query frame.
-        goals: Wordings of the goal; at least one. The first is the dataset's task text.
-        seed: Seed of the simulator, or None.
-        difficulty: `easy`, `medium`, `hard`, or None.
-        simulator: `robomme`, `tabletop`, …, or None.
-        exec_start_idx: Index of the query frame, which is the number of lesson frames; None where
-            there is no lesson.
-        exact: False if a frame was ever lossily compressed.
-        feature_sha256: Digest by feature over the session that the episode is: the lesson, or all
-            frames where there is none; see `digest.py`.
-        span_sha256: Digests of the spans that parts of a lesson are, and of the query frame, by
-            name, see `spans`; None where there is no lesson.
-        evidence: Frames of the lesson that show the hidden answer, part by part; None where that
-            is unknown, and where there is no lesson.
-    """
-
-    episode_index: int
-    episode_id: EpisodeId
-    length: int
-    goals: tuple[str, ...]
-    seed: int | None
-    difficulty: str | None
-    simulator: str | None
-    exec_start_idx: int | None
-    exact: bool
-    feature_sha256: dict[str, str]
-    span_sha256: SpanDigests | None
-    evidence: tuple[EvidenceSpan, ...] | None = None
+    episode_index: Annotated[int, "Number of the episode in the dataset, from 0."]
+    episode_id: Annotated[
+        EpisodeId,
+        "Id of the episode that was recorded; of a unit, the one it was made of.",
+    ]
+    length: Annotated[int, "Stored frames. A demonstration's last one is the query frame."]
+    goals: Annotated[
+        tuple[str, ...],
+        "Wordings of the goal; at least one. The first is the dataset's task text.",
+    ]
+    seed: Annotated[int | None, "Seed of the simulator, or None."]
+    difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
+    simulator: Annotated[str | None, "`robomme`, `tabletop`, …, or None."]
+    exec_start_idx: Annotated[
+        int | None,
+        "Index of the query frame, which is the number of lesson frames; None where there is "
+        "no lesson.",
+    ]
+    exact: Annotated[bool, "False if a frame was ever lossily compressed."]
+    feature_sha256: Annotated[
+        dict[str, str],
+        "Digest by feature over the session that the episode is: the lesson, or all frames "
+        "where there is none.",
+    ]
+    span_sha256: Annotated[
+        SpanDigests | None,
+        "Digests of the spans that parts of a lesson are, and of the query frame, by name, "
+        "see `spans`; None where there is no lesson.",
+    ]
+    evidence: Annotated[
+        tuple[EvidenceSpan, ...] | None,
+        "Frames of the lesson that show the hidden answer, part by part; None where that is "
+        "unknown, and where there is no lesson.",
+    ] = None
 
     def __post_init__(self) -> None:
         if not self.goals or sum(map(len, self.goals)) > _MOST_GOALS:
@@ -176,32 +165,20 @@ class Counts:
 
 @dataclass(frozen=True)
 class DatasetIdentity:
-    """`meta/interference.json`: what a dataset is.
+    """`meta/interference.json`: what a dataset is."""
 
-    Attributes:
-        format_version: Of the files.
-        kind: Name of the dataset in a split, such as `demonstrations`.
-        version: Such as `1.0.0`.
-        revision: Identity of the content: SHA-256 over all episode records.
-        exact: Whether all episodes are.
-        codec: Name of the video settings.
-        cameras: Names of the cameras, sorted.
-        unit: `frames` and `stride` of a unit; None in demonstrations.
-        simulators: That the episodes come from.
-        sources: What the sources say of themselves.
-        counts: How much there is.
-        sums: SHA-256 of `meta/SHA256SUMS`, which lists every other file.
-    """
-
-    format_version: int
-    kind: str
-    version: str
-    revision: str
-    exact: bool
-    codec: str
-    cameras: tuple[str, ...]
-    unit: dict[str, int] | None
-    simulators: tuple[str, ...]
-    sources: tuple[dict[str, Any], ...]
-    counts: Counts
-    sums: str
+    format_version: Annotated[int, "Of the files."]
+    kind: Annotated[str, "Name of the dataset in a split, such as `demonstrations`."]
+    version: Annotated[str, "Such as `1.0.0`."]
+    revision: Annotated[str, "Identity of the content: SHA-256 over all episode records."]
+    exact: Annotated[bool, "Whether all episodes are."]
+    codec: Annotated[str, "Name of the video settings."]
+    cameras: Annotated[tuple[str, ...], "Names of the cameras, sorted."]
+    unit: Annotated[
+        dict[str, int] | None,
+        "`frames` and `stride` of a unit; None in demonstrations.",
+    ]
+    simulators: Annotated[tuple[str, ...], "That the episodes come from."]
+    sources: Annotated[tuple[dict[str, Any], ...], "What the sources say of themselves."]
+    counts: Annotated[Counts, "How much there is."]
+    sums: Annotated[str, "SHA-256 of `meta/SHA256SUMS`, which lists every other file."]
