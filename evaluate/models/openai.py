@@ -15,6 +15,7 @@ from openai import OpenAI
 from robomme_interference_data.errors import InvalidOptionError, ModelError, first_line
 from robomme_interference_data.storage.encode import png
 
+from .bounded_http import AnswerTooLongError, BoundedClient
 from .images import data_url, mp4, within
 from .model import ChatModel, Message, Part, Reply, Video
 
@@ -47,7 +48,7 @@ class OpenAIModel(ChatModel):
             video (`video_url`, as vLLM and SGLang take it).
         repeats: Further times that a question is asked.
         connect_s: Most seconds until there is a connection.
-        response_s: Most seconds until there is an answer.
+        response_s: Most seconds until the whole answer is there, which has 16 MiB at most.
 
     Raises:
         InvalidOptionError: A number, `video` or the key is not what it may be.
@@ -88,6 +89,7 @@ class OpenAIModel(ChatModel):
             api_key=_key(),
             timeout=openai.Timeout(response_s, connect=connect_s),
             max_retries=repeats,
+            http_client=BoundedClient(connect_s + response_s),
         )
 
     def reply(self, messages: Sequence[Message]) -> Reply:
@@ -148,6 +150,8 @@ class OpenAIModel(ChatModel):
             return ModelError(
                 f"{self._url} gave no answer in time", f"Raise response_s, or ask less. {_WAITS}"
             )
+        if isinstance(error.__cause__, AnswerTooLongError):
+            return ModelError(f"{self._url} gives no end to an answer: {error.__cause__}")
         if isinstance(error, openai.APIConnectionError):
             cause = first_line(error.__cause__ or error)
             return ModelError(

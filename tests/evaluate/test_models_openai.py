@@ -1,6 +1,7 @@
 """Chat endpoints: what they are sent, what they answer, and what is done about their faults."""
 
 import io
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,7 +17,10 @@ from support.chat_server import (
     BUSY_FOR_AN_HOUR,
     BUSY_SOME_TIME,
     CLOSED,
+    DRIPS,
+    DRIPS_HEADERS,
     EMPTY,
+    ENDLESS,
     GARBAGE,
     GONE,
     LOCKED,
@@ -31,6 +35,7 @@ from robomme_interference_data.errors import (
     ModelError,
     UnknownNameError,
 )
+from robomme_interference_data.evaluate.models import bounded_http
 from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.images import within
 from robomme_interference_data.evaluate.models.model import Message, Video
@@ -146,11 +151,22 @@ def test_several_faults_in_one_question(server: ChatServer) -> None:
     assert (reply.calls, len(server.seen)) == (6, 6)
 
 
-def test_no_answer_in_time(server: ChatServer) -> None:
-    server.faults = [SLOW] * 2
+@pytest.mark.parametrize("fault", [SLOW, DRIPS, DRIPS_HEADERS])
+def test_no_whole_answer_in_time(server: ChatServer, fault: str) -> None:
+    server.faults = [fault] * 2
+    began = time.monotonic()
     with pytest.raises(ModelError, match="no answer in time"):
-        model_of(server, "repeats=1", "response_s=0.05").reply(ASKED)
+        model_of(server, "repeats=1", "response_s=0.05", "connect_s=0.1").reply(ASKED)
     assert len(server.seen) == 2
+    assert time.monotonic() - began < 2
+
+
+def test_an_answer_without_end(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounded_http, "MAX_BYTES", 1 << 20)
+    server.faults = [ENDLESS] * 2
+    with pytest.raises(ModelError, match="more than 1048576 bytes"):
+        model_of(server, "repeats=1").reply(ASKED)
+    assert model_of(server).reply(ASKED).text == "1 images"
 
 
 def test_a_refusal_is_an_answer_without_words(server: ChatServer) -> None:

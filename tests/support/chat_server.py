@@ -7,7 +7,8 @@
 one a question, in order, before it: `SLOW` (`slow_s` seconds), `BUSY` (429, `Retry-After: 0.01`),
 `BUSY_SOME_TIME` (429 alone), `BUSY_FOR_AN_HOUR` (429, `Retry-After: 3600`), `BROKEN` (500),
 `GARBAGE` (no JSON), `EMPTY` (JSON that is no answer), `CLOSED` (no answer at all), `REFUSED` (no
-words), `GONE` (404, as for another model), `LOCKED` (401), `UNCOUNTED` (tells no tokens).
+words), `GONE` (404, as for another model), `LOCKED` (401), `UNCOUNTED` (tells no tokens), `DRIPS`
+and `DRIPS_HEADERS` (a byte every 20 ms), `ENDLESS` (blanks as fast as they are read).
 """
 
 import base64
@@ -28,6 +29,7 @@ from PIL import Image
 SLOW, BUSY, BUSY_SOME_TIME, BUSY_FOR_AN_HOUR = "slow", "busy", "busy some time", "busy for an hour"
 BROKEN, GARBAGE, EMPTY, CLOSED, REFUSED = "broken", "garbage", "empty", "closed", "refused"
 GONE, LOCKED, UNCOUNTED = "gone", "locked", "uncounted"
+DRIPS, DRIPS_HEADERS, ENDLESS = "drips", "drips headers", "endless"
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,18 @@ class ChatServer:
             time.sleep(self.slow_s)
         if fault == CLOSED:
             handler.close_connection = True
+            return
+        if fault in (DRIPS, DRIPS_HEADERS, ENDLESS):
+            handler.close_connection = True
+            with suppress(OSError):  # the client has gone
+                handler.wfile.write(b"HTTP/1.1 200 OK\r\n")
+                if fault != DRIPS_HEADERS:
+                    handler.wfile.write(b"Content-Type: application/json\r\n\r\n")
+                while fault == ENDLESS:
+                    handler.wfile.write(b" " * (1 << 20))
+                while True:
+                    handler.wfile.write(b" ")
+                    time.sleep(0.02)
             return
         failed = {
             BUSY: (429, {"error": {"message": "too many"}}, {"Retry_After": "0.01"}),
