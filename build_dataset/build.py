@@ -26,7 +26,7 @@ from robomme_interference_data.runtime.executor import Executor, Outcome
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import get_codec
-from robomme_interference_data.storage.files import canonical_json, working
+from robomme_interference_data.storage.files import canonical_json, replace_folder, staging_dir
 
 from .config import BuildPlan
 from .earlier import Earlier, read_earlier
@@ -95,7 +95,7 @@ def build_dataset(
         raise InvalidOptionError.expected(
             "--out", str(out), "a path in UTF-8: LeRobot's writer can use no other"
         ) from None
-    with working(out) as work:
+    with staging_dir(out) as work:
         earlier = find_earlier(out, plan)
         stored = list(earlier.episodes) if earlier else []
         skipped = dict(earlier.skipped) if earlier else {}
@@ -105,7 +105,6 @@ def build_dataset(
         if todo or not earlier:
             _stage(work, plan, todo, stored, skipped, executor, progress)
             _write(work, out, plan, earlier, stored, skipped, progress)
-        shutil.rmtree(work, ignore_errors=True)
     frames = sum(one.record.length for one in stored)
     return BuildResult(out, len(stored), frames, len(stored) - before, skipped)
 
@@ -262,9 +261,7 @@ def _write(
     with progress.status("Hashing"):
         complete_dataset(made, records, identity, skipped)
         os.sync()
-    if out.exists():
-        out.rename(work / "before")  # put back by the next build, should this one end here
-    made.rename(out)
+    replace_folder(made, out)
 
 
 def _placed(record: EpisodeRecord, index: int, features: Collection[str]) -> EpisodeRecord:

@@ -33,7 +33,7 @@ from robomme_interference_data.schema.manifest import (
 )
 from robomme_interference_data.storage.files import (
     sha256_file,
-    working,
+    staging_dir,
     write_json,
 )
 from robomme_interference_data.storage.hub import HubFiles
@@ -114,7 +114,7 @@ def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
     """
     out = root.resolve() / MANIFESTS
     rows, header = out / MANIFEST_ROWS, out / MANIFEST_HEADER
-    with working(out) as work:
+    with staging_dir(out) as work:
         try:
             out.mkdir(exist_ok=True)
             check_place(root)
@@ -158,7 +158,7 @@ def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHe
                 dataset.identity.version,
                 dataset.revision,
                 sha256_file(dataset.files.path(IDENTITY_PATH)),
-                dataset.files.describe() if isinstance(dataset.files, HubFiles) else None,
+                dataset.files.location if isinstance(dataset.files, HubFiles) else None,
             )
             for dataset in plan.datasets.values()
         },

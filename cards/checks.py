@@ -10,7 +10,7 @@ from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import PublishError
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.storage.files import LocalFiles, naming
+from robomme_interference_data.storage.files import LocalFiles, with_filename
 
 
 def check_split(split: Split, progress: WorkProgress | None = None) -> None:
@@ -65,7 +65,7 @@ def open_with_lerobot(name: str, root: Path) -> None:
         told: BaseException | None = error
         while told is not None:  # LeRobot copies tables to a cache, and that disk may be full
             if isinstance(told, OSError) and told.errno is not None:
-                with naming(config.HF_DATASETS_CACHE):
+                with with_filename(config.HF_DATASETS_CACHE):
                     raise told from None
             told = told.__cause__
         raise PublishError(

@@ -90,7 +90,7 @@ def card_text(source: str, about: "Publication") -> str:
         return render.results_text(Path(source), about)
     files = locate(source)
     if _has(files, MANIFEST_PATH):
-        return render.split_text(load_split(files.describe()), about)
+        return render.split_text(load_split(files.location), about)
     if _has(files, IDENTITY_PATH):
         return render.demonstrations_text(Dataset(files), about)
     if _has(files, RUN_HEADER):

@@ -13,7 +13,13 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import PublishError
-from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file, working
+from robomme_interference_data.storage.files import (
+    LocalFiles,
+    all_files,
+    replace_folder,
+    sha256_file,
+    staging_dir,
+)
 
 from . import render
 from .publish import demonstrations_of, units_of
@@ -59,7 +65,7 @@ def write_tree(tree: Tree, out: Path) -> bool:
     if there == sorted(tree) and all(_holds(out / path, tree[path]) for path in there):
         return False
     out = out.resolve()
-    with working(out) as work:
+    with staging_dir(out) as work:
         made = work / "made"
         try:
             shutil.rmtree(made, ignore_errors=True)
@@ -69,12 +75,9 @@ def write_tree(tree: Tree, out: Path) -> bool:
                     shutil.copyfile(content.source, made / path)
                 else:
                     (made / path).write_bytes(content.source)
-            if out.exists():
-                out.rename(work / "before")
-            made.rename(out)
+            replace_folder(made, out)
         finally:
             shutil.rmtree(made, ignore_errors=True)
-        shutil.rmtree(work, ignore_errors=True)
     return True
 
 

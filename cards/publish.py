@@ -40,7 +40,7 @@ def published_base(split: Split, config: PublishConfig) -> str | None:
     place, wanted = recorded.place or "", config.demonstrations_id
     if "@" not in place or wanted not in (None, place.split("@")[0]):
         return None
-    if Dataset(HubFiles(*place.split("@"))).revision != recorded.revision:
+    if Dataset(HubFiles.parse(place)).revision != recorded.revision:
         raise PublishError(
             f"{place} holds other demonstrations than those that {split.location} is for",
             split.mend,
@@ -69,7 +69,7 @@ def units_of(split: Split, config: PublishConfig, base: str | None) -> Goods:
         return render.split_files(split, config.about(repo_id, str(version), base))
 
     def parts(earlier: HubFiles | None) -> dict[str, str]:
-        there = load_split(earlier.describe()) if earlier else split
+        there = load_split(earlier.location) if earlier else split
         found = parts_of_buffers(there.manifests()) | parts_of_questions(there)
         for name, one in there.datasets.items():
             found |= parts_of_dataset(one) if name != DEMONSTRATIONS else {}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robomme_interference_data.errors import HubError
-from robomme_interference_data.storage.hub_errors import Asked, busy_for
+from robomme_interference_data.storage.hub_errors import HubCall, busy_for
 
 from .tree import Difference, Entry, Tree, compare
 from .versions import Version, versions_of
@@ -59,15 +59,14 @@ class HubRepository:
 
         self.repo_id = repo_id
         self._api = HfApi()
-        self._asked = Asked(repo_id)
         self._tell = tell
         self._wait = wait
-        self._of = {"repo_id": repo_id, "repo_type": "dataset"}
+        self._of: dict[str, Any] = {"repo_id": repo_id, "repo_type": "dataset"}
 
     @property
     def page(self) -> str:
         """Address of its page."""
-        return self._asked.page
+        return HubCall(self.repo_id).page
 
     def state(self) -> State | None:
         """Return what it holds; None if there is none of this name that this login may see.
@@ -120,7 +119,7 @@ class HubRepository:
         state = self.state()  # it may be there all the same: the answer may have been lost
         if state is None:
             raise refused or HubError(
-                f"{self.repo_id} was made, and is not there", f"{self._asked.again}."
+                f"{self.repo_id} was made, and is not there", "Run the same command again."
             )
         return state
 
@@ -151,7 +150,7 @@ class HubRepository:
         if left:
             raise HubError(
                 f"{self.repo_id} does not hold what was sent: {left}",
-                f"{self._asked.again}.",
+                "What was sent is kept: run the same command again.",
             )
         return made
 
@@ -165,7 +164,9 @@ class HubRepository:
             operations.append(added)
         options = {"commit_message": message, "parent_commit": head}
         return str(
-            self._ask(self._api.create_commit, operations=operations, **self._of, **options).oid
+            self._ask(
+                self._api.create_commit, sends=True, operations=operations, **self._of, **options
+            ).oid
         )
 
     def _committed(self, tree: Tree) -> str | None:
@@ -212,15 +213,16 @@ class HubRepository:
 
     # --- asking ----------------------------------------------------------------------------------
 
-    def _ask(self, call: Callable[..., Any], **options: Any) -> Any:
-        """Ask the client; wait and ask again while the Hub is busy."""
+    def _ask(self, call: Callable[..., Any], *, sends: bool = False, **options: Any) -> Any:
+        """Call the client; wait and call again while the Hub is busy."""
+        about = HubCall(self.repo_id, sends=sends)
         for _ in range(_TRIES - 1):
             try:
-                return self._asked.ask(call, **options)
+                return about.run(call, **options)
             except HubError as error:
                 seconds = busy_for(error)
                 if seconds is None or seconds > _LONGEST_WAIT:
                     raise
             self._tell(f"The Hub is busy: trying again in {seconds:.0f} s")
             self._wait(seconds)
-        return self._asked.ask(call, **options)
+        return about.run(call, **options)

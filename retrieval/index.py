@@ -4,7 +4,6 @@ It is made in a hidden folder beside its place, an episode at a time, so that an
 goes on from there. The index gets its name when it is whole.
 """
 
-import shutil
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -55,9 +54,10 @@ from robomme_interference_data.storage.files import (
     atomic_path,
     canonical_json,
     format_sums,
+    replace_folder,
     sha256_file,
-    work_folder,
-    working,
+    staging_dir,
+    staging_path,
     write_json,
     write_text,
 )
@@ -118,7 +118,7 @@ def build_index(
     works = [_Work(root, encoder, camera) for root in roots]
     with ExitStack() as held:
         for work in works:
-            held.enter_context(working(work.folder))
+            held.enter_context(staging_dir(work.folder))
         progress.start(encoder.name, sum(sum(work.lengths) for work in works))
         reports = []
         for work in works:
@@ -128,7 +128,6 @@ def build_index(
             else:
                 embedded = work.embed(executor or Serial(), threads, progress, force=force)
                 header = work.write()
-            shutil.rmtree(work.hidden)
             reports.append(IndexReport(str(work.folder), embedded, header))
         return reports
 
@@ -210,7 +209,7 @@ class _Work:
         self.lengths = [record.length for record in self.dataset.records()]
         self.computed = {"in": encoder.computed_in, "batch": encoder.batch}
         self.folder = root / index_folder(encoder.name, camera)
-        self.hidden = work_folder(self.folder)
+        self.hidden = staging_path(self.folder)
         # Features that were made otherwise have another place: they are never mixed.
         made_of = canonical_json([encoder.fingerprint, self.computed, self.dataset.revision])
         self.made = self.hidden / sha256(made_of.encode()).hexdigest()[:16]
@@ -283,7 +282,5 @@ class _Work:
         )
         header = replace(header, sha256=header.digest())
         write_json(made / INDEX_HEADER, to_dict(header))
-        if self.folder.exists():
-            self.folder.rename(self.hidden / "before")
-        made.rename(self.folder)
+        replace_folder(made, self.folder)
         return header

@@ -11,7 +11,7 @@ from robomme_interference_data.cli.console import say
 from robomme_interference_data.errors import InvalidOptionError, PolicyServerError
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.storage.cache import default_cache_folder
-from robomme_interference_data.storage.files import hold
+from robomme_interference_data.storage.files import file_lock
 
 from .registry import make_policy, parse_policy
 
@@ -52,7 +52,7 @@ def hold_servers(text: str, out: Path) -> Iterator[None]:
                 "spoil each other, as a server holds one memory",
                 "Wait for that run to end, or start another server, on another port.",
             )
-            stack.enter_context(hold(lock, busy))
+            stack.enter_context(file_lock(lock, busy))
             with suppress(OSError):  # such as a full disk: the lock holds all the same
                 lock.write_text(f"the run in {out.resolve()} (process {os.getpid()})", "utf-8")
         yield

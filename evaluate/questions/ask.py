@@ -69,7 +69,7 @@ def run_examination(
     config = dataclasses.replace(
         config,
         model=config.model if config.model in OWN else pin_model(config.model),
-        split=Path(split.location),
+        split=split.location,
     )
     name = _name(config)
     answerer = make_answerer(config)

@@ -55,7 +55,7 @@ class RunConfig(WorkConfig):
         "websocket://HOST:PORT (several with commas), websocket with --serve, "
         "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
     )
-    split: Path = setting(help="Folder of the split of buffers.")
+    split: str = setting(help="Folder of the split of buffers.")
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
     simulator: str = setting("tabletop", help="tabletop, robomme or module:function of your own.")
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
@@ -109,7 +109,7 @@ class AskConfig(WorkConfig):
         help="openai:URL#MODEL, transformers:ID or transformers:FOLDER; recall, the ideal "
         "observer, or guess."
     )
-    split: Path = setting(help="Folder of the split, with its questions.")
+    split: str = setting(help="Folder of the split, with its questions.")
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
     frames: int = setting(
         SAMPLE_FRAMES, help="Frames that are kept, that of now among them.", metavar="N"

@@ -127,7 +127,7 @@ def run_evaluation(
         config,
         policy=pin_policy(config.policy),
         subgoals=pin_subgoals(config.subgoals),
-        split=Path(split.location),
+        split=split.location,
     )
     with hold_servers(config.policy, folder):
         policy, said = describe_policy(config.policy, config.policy_options, workers=config.workers)

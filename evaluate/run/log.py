@@ -31,7 +31,7 @@ from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
 from robomme_interference_data.storage.files import (
     atomic_path,
     canonical_json,
-    hold,
+    file_lock,
     parse_json,
     read_bytes,
     write_json,
@@ -218,7 +218,7 @@ def open_log(
     busy = RunFolderError(
         f"another process is writing {folder}", "Wait for it to end, or give another --out."
     )
-    with hold(folder / ".lock", busy):
+    with file_lock(folder / ".lock", busy):
         if not there:
             (folder / RUN_RECORD).touch()
             header = RunHeader(FORMAT_VERSION, dict(identity), split)

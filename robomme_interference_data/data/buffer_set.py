@@ -96,7 +96,7 @@ class Split:
     @property
     def location(self) -> str:
         """Where it lies: its folder, or its repository with the commit, `namespace/name@…`."""
-        return self.files.describe()
+        return self.files.location
 
     @cached_property
     def revision(self) -> str:
@@ -146,7 +146,7 @@ class Split:
                 f"the manifests of {self.location} do not say where its {name} are",
                 "A published split says it: robomme-interference publish SPLIT --repo-id NAME",
             )
-        return own if place == "." else HubFiles(*place.split("@"))
+        return own if place == "." else HubFiles.parse(place)
 
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:

@@ -37,7 +37,7 @@ def load_split(
         FormatError: Its files are damaged, or of another format version.
         InvalidOptionError: An argument is not what it may be.
     """
-    files = locate(_folder("split", split, "a folder, or namespace/name"), revision=revision)
+    files = locate(_place("split", split, "a folder, or namespace/name"), revision=revision)
     if threads is not None:
         expected = "a number from 1, or None"
         threads = whole_number("threads", threads, expected)
@@ -109,10 +109,10 @@ def load_buffer(
 def _cache(cache: bool | str | os.PathLike[str] | DecodedCache) -> DecodedCache | None:
     if isinstance(cache, bool | DecodedCache | None):
         return DecodedCache(default_cache_folder()) if cache is True else cache or None
-    return DecodedCache(_folder("cache", cache, "True, False, a folder or a DecodedCache"))
+    return DecodedCache(Path(_place("cache", cache, "True, False, a folder or a DecodedCache")))
 
 
-def _folder(option: str, given: object, expected: str) -> Path:
+def _place(option: str, given: object, expected: str) -> str:
     if not isinstance(given, str | os.PathLike) or not str(given) or "\0" in str(given):
         raise InvalidOptionError.expected(option, given, expected)
-    return Path(given)
+    return os.fspath(given)

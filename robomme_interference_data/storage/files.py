@@ -21,6 +21,9 @@ from robomme_interference_data.errors import (
     MissingFileError,
 )
 
+_BEFORE = "before"
+"""Name in a staging folder of what is being replaced."""
+
 _MOST_JSON = 16 << 20
 """Bytes of a file of JSON, at most: ours have some thousand, and Python takes forty times as many
 for some values."""
@@ -65,8 +68,13 @@ class Files(Protocol):
         """Return the folder that holds all files, bringing those here that match a pattern."""
         ...
 
+    @property
+    def location(self) -> str:
+        """What `locate` finds the same files by: a folder, or `namespace/name@commit`."""
+        ...
+
     def describe(self) -> str:
-        """Return the place in words, for messages: a folder, or a repository and revision."""
+        """Return the location in words, for messages only."""
         ...
 
 
@@ -115,6 +123,11 @@ class LocalFiles:
     def snapshot(self, *patterns: str) -> Path:
         """Return the folder; see `Files.snapshot`."""
         return self.root
+
+    @property
+    def location(self) -> str:
+        """The folder."""
+        return str(self.root)
 
     def describe(self) -> str:
         """Return the folder."""
@@ -244,8 +257,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 @contextmanager
-def naming(place: object) -> Iterator[None]:
-    """Say where, if the system says no more than what: of a full disk, it does not."""
+def with_filename(place: object) -> Iterator[None]:
+    """Add a file name to the system's error where it has none: that of a full disk has not."""
     try:
         yield
     except OSError as error:
@@ -265,7 +278,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     os.close(handle)
     partial = Path(name)
     try:
-        with naming(path):
+        with with_filename(path):
             yield partial
             partial.chmod(0o644)
             with partial.open("rb") as file:
@@ -313,7 +326,7 @@ def read_sums(path: Path) -> dict[str, str]:
 
 
 @contextmanager
-def hold(lock: Path, busy: InterferenceError) -> Iterator[None]:
+def file_lock(lock: Path, busy: InterferenceError) -> Iterator[None]:
     """Hold a lock file until the block ends; the lock goes with the process, however it ends.
 
     Args:
@@ -329,31 +342,42 @@ def hold(lock: Path, busy: InterferenceError) -> Iterator[None]:
         yield
 
 
-def work_folder(out: Path) -> Path:
+def staging_path(out: Path) -> Path:
     """Return the hidden folder beside `out` in which `out` is made."""
     return out.parent / f".{out.name}.building"
 
 
 @contextmanager
-def working(out: Path) -> Iterator[Path]:
-    """Make the work folder of `out` and hold it; put back what was `before` in it if `out` is gone.
+def staging_dir(out: Path) -> Iterator[Path]:
+    """Make and lock the folder in which `out` is made, for one process at a time.
 
-    So a folder can be replaced whole: `out` becomes `before` in the work folder, and what was made
-    there `out`; then the caller removes the work folder. One in which nothing is finished goes by
-    itself.
-
-    Raises:
-        BuildError: Another process holds it.
+    What is made there becomes `out` by `replace_folder`. If the block succeeds, the staging folder
+    is removed; if it fails, it stays for the next attempt, unless nothing in it is finished.
     """
-    work = work_folder(out)
+    work = staging_path(out)
     work.mkdir(parents=True, exist_ok=True)
     busy = BuildError(f"another process makes {out}", "Wait for it to end, or stop it.")
-    with hold(work / "lock", busy):
-        if (work / "before").exists() and not out.exists():
-            (work / "before").rename(out)
+    with file_lock(work / "lock", busy):
+        before, finished = work / _BEFORE, False
+        if before.exists() and not out.exists():  # killed while it was replaced
+            before.rename(out)
+        shutil.rmtree(before, ignore_errors=True)
         try:
-            with naming(work):
+            with with_filename(work):
                 yield work
+            finished = True
         finally:
-            if not any(work.glob("*/[!.]*")):
+            if finished or not any(work.glob("*/[!.]*")):
                 shutil.rmtree(work, ignore_errors=True)
+
+
+def replace_folder(made: Path, out: Path) -> None:
+    """Let a folder in the staging folder of `out` become `out`, instead of what is there.
+
+    If the process is killed in between, the next `staging_dir` puts the old folder back.
+    """
+    before = staging_path(out) / _BEFORE
+    if out.exists():
+        out.rename(before)
+    made.rename(out)
+    shutil.rmtree(before, ignore_errors=True)

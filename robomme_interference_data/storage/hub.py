@@ -1,7 +1,8 @@
 """Reach repositories on the Hugging Face Hub, pinned to one commit: datasets, policies, encoders.
 
 The stock client does the work, so its own settings hold (`HF_ENDPOINT`, `HF_HUB_OFFLINE`,
-`HF_HOME`, `HF_HUB_CACHE`, `HF_TOKEN`), and its cache is the only one.
+`HF_HOME`, `HF_HUB_CACHE`, `HF_TOKEN`), and its cache is the only one. `hub_errors` turns what it
+raises into this package's errors.
 """
 
 import os
@@ -9,20 +10,17 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from hashlib import sha1
 from pathlib import Path
-from typing import Any
+from typing import Self
 
-from robomme_interference_data.errors import (
-    HashMismatchError,
-    InvalidOptionError,
-)
+from robomme_interference_data.errors import HashMismatchError, InvalidOptionError
 
 from .files import LocalFiles, all_files, check_relative, sha256_file
-from .hub_errors import Asked, check_endpoint
+from .hub_errors import HubCall, check_endpoint
 
-_REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_LOCATION = re.compile(r"([A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(.+))?")
 _VERSION = re.compile(r"data-\d+\.\d+\.\d+")
 _AT_ONCE = 8
 
@@ -34,12 +32,10 @@ def locate(
 
     Args:
         location: A folder, or a repository on the Hub: `namespace/name`, or with a branch, tag or
-            commit `namespace/name@revision`. A folder that is there goes before a repository.
+            commit `namespace/name@revision`. An existing folder takes precedence over a repository;
+            a `Path` is always a folder.
         repo_type: `dataset` or `model`.
         revision: The branch, tag or commit, if not in `location`.
-
-    Raises:
-        InvalidOptionError: It is neither, or a folder with a revision.
     """
     folder = Path(location).expanduser()
     if folder.is_dir():
@@ -49,18 +45,7 @@ def locate(
                 "Leave it out, or give namespace/name instead of the folder.",
             )
         return LocalFiles(folder)
-    repo_id, at, named = str(location).partition("@")
-    if at and revision is not None and named != revision:
-        raise InvalidOptionError(
-            f"{str(location)!r} and revision {revision!r}", "Give the revision once."
-        )
-    revision = named or revision
-    if not _REPO_ID.fullmatch(repo_id) or (at and not named):
-        raise InvalidOptionError(
-            f"{str(location)!r} is neither a folder nor a {repo_type} repository on the Hub",
-            "Give an existing folder, namespace/name, or namespace/name@revision.",
-        )
-    return HubFiles(repo_id, revision or None, repo_type)
+    return HubFiles.parse(str(location), repo_type, revision)
 
 
 class HubFiles:
@@ -74,9 +59,6 @@ class HubFiles:
         repo_id: Repository, `namespace/name`.
         revision: Branch, tag or commit hash; None for the main branch.
         repo_type: `dataset` or `model`.
-
-    Raises:
-        InvalidOptionError: `HF_ENDPOINT` is no address.
     """
 
     folder = ""
@@ -87,6 +69,22 @@ class HubFiles:
         self.revision = revision or "main"
         self.repo_type = repo_type
 
+    @classmethod
+    def parse(cls, location: str, repo_type: str = "dataset", revision: str | None = None) -> Self:
+        """Return the files at `namespace/name` or `namespace/name@revision`."""
+        match = _LOCATION.fullmatch(location)
+        if match is None:
+            raise InvalidOptionError(
+                f"{location!r} is neither a folder nor a {repo_type} repository on the Hub",
+                "Give an existing folder, namespace/name, or namespace/name@revision.",
+            )
+        repo_id, at = match.groups()
+        if at and revision not in (None, at):
+            raise InvalidOptionError(
+                f"{location!r} and revision {revision!r}", "Give the revision once."
+            )
+        return cls(repo_id, at or revision, repo_type)
+
     def inside(self, folder: str) -> "HubFiles":
         """Return the files of a folder of the repository, at the same commit."""
         found = HubFiles(self.repo_id, self.commit, self.repo_type)
@@ -95,12 +93,7 @@ class HubFiles:
 
     @cached_property
     def commit(self) -> str:
-        """Commit hash that the revision stands for.
-
-        Raises:
-            HubError: The repository or revision is unknown, needs permission, or cannot be
-                reached and is not in the cache.
-        """
+        """Commit hash that the revision stands for."""
         from huggingface_hub import HfApi
         from huggingface_hub.errors import RevisionResolutionError
 
@@ -109,36 +102,42 @@ class HubFiles:
         if _VERSION.fullmatch(self.revision):
             with suppress(RevisionResolutionError):
                 return str(resolve(self.repo_id, local_files_only=True, **wanted).resolved)
-        return str(self._ask(None, resolve, self.repo_id, **wanted).resolved)
+        return str(self._call().run(resolve, self.repo_id, **wanted).resolved)
+
+    @property
+    def location(self) -> str:
+        """`namespace/name@commit`; see `Files.location`."""
+        return f"{self.repo_id}@{self.commit}"
 
     def path(self, relative: str) -> Path:
         """Return the file's path in the cache, downloading it first if need be; see `Files.path`.
 
-        Raises:
-            MissingFileError: The repository has no such file.
-            HubError: See `commit`.
-            HashMismatchError: What came is not what the Hub has.
+        What arrives is compared with the digest that the Hub has of it.
         """
         from huggingface_hub import hf_hub_download
+        from huggingface_hub.utils import tqdm
 
         check_relative(relative, self.describe())
-        new = self.missing([relative])
+        new, name = self.missing([relative]), self.folder + relative
         path = Path(
-            self._ask(
-                relative,
+            self._call(name).run(
                 hf_hub_download,
                 self.repo_id,
-                self.folder + relative,
+                name,
                 repo_type=self.repo_type,
                 revision=self.commit,
-                tqdm_class=_silent(),
+                tqdm_class=partial(tqdm, disable=True),  # files are small, and counted by `fetch`
             )
         )
         self._check({one: path for one in new})
         return path
 
     def fetch(self, paths: Iterable[str]) -> None:
-        """Download files that are not in the cache, with a bar; see `Files.fetch`."""
+        """Download files that are not in the cache, with a progress bar; see `Files.fetch`.
+
+        Not by `snapshot_download`, which lists the whole repository first: for one buffer of a
+        large dataset that is more bytes, and more requests, than the buffer's metadata.
+        """
         from huggingface_hub.utils import tqdm
 
         missing = self.missing(paths)
@@ -148,79 +147,53 @@ class HubFiles:
             tqdm(total=len(missing), desc=f"Fetching from {self.repo_id}", unit=" files") as bar,
             ThreadPoolExecutor(_AT_ONCE) as pool,
         ):
-            try:
-                for _ in pool.map(self.path, missing):
-                    bar.update()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+            for _ in pool.map(self.path, missing):  # an error cancels those that wait
+                bar.update()
 
     def missing(self, paths: Iterable[str]) -> list[str]:
         """Return the files that are not in the cache, each once."""
         from huggingface_hub import try_to_load_from_cache
 
-        there = partial(
-            try_to_load_from_cache,
-            self.repo_id,
-            repo_type=self.repo_type,
-            revision=self.commit,
-        )
-        found = {path: there(self.folder + path) for path in dict.fromkeys(paths)}
-        return [path for path, place in found.items() if not isinstance(place, str)]
+        def cached(path: str) -> object:
+            of = {"repo_type": self.repo_type, "revision": self.commit}
+            return try_to_load_from_cache(self.repo_id, self.folder + path, **of)
+
+        return [path for path in dict.fromkeys(paths) if not isinstance(cached(path), str)]
 
     def sizes(self) -> dict[str, int]:
-        """Ask how large every file of the repository is; return bytes by path.
-
-        Raises:
-            HubError: See `commit`.
-        """
+        """Ask how large every file of the repository is; return bytes by path."""
         from huggingface_hub import HfApi
 
-        commit = self.commit  # what it raises is told already
-
-        def listed() -> dict[str, int]:
-            tree = HfApi().list_repo_tree(
-                self.repo_id, recursive=True, revision=commit, repo_type=self.repo_type
-            )
-            return {
-                one.path.removeprefix(self.folder): one.size
-                for one in tree
-                if hasattr(one, "size") and one.path.startswith(self.folder)
-            }
-
-        found: dict[str, int] = self._ask(None, listed)
-        return found
+        of = {"repo_type": self.repo_type, "revision": self.commit}
+        tree = self._call().run(
+            lambda: list(HfApi().list_repo_tree(self.repo_id, recursive=True, **of))  # in pages
+        )
+        return {
+            one.path.removeprefix(self.folder): one.size
+            for one in tree
+            if hasattr(one, "size") and one.path.startswith(self.folder)
+        }
 
     def snapshot(self, *patterns: str) -> Path:
-        """Download the files that match a pattern, such as `meta/*`; return the folder of all.
-
-        Raises:
-            HubError: See `commit`.
-            HashMismatchError: What came is not what the Hub has.
-        """
+        """Download the files that match a pattern, such as `meta/*`; return the folder of all."""
         from huggingface_hub import constants, snapshot_download
         from huggingface_hub.file_download import repo_folder_name
 
         cache = repo_folder_name(repo_id=self.repo_id, repo_type=self.repo_type)
         root = Path(constants.HF_HUB_CACHE, cache, "snapshots", self.commit, self.folder)
-        there = {*all_files(root)}
-        self._ask(
-            None,
+        before = {*all_files(root)}
+        self._call().run(
             snapshot_download,
             self.repo_id,
             repo_type=self.repo_type,
             revision=self.commit,
             allow_patterns=[self.folder + pattern for pattern in patterns],
         )
-        self._check({path: root / path for path in all_files(root) if path not in there})
+        self._check({path: root / path for path in all_files(root) if path not in before})
         return root
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Return the sorted paths of the files under a folder, which are downloaded.
-
-        Raises:
-            HubError, HashMismatchError: See `snapshot`.
-        """
+        """Return the sorted paths of the files under a folder, which are downloaded."""
         return LocalFiles(self.snapshot(f"{folder}/*{suffix}")).list(folder, suffix)
 
     def describe(self) -> str:
@@ -245,13 +218,11 @@ class HubFiles:
         if damaged:
             raise HashMismatchError(
                 f"{', '.join(damaged)} of {self.describe()} came damaged: the digest is another",
-                "What is damaged was thrown away. Type the same command again.",
+                "What is damaged was thrown away. Run the same command again.",
             )
 
-    def _ask(self, relative: str | None, call: Any, *arguments: Any, **options: Any) -> Any:
-        path = None if relative is None else self.folder + relative
-        asked = Asked(self.repo_id, self.repo_type, self._at, path)
-        return asked.ask(call, *arguments, **options)
+    def _call(self, path: str | None = None) -> HubCall:
+        return HubCall(self.repo_id, self.repo_type, self._at, path)
 
     @property
     def _at(self) -> str:
@@ -263,15 +234,3 @@ class HubFiles:
 def _git_sha1(path: Path) -> str:
     data = path.read_bytes()
     return sha1(b"blob %d\0" % len(data) + data).hexdigest()
-
-
-@cache
-def _silent() -> type:
-    """Return the client's progress bar without a bar: files are small, and counted elsewhere."""
-    from huggingface_hub.utils import tqdm
-
-    class Silent(tqdm):  # type: ignore[misc, valid-type]
-        def __init__(self, *arguments: Any, **options: Any) -> None:
-            super().__init__(*arguments, **{**options, "disable": True})
-
-    return Silent

@@ -1,58 +1,88 @@
-"""What the Hub's client raises, in this package's words, with what to do next."""
+"""Errors of the Hub's client as errors of this package, with what to do next."""
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from robomme_interference_data.errors import (
-    HubError,
-    InterferenceError,
-    InvalidOptionError,
-    MissingFileError,
-)
+from robomme_interference_data.errors import HubError, InvalidOptionError, MissingFileError
 
-from .files import naming
+from .files import with_filename
 
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _BUSY = (429, 503)
 _PUBLIC = "https://huggingface.co"
 
+_LOGIN = (
+    "the Hub at {endpoint} does not know this login",
+    "Make a token that may {may}, and type: hf auth login (HF_TOKEN, if set, takes precedence)",
+)
+_UNKNOWN = (
+    "there is no {repository} that this login may see",
+    "Check the name. {folder}For a private repository, type: hf auth login",
+)
+_ANSWERS = {
+    "GatedRepoError": (
+        "the {repository} is gated, and this login has not been given access",
+        "Ask for access at {page}, then type: hf auth login",
+    ),
+    "RevisionNotFoundError": (
+        "the {repository} has no revision {revision!r}",
+        "Its branches and tags are listed at {page}/tree/main",
+    ),
+    "RepositoryNotFoundError": _UNKNOWN,
+    "HFValidationError": _UNKNOWN,
+    "RemoteEntryNotFoundError": (
+        "{path} is missing in {repo_id}@{revision}",
+        "The repository is not complete; its files: {page}/tree/{revision}",
+    ),
+    "LocalTokenNotFoundError": _LOGIN,
+    401: _LOGIN,
+    403: (
+        "this login may not {may} {repo_id}",
+        "Use a token that may: hf auth login --force",
+    ),
+    412: (
+        "somebody else wrote to {repo_id} at the same time",
+        "Look at {page}/commits/main. If that is as it should be: {again}",
+    ),
+}
+"""Message and hint by the client's error class or the status of the Hub's answer; the first that
+fits counts."""
+
 
 def check_endpoint() -> None:
-    """Check that `HF_ENDPOINT` is an address: of some that are none, the client cannot be imported.
-
-    Raises:
-        InvalidOptionError: It is none.
-    """
+    """Check that `HF_ENDPOINT` is an address: some others break the client's import."""
     given = os.environ.get("HF_ENDPOINT", _PUBLIC)
     try:
-        told = urlsplit(given)
-        known = told.scheme in ("http", "https") and told.hostname and told.port != 0
+        url = urlsplit(given)
+        valid = url.scheme in ("http", "https") and url.hostname and url.port != 0
     except ValueError:
-        known = False
-    if not known or any(map(str.isspace, given)):
+        valid = False
+    if not valid or any(map(str.isspace, given)):
         expected, hint = f"an address such as {_PUBLIC}", "For that one, type: unset HF_ENDPOINT"
         raise InvalidOptionError.expected("HF_ENDPOINT", given, expected, hint)
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the Hub is asked for: a repository, to read it or to write to it.
+class HubCall:
+    """A call of the Hub's client about one repository: its errors get this package's words.
 
     Attributes:
         repo_id: The repository, `namespace/name`.
         repo_type: `dataset` or `model`.
-        revision: Branch, tag or commit that is read; None where it is written to.
+        revision: Branch, tag or commit that is read; None if nothing is downloaded.
         path: The file that is read; None for none in particular.
+        sends: Whether files are sent.
     """
 
     repo_id: str
     repo_type: str = "dataset"
     revision: str | None = None
     path: str | None = None
+    sends: bool = False
 
     @property
     def page(self) -> str:
@@ -65,16 +95,17 @@ class Asked:
     @property
     def again(self) -> str:
         """What to do after an error that may pass, without a full stop."""
-        kept = "was sent" if self.revision is None else "came whole"
-        return f"What {kept} is kept: type the same command again"
+        kept = "arrived" if self.revision else "was sent" if self.sends else None
+        again = "run the same command again"
+        return f"what {kept} is kept: {again}" if kept else again
 
-    def ask(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Call a function of the client.
+    def run(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Call a function of the client, and nothing but the client.
 
         Raises:
             HubError: The Hub refuses, does not know the repository, or cannot be reached.
             MissingFileError: The repository has no such file.
-            OSError: The system's word on a file, such as that the disk is full.
+            OSError: The system's error about a file, such as that the disk is full.
         """
         import httpx
         from huggingface_hub import constants, errors
@@ -92,67 +123,52 @@ class Asked:
         ) as error:
             cause = _cause(error)
             if isinstance(cause, OSError) and cause.errno is not None:
-                with naming(constants.HF_HUB_CACHE if self.revision else self.repo_id):
+                with with_filename(constants.HF_HUB_CACHE if self.revision else self.repo_id):
                     raise cause from None
             raise self._explained(cause) from cause
 
-    def _explained(self, error: BaseException) -> InterferenceError:
-        import httpx
-        from huggingface_hub import constants, errors
+    def _explained(self, error: BaseException) -> HubError | MissingFileError:
+        from huggingface_hub import constants
 
-        reads, code, seconds = self.revision is not None, _status(error), _seconds(error)
         repository = f"{self.repo_type} repository {self.repo_id!r} on {constants.ENDPOINT}"
-        what = f"the {repository}" if self.path is None else f"{self.path} of the {repository}"
-        lacking = " is not in the cache, and" if reads else ""
-        if isinstance(error, errors.GatedRepoError):
-            what = f"the {repository} is gated, and this login has not been given access"
-            hint = f"Ask for access at {self.page}, then type: hf auth login"
-        elif isinstance(error, errors.RevisionNotFoundError):
-            what = f"the {repository} has no revision {self.revision!r}"
-            hint = f"Its branches and tags are listed at {self.page}/tree/main"
-        elif isinstance(error, errors.RepositoryNotFoundError | errors.HFValidationError):
-            what = f"there is no {repository} that this login may see"
-            login = "For a private repository, type: hf auth login"
-            hint = f"Check the name. {self._no_folder}{login}"
-        elif isinstance(error, errors.RemoteEntryNotFoundError):
-            what = f"{self.path} is missing in {self.repo_id}@{self.revision}"
-            hint = f"The repository is not complete; its files: {self.page}/tree/{self.revision}"
-            return MissingFileError(what, hint)
-        elif isinstance(error, errors.LocalTokenNotFoundError) or code == 401:
-            what = f"the Hub at {constants.ENDPOINT} does not know this login"
-            may = f"Make a token that may {'read' if reads else 'write'}"
-            hint = f"{may}, and type: hf auth login (HF_TOKEN, where it is set, goes before that)"
-        elif code == 403:
-            what = f"this login may not {'read' if reads else 'write to'} {self.repo_id}"
-            own = "" if reads else "a repository of your own, or "
-            hint = f"Give {own}a token that may: hf auth login --force"
-        elif code == 412:
-            what = f"somebody else wrote to {self.repo_id} at the same time"
-            hint = f"Look at {self.page}/commits/main. {self.again}, if that is as it should be."
-        elif constants.HF_HUB_OFFLINE:
-            what = f"{what}{lacking} cannot be reached: HF_HUB_OFFLINE is set"
-            hint = f"{self._no_folder}Where there is a network, type: {self._command}"
+        keys = [*(one.__name__ for one in type(error).__mro__), _status(error)]
+        key = next((key for key in _ANSWERS if key in keys), None)
+        if key is not None:
+            words = vars(self) | {
+                "repository": repository,
+                "page": self.page,
+                "endpoint": constants.ENDPOINT,
+                "may": "read" if self.revision else "write to",
+                "folder": self._folder,
+                "again": f"{self.again}.",
+            }
+            message, hint = (text.format(**words) for text in _ANSWERS[key])
+            missing = key == "RemoteEntryNotFoundError"
+            return MissingFileError(message, hint) if missing else HubError(message, hint)
+        what = f"{self.path} of the {repository}" if self.path else f"the {repository}"
+        if self.revision:
+            what += " is not in the cache, and"
+        seconds = _seconds(error)
+        again = self.again[0].upper() + self.again[1:]
+        if constants.HF_HUB_OFFLINE:
+            why = "cannot be reached: HF_HUB_OFFLINE is set"
+            again = f"With a network, type: {self._download}"
         elif seconds is not None:
-            what = f"{what}{lacking} cannot be had: the Hub is busy ({code})"
-            hint = f"{self._no_folder}{self.again} in {max(seconds / 60, 1):.0f} minutes or more."
+            why = f"cannot be had: the Hub is busy ({_status(error)})"
+            again += f" in {max(seconds / 60, 1):.0f} minutes or more."
         else:
-            away = isinstance(error, httpx.TransportError) or (code or 0) >= 500
-            state = f"{lacking} cannot be reached" if away else ""
-            what = f"{what}{state}: {' '.join(str(error).split())}"
-            hint = f"{self._no_folder}{self.again}."
-        return HubError(what, hint)
+            why, again = f"cannot be had: {' '.join(str(error).split())}", f"{again}."
+        return HubError(f"{what} {why}", self._folder + again)
 
     @property
-    def _command(self) -> str:
-        """The command that does what could not be done, with a network."""
+    def _download(self) -> str:
         if self.revision is None:
-            return "the same command again, with HF_HUB_OFFLINE=0 in front."
-        option = "" if self.repo_type == "model" else f" --repo-type {self.repo_type}"
+            return "HF_HUB_OFFLINE=0 and the same command"
         what = f"{self.repo_id} --revision {self.revision} {self.path or ''}".rstrip()
-        return f"HF_HUB_OFFLINE=0 hf download{option} {what}"
+        return f"HF_HUB_OFFLINE=0 hf download --repo-type {self.repo_type} {what}"
 
     @property
-    def _no_folder(self) -> str:
+    def _folder(self) -> str:
         """What to say as long as the name may be that of a folder, mistyped."""
         if self.revision is None or _COMMIT.fullmatch(self.revision):
             return ""
@@ -175,7 +191,7 @@ def _seconds(error: BaseException) -> float | None:
 
     if _status(error) not in _BUSY:
         return None
-    headers: Mapping[str, str] = error.response.headers  # type: ignore[attr-defined]
+    headers: Any = error.response.headers  # type: ignore[attr-defined]
     limit = parse_ratelimit_headers(headers)
     if limit is not None and limit.remaining == 0:
         return float(limit.reset_in_seconds)

@@ -32,7 +32,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.storage.files import LocalFiles, hold, read_json, work_folder
+from robomme_interference_data.storage.files import LocalFiles, file_lock, read_json, staging_path
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
 
@@ -67,7 +67,7 @@ def test_the_golden_units_come_out_again_and_grow_to_the_same_bytes(tmp_path: Pa
     again = step(numbers=(0, 1))
     assert (again.episodes, again.added) == (17, 0)
     assert contents(out) == contents(golden)
-    assert not work_folder(out).exists()
+    assert not staging_path(out).exists()
 
 
 def test_the_golden_demonstrations_hold_what_the_source_gives(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_build_goes_on_from_what_was_staged(tmp_path: Path) -> None:
         source.wrong[name] = {0: SourceError("must not be read")}
     source.wrong["B/train/0"] = {}
     assert build(out, source).added == 4
-    assert not work_folder(out).exists()
+    assert not staging_path(out).exists()
     build(tmp_path / "at once", MadeUpSource(TRAIN))
     assert contents(out) == contents(tmp_path / "at once")
 
@@ -106,8 +106,8 @@ def test_what_a_killed_build_had_moved_away_is_put_back(tmp_path: Path) -> None:
     out = tmp_path / "out"
     source = MadeUpSource(TRAIN)
     build(out, source, filters={"numbers": (0,)})
-    work_folder(out).mkdir()
-    out.rename(work_folder(out) / "before")  # killed between the two renames
+    staging_path(out).mkdir()
+    out.rename(staging_path(out) / "before")  # killed between the two renames
     assert build(out, source).added == 2
     assert ids(out) == list(TRAIN)
 
@@ -182,10 +182,10 @@ def test_what_else_may_be_in_the_way(tmp_path: Path) -> None:
     with pytest.raises(BuildError, match="is not a dataset of this package"):
         build(tmp_path / "mine", source)
     assert contents(tmp_path / "mine") == {"notes.txt": b"keep"}
-    work = work_folder(tmp_path / "out")
+    work = staging_path(tmp_path / "out")
     work.mkdir()
     with (
-        hold(work / "lock", BuildError("x")),
+        file_lock(work / "lock", BuildError("x")),
         pytest.raises(BuildError, match="another process makes .*out"),
     ):
         build(tmp_path / "out", source)

@@ -14,8 +14,8 @@ from robomme_interference_data.storage.files import (
     LocalFiles,
     atomic_path,
     canonical_json,
+    file_lock,
     format_sums,
-    hold,
     parse_json,
     read_json,
     read_sums,
@@ -190,12 +190,12 @@ def test_json_has_a_bounded_depth() -> None:
 def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
     busy = FormatError("busy")
     with (
-        hold(tmp_path / "lock", busy),
+        file_lock(tmp_path / "lock", busy),
         pytest.raises(FormatError, match="busy"),
-        hold(tmp_path / "lock", busy),
+        file_lock(tmp_path / "lock", busy),
     ):
         pass
-    with hold(tmp_path / "lock", busy):  # free again
+    with file_lock(tmp_path / "lock", busy):  # free again
         pass
 
 

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from huggingface_hub import constants
+from huggingface_hub import HfApi, constants
 from support.hub_server import HubServer
 from support.lerobot_layouts import write_lerobot
 
+from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import (
     FormatError,
@@ -23,6 +24,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.hub import HubFiles, locate
+from robomme_interference_data.storage.hub_errors import HubCall
 
 Run = Callable[..., tuple[int, str, str]]
 REPO = "someone/small"
@@ -90,6 +92,21 @@ def test_no_path_leads_out(hub: HubServer, path: str) -> None:
     assert hub.requests == []
 
 
+@pytest.mark.parametrize("text", ["./a/b", "a//b", "a/b/"])
+def test_a_folder_that_is_not_there_is_not_asked_for_on_the_hub(hub: HubServer, text: str) -> None:
+    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
+        load_split(text)
+    assert hub.requests == []
+
+
+def test_a_location_leads_back(hub: HubServer, tmp_path: Path) -> None:
+    commit = hub.push(DATASET, FILES)
+    files = locate(REPO)
+    assert files.location == f"{REPO}@{commit}"
+    assert locate(files.location).path("README.md").read_bytes() == b"read me"
+    assert locate(tmp_path).location == str(tmp_path)
+
+
 # --- refusals ------------------------------------------------------------------------------------
 
 
@@ -151,6 +168,14 @@ def test_a_token_that_is_no_more(
     with pytest.raises(HubError, match="does not know this login") as caught:
         HubFiles(REPO, revision).path("README.md")
     assert "may read, and type: hf auth login (HF_TOKEN" in str(caught.value.hint)
+
+
+def test_what_is_kept_is_said_of_files_alone(hub: HubServer) -> None:
+    hub.fault("GET", "/api/whoami-v2", status=500, times=50)
+    for sends, kept in ((False, False), (True, True)):
+        with pytest.raises(HubError) as caught:
+            HubCall(REPO, sends=sends).run(HfApi().whoami, token="any")
+        assert ("what was sent is kept" in str(caught.value.hint).lower()) == kept
 
 
 def test_a_hub_that_is_down(hub: HubServer) -> None:

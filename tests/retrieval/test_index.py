@@ -30,7 +30,7 @@ from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import measure
-from robomme_interference_data.storage.files import hold, work_folder
+from robomme_interference_data.storage.files import file_lock, staging_path
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 
@@ -213,9 +213,9 @@ def test_what_cannot_be_embedded(own_split: Path) -> None:
 
 
 def test_two_do_not_make_one_index(own_split: Path) -> None:
-    folder = work_folder(own_split / "demonstrations" / "index" / "thumbnail")
+    folder = staging_path(own_split / "demonstrations" / "index" / "thumbnail")
     folder.mkdir(parents=True)
-    with hold(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
+    with file_lock(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
         make_index(own_split)
 
 

@@ -14,7 +14,7 @@ from support.build_server import BuildServer
 from support.splits import contents
 
 from robomme_interference_data.build_dataset.stage import read_staged
-from robomme_interference_data.storage.files import work_folder
+from robomme_interference_data.storage.files import staging_path
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 
@@ -50,7 +50,7 @@ def undisturbed(
 
 def staged(out: Path) -> dict[Path, int]:
     """The files of finished staged episodes, with their times."""
-    folders = work_folder(out).glob("episodes/[0-9a-f]*")
+    folders = staging_path(out).glob("episodes/[0-9a-f]*")
     return {
         path: path.stat().st_mtime_ns
         for folder in folders
@@ -84,7 +84,7 @@ def test_stopped_at_random_moments(
         if out.exists():
             assert contents(out) == expected
             shutil.rmtree(out)
-            shutil.rmtree(work_folder(out), ignore_errors=True)
+            shutil.rmtree(staging_path(out), ignore_errors=True)
             continue
         codes = {signal.SIGINT: 130, signal.SIGTERM: 143}
         assert finished.code in (codes.get(sent, -sent), -sent), finished.stderr

@@ -50,7 +50,7 @@ def test_a_split_for_published_demonstrations(
     assert code == 0, err
     assert "publish" in err
     split = load_split(out)
-    assert split.header.datasets["demonstrations"].place == split.place("demonstrations").describe()
+    assert split.header.datasets["demonstrations"].place == split.place("demonstrations").location
     buffer = split.load("MoveCube/test/0", "k2", verify=True)
     assert {one.family for one in buffer.sessions[1:]} == {*FAMILIES}
     lesson = load_split(GOLDEN).load("MoveCube/test/0", "k0")
