@@ -5,14 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import (
-    AsJson,
-    Group,
-    SplitFolder,
-    print_json,
-    say,
-    stoppable,
-)
+from robomme_interference_data.cli.console import Group, print_json, say, stoppable
+from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
@@ -24,7 +18,6 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import MissingFileError, visible
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
-from robomme_interference_data.schema.settings import with_settings
 
 from .config import (
     AllConfig,
@@ -61,7 +54,7 @@ robomme-interference build demonstrations --source robomme-h5:recordings/ \\
     --out $S/demonstrations
 robomme-interference build distractors --source robomme-h5:recordings/ \\
     --out $S/distractors
-robomme-interference build manifests $S --conditions no-history k0 k1 k3 k7
+robomme-interference build manifests $S --conditions no-history,k0,k1,k3,k7
 ```
 """,
 )
@@ -101,7 +94,7 @@ def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
     Examples:
     ```
     robomme-interference build distractors --source lerobot:NAMESPACE/NAME --out S/distractors
-    robomme-interference build distractors --source robomme-h5:recordings/ frames:mine/ \
+    robomme-interference build distractors --source robomme-h5:recordings/ --source frames:mine/ \
         --cameras front --out S/distractors
     ```
     """
@@ -171,7 +164,7 @@ def manifests(
 
     Example:
     ```
-    robomme-interference build manifests my-split --conditions no-history k0 k1 k3 k7 --seed 0
+    robomme-interference build manifests my-split --conditions no-history,k0,k1,k3,k7 --seed 0
     ```
     """
     with stoppable("The datasets are kept"):
@@ -230,7 +223,7 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
     ```
     robomme-interference build all --source robomme-h5:recordings/ --out my-split
     robomme-interference build all --source tabletop --split test --out my-split \
-        --conditions no-history k0 k7 before-k7 held-k7 stale-k0
+        --conditions no-history,k0,k7,before-k7,held-k7,stale-k0
     ```
     """
     with stoppable(_KEPT):

@@ -40,9 +40,9 @@ class BuildConfig(WorkersConfig):
 
     source: tuple[str, ...] = setting(
         whole=True,
-        metavar="SOURCE…",
+        metavar="SOURCE",
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
-        "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; several, with spaces.",
+        "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; repeated for several.",
     )
     out: Path = setting(help="Folder to make, or dataset to let grow.")
     families: tuple[str, ...] = setting((), help="Families to take; all by default.")
@@ -59,7 +59,7 @@ class BuildConfig(WorkersConfig):
         shown="300 on tabletop and sample, else 1800",
     )
     columns: tuple[str, ...] = setting(
-        (), metavar="NAME=COLUMN…", help="lerobot sources: where columns are named otherwise."
+        (), metavar="NAME=COLUMN,…", help="lerobot sources: where columns are named otherwise."
     )
     families_file: Path | None = setting(
         None, help="lerobot sources: file that names each episode's family."
@@ -98,7 +98,7 @@ class PlanConfig:
 
     conditions: tuple[str, ...] = setting(
         DEFAULT_CONDITIONS,
-        help="Conditions to plan buffers for, such as no-history k0 k7 before-k7; all kinds: "
+        help="Conditions to plan buffers for, such as no-history,k0,k7,before-k7; all kinds: "
         "robomme-interference conditions.",
     )
     seed: int = setting(0, help="Seed of the draw.")

@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import (
-    AsJson,
-    SplitFolder,
-    check_output,
-    print_json,
-    say,
-    stoppable,
-)
+from robomme_interference_data.cli.console import check_output, print_json, say, stoppable
+from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score import Grid
-from robomme_interference_data.schema.settings import with_settings
 
 from .publish_config import PublishConfig, VersionConfig
 

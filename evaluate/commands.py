@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robomme_interference_data.cli.console import (
-    AsJson,
-    SplitFolder,
     check_output,
     command_line,
     print_json,
     say,
     stoppable,
 )
-from robomme_interference_data.schema.settings import with_settings
+from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
 from .run.config import AskConfig, CeilingConfig, RunConfig
@@ -33,7 +31,7 @@ def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) 
     Examples:
     ```
     robomme-interference ceiling my-split --memory window
-    robomme-interference ceiling my-split --retrieval thumbnail --conditions k0 k7
+    robomme-interference ceiling my-split --retrieval thumbnail --conditions k0,k7
     robomme-interference ceiling my-split --retrieval thumbnail --shift light:2
     ```
     """
@@ -71,7 +69,7 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     robomme-interference evaluate --policy websocket://localhost:8000 \
       --system perceptual-framesamp-modul --split S --out runs/mine \
       --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999 \
-      --conditions k0 k7 --families MoveCube RouteStick
+      --conditions k0,k7 --families MoveCube,RouteStick
 
     robomme-interference evaluate --policy websocket --workers 2 \
       --serve 'python serve.py --port {port}' --system mine --split S --out runs/served
@@ -112,7 +110,7 @@ def ask(config: AskConfig, as_json: AsJson = False) -> None:
 
     Examples:
     ```
-    robomme-interference ask --model recall --split S --out runs/recall --conditions k0 k7
+    robomme-interference ask --model recall --split S --out runs/recall --conditions k0,k7
 
     robomme-interference ask --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct \
       --system qwen3-vl-4b --split S --out runs/qwen --frames 32 --sampling framesamp

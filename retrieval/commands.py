@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.cli.console import (
+from robomme_interference_data.cli.console import check_output, print_json, say, stoppable
+from robomme_interference_data.cli.options import (
     AsJson,
     ConditionName,
     Conditions,
@@ -16,15 +17,11 @@ from robomme_interference_data.cli.console import (
     QueryName,
     SplitFolder,
     SplitOption,
-    check_output,
-    print_json,
-    say,
-    stoppable,
+    with_settings,
 )
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.runtime.executor import Serial, WorkersConfig, make_executor
-from robomme_interference_data.schema.settings import with_settings
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
@@ -170,7 +167,7 @@ def retrieval_score(
             help="How to choose: METHOD or METHOD/CUT, several for comparison, or all. METHOD is "
             "max (released rule), latest, joined, mean, last, random, top32 or oracle; CUT a "
             "cosine or adaptive, left out for the encoder's own.",
-            metavar="RULE…",
+            metavar="RULE,…",
         ),
     ] = ["max"],  # noqa: B006 - typer copies it
     families: Families = [],  # noqa: B006

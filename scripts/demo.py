@@ -26,7 +26,7 @@ SPLIT = DEMO / "split"
 THERE_BEFORE = (ROOT / DEMO).exists()
 COMMAND = Path(sys.executable).parent / "robomme-interference"
 
-FILLERS = ("SampleReach", "SamplePush", "SampleStack", "SampleWipe", "SamplePour")
+FILLERS = "SampleReach,SamplePush,SampleStack,SampleWipe,SamplePour"
 """Families of made-up sessions, so that every query has seven others to draw from."""
 
 
@@ -38,7 +38,7 @@ def main() -> None:
     queries, units = recorded_here() if SHARED.is_dir() else (sample, sample)
     run("build demonstrations", *queries, "--split test", f"--out {SPLIT}/demonstrations")
     run("build distractors", *units, f"--out {SPLIT}/distractors")
-    run(f"build manifests {SPLIT} --conditions no-history k0 k1 k3 k7 --seed 0")
+    run(f"build manifests {SPLIT} --conditions no-history,k0,k1,k3,k7 --seed 0")
     run(f"show VideoRepick/test/0 k7 --split {SPLIT} --out {DEMO}/strip.png")
     run(f"audit {SPLIT}")
     # As it would be on the Hub, after every hash and rule has been checked.
@@ -66,8 +66,8 @@ def simulate() -> None:
     run(f"build demonstrations {played} --out {out}/demonstrations")
     run(f"build distractors --source tabletop --episodes 2 --out {out}/distractors")
     # Beside the paper's: the lesson after the units, delay without content, and no lesson at all.
-    paper, beyond = "no-history k0 k1 k3 k7", "before-k7 held-k7 absent-k7"
-    run(f"build manifests {out} --conditions {paper} {beyond}")
+    conditions = "no-history,k0,k1,k3,k7,before-k7,held-k7,absent-k7"
+    run(f"build manifests {out} --conditions {conditions}")
     run(f"show PatternLock/test/0 k7 --split {out} --out {DEMO}/tabletop.png")
 
 
@@ -79,7 +79,7 @@ def evaluate() -> None:
     for out, policy in zip(runs, policies.values(), strict=True):
         run(
             f"evaluate --policy {policy} --split {DEMO}/tabletop --out {out} --episodes 0",
-            "--families MoveCube PatternLock RouteStick --workers 2",
+            "--families MoveCube,PatternLock,RouteStick --workers 2",
         )
     # Three episodes a cell, not the benchmark's 450: a cell is complete with those given.
     run(f"score {' '.join(map(str, runs))} --grid given --out {DEMO}/score")
@@ -92,7 +92,7 @@ def ask() -> None:
     run(f"question VideoUnmask/test/0 --split {split} --out {DEMO}/question.png")
     runs = [DEMO / "asked" / model for model in ("recall", "guess")]
     for out in runs:
-        run(f"ask --model {out.name} --split {split} --out {out} --conditions no-history k0 k7")
+        run(f"ask --model {out.name} --split {split} --out {out} --conditions no-history,k0,k7")
     run(f"score {' '.join(map(str, runs))} --grid given --out {DEMO}/score-questions")
 
 
@@ -109,7 +109,10 @@ def recorded_here() -> tuple[list[str], list[str]]:
         lay_out_lessons(SHARED / "lessons", lessons)
     return (
         [f"--source frames:{lessons}"],
-        [f"--source robomme-h5:{recordings} sample:{','.join(FILLERS)}", "--cameras front"],
+        [
+            f"--source robomme-h5:{recordings} --source sample:{FILLERS}",
+            "--cameras front",
+        ],
     )
 
 

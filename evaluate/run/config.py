@@ -63,7 +63,7 @@ class RunConfig(WorkConfig):
         (),
         name="--policy-option",
         whole=True,
-        metavar="NAME=VALUE…",
+        metavar="NAME=VALUE",
         help="Options of the policy, such as device=cpu or response_s=60.",
     )
     serve: str | None = setting(
@@ -85,7 +85,7 @@ class RunConfig(WorkConfig):
         (),
         name="--subgoal-option",
         whole=True,
-        metavar="NAME=VALUE…",
+        metavar="NAME=VALUE",
         help="Options of what writes subgoals, such as frames=32 or response_s=60.",
     )
     robomme_python: str | None = setting(
@@ -123,7 +123,7 @@ class AskConfig(WorkConfig):
         (),
         name="--model-option",
         whole=True,
-        metavar="NAME=VALUE…",
+        metavar="NAME=VALUE",
         help="Options of the model, such as max_tokens=64 or response_s=60.",
     )
 

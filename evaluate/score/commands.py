@@ -7,14 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import (
-    AsJson,
-    check_output,
-    command_line,
-    print_json,
-    say,
-)
-from robomme_interference_data.schema.settings import with_settings
+from robomme_interference_data.cli.console import check_output, command_line, print_json, say
+from robomme_interference_data.cli.options import AsJson, split_commas, with_settings
 
 from . import Settings
 
@@ -81,7 +75,11 @@ def compare(
     ] = None,
     conditions: Annotated[
         list[str] | None,
-        typer.Option(help="The condition of A and that of B, such as k0 k7, instead of each."),
+        typer.Option(
+            help="The condition of A and that of B, such as k0,k7, instead of each.",
+            metavar="NAME,…",
+            callback=split_commas,
+        ),
     ] = None,
     system_a: Annotated[
         str | None, typer.Option(help="Name of the system of rows of A that name none.")
@@ -101,7 +99,7 @@ def compare(
     Examples:
     ```
     robomme-interference compare my-run my-run-with-retrieval
-    robomme-interference compare my-run --conditions k0 k7
+    robomme-interference compare my-run --conditions k0,k7
     robomme-interference compare my-run my-run-under-light-2
     robomme-interference compare my-run rollouts.csv --system-b retrieval-framesamp-modul
     ```

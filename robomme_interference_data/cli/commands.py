@@ -9,10 +9,10 @@ import typer
 
 from robomme_interference_data.data.fetch import FetchConfig
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.schema.settings import with_settings
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
-from .console import (
+from .console import check_output, print_json, say, stoppable
+from .options import (
     AsJson,
     ConditionName,
     Conditions,
@@ -21,10 +21,7 @@ from .console import (
     QueryName,
     SplitFolder,
     SplitOption,
-    check_output,
-    print_json,
-    say,
-    stoppable,
+    with_settings,
 )
 
 
@@ -39,7 +36,7 @@ def list_buffers(
 
     Examples:
     ```
-    robomme-interference list my-split --conditions k3 k7
+    robomme-interference list my-split --conditions k3,k7
     robomme-interference list my-split --families MoveCube --json
     ```
     """
@@ -71,7 +68,7 @@ def list_conditions(as_json: AsJson = False) -> None:
     Examples:
     ```
     robomme-interference conditions
-    robomme-interference build manifests my-split --conditions no-history k0 k7 before-k7 held-k7
+    robomme-interference build manifests my-split --conditions no-history,k0,k7,before-k7,held-k7
     ```
     """
     from robomme_interference_data.constants import MAX_K

@@ -1,4 +1,4 @@
-"""What commands share: messages on stderr, JSON on stdout, parameters, and how they are stopped."""
+"""What commands share: messages on stderr, JSON on stdout, and how they are stopped."""
 
 import json
 import logging
@@ -8,25 +8,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_HEADER, MANIFEST_ROWS
 from robomme_interference_data.errors import InvalidOptionError, visible
-
-# Parameters that several commands have.
-AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
-SplitFolder = Annotated[Path, typer.Argument(help="Folder of the split.")]
-SplitOption = Annotated[
-    Path, typer.Option(envvar="ROBOMME_INTERFERENCE_SPLIT", help="Folder of the split.")
-]
-QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
-ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]
-Families = Annotated[list[str], typer.Option(help="Families.", show_default="all")]
-Conditions = Annotated[list[str], typer.Option(help="Conditions, such as k3.", show_default="all")]
-Picture = Annotated[Path | None, typer.Option(help="Picture to write, .png or .svg.")]
 
 
 class Group(TyperGroup):

@@ -17,7 +17,6 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import commands as evaluating
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.retrieval import commands as retrieving
-from robomme_interference_data.schema.settings import spread_values
 from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub_errors import check_endpoint
 
@@ -27,21 +26,11 @@ from .hints import PROGRAM, error_lines, option_names
 
 
 class _Root(Group):
-    """Keeps the order of `_GROUPS`, and lets options take several values: `--conditions k0 k7`."""
+    """Lists the commands under the titles of `_GROUPS`."""
 
     @property
     def sections(self) -> dict[str, list[str]]:
         return {title: [name for name, _ in group] for title, group in _GROUPS.items()}
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        command: Any = self
-        several: set[str] = set()
-        for arg in args:
-            command = getattr(command, "commands", {}).get(arg)
-            if command is None:
-                break
-            several |= {o for p in command.params if getattr(p, "multiple", False) for o in p.opts}
-        return super().parse_args(ctx, spread_values(args, tuple(several)))
 
 
 app = typer.Typer(
@@ -52,6 +41,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
     epilog="""A split is a folder with demonstrations, distractor units and manifests of buffers.
+An option that takes several values is repeated, or has commas between them (NAME,…).
 
 ```
 robomme-interference doctor

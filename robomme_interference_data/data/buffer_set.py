@@ -185,7 +185,7 @@ class Split:
         if isinstance(self.files, HubFiles):  # what is published stays as it is
             place = self.header.datasets[DEMONSTRATIONS].place
             command = f"new-split --demonstrations {place} --source KIND:PATH --out SPLIT"
-        return f"robomme-interference {command} --conditions {' '.join(conditions)}"
+        return f"robomme-interference {command} --conditions {','.join(conditions)}"
 
     @property
     def mend(self) -> str:

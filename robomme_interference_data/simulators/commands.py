@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.cli.console import AsJson, check_output, print_json
+from robomme_interference_data.cli.console import check_output, print_json
+from robomme_interference_data.cli.options import AsJson
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 

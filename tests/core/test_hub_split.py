@@ -74,7 +74,7 @@ def test_what_is_published_is_not_planned_again(hub: HubServer) -> None:
     with pytest.raises(UnknownNameError, match="condition 'k2' is not in") as caught:
         load_buffer(QUERY, "k2", split=SPLIT)
     hint = str(caught.value.hint)
-    assert f"new-split --demonstrations {BASE}@" in hint and hint.endswith("k7 k2")
+    assert f"new-split --demonstrations {BASE}@" in hint and hint.endswith("k7,k2")
     assert "build manifests" not in hint
 
 
@@ -204,7 +204,7 @@ def test_fetch_a_part_twice(hub: HubServer, fetch: Fetched) -> None:
     ("options", "words"),
     [
         (["--families", "MoveCub"], "MoveCub"),
-        (["--conditions", "k1", "k9"], "--conditions no-history k0 k1 k3 k7 k9"),
+        (["--conditions", "k1,k9"], "--conditions no-history,k0,k1,k3,k7,k9"),
         (["--cameras", "side"], "side"),
         (["--episodes", "40-49"], "no buffer"),
         (["--index", "thumbnail"], "lacks index"),

@@ -8,10 +8,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from robomme_interference_data.cli.console import AsJson
-from robomme_interference_data.schema.settings import setting, spread_values, with_settings
-
-SEVERAL = ("--families", "--source")
+from robomme_interference_data.cli.options import AsJson, with_settings
+from robomme_interference_data.schema.settings import setting
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ def command(config: Config, as_json: AsJson = False) -> None:
 
 def called(*arguments: str) -> list[Any]:
     seen.clear()
-    result = CliRunner().invoke(app, spread_values(arguments, SEVERAL), prog_name="it")
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     return list(seen)
 
@@ -50,14 +48,15 @@ def test_defaults_are_those_of_the_dataclass() -> None:
     assert called("S", "--out", "o") == [Config(Path("S"), Path("o")), False]
 
 
-@pytest.mark.parametrize("families", [["A", "B", "C"], ["A,B", "C"], ["A,B,C"], ["A,,B,", "C"]])
-def test_several_values_with_spaces_or_commas(families: list[str]) -> None:
-    config, _ = called("S", "--families", *families, "--out", "o")
-    assert config.families == ("A", "B", "C")
+@pytest.mark.parametrize("families", [["A,B,C"], ["A,B", "C"], ["A", "B", "C"], ["A,,B,", "C"]])
+def test_lists_are_repeated_or_separated_by_commas(families: list[str]) -> None:
+    repeated = [word for family in families for word in ("--families", family)]
+    config, _ = called(*repeated, "S", "--out", "o")
+    assert (config.split, config.families) == (Path("S"), ("A", "B", "C"))
 
 
 def test_whole_values_keep_their_commas() -> None:
-    config, _ = called("S", "--out", "o", "--source", "x:a,b", "y")
+    config, _ = called("S", "--out", "o", "--source", "x:a,b", "--source", "y")
     assert config.source == ("x:a,b", "y")
 
 
@@ -77,6 +76,6 @@ def test_all_options(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_slips_are_told(arguments: list[str], told: str) -> None:
-    result = CliRunner().invoke(app, spread_values(arguments, SEVERAL))
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert told in result.output

@@ -110,7 +110,7 @@ def test_a_buffer_by_its_key() -> None:
         ((None, -1), InvalidIdError, "'k-1' is not a condition"),
         ((3,), InvalidIdError, "3 is not a condition"),
         (("K3",), InvalidIdError, "'K3' is not a condition"),
-        (("k5",), UnknownNameError, "--conditions no-history k0 k1 k3 k7 k5"),
+        (("k5",), UnknownNameError, "--conditions no-history,k0,k1,k3,k7,k5"),
     ],
 )
 def test_conditions_that_cannot_be_loaded(

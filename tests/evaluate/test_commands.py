@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from robomme_interference_data.evaluate import commands
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.runtime.executor import Serial
-from robomme_interference_data.schema.settings import spread_values
 
 pytestmark = pytest.mark.usefixtures("trouble", "_serial")
 
@@ -21,7 +20,6 @@ APP = typer.Typer(rich_markup_mode="markdown", pretty_exceptions_enable=False)
 APP.command()(commands.evaluate)
 APP.command()(commands.merge)
 APP.command()(commands.ceiling)
-SEVERAL = ("--families", "--conditions", "--policy-option")
 USUAL = "--simulator support.worlds:World --system mine --episodes 0"
 
 
@@ -31,11 +29,11 @@ def _serial(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def type_in(line: str) -> Any:
-    return CliRunner().invoke(APP, spread_values(line.split(), SEVERAL))
+    return CliRunner().invoke(APP, line.split())
 
 
 def test_ceiling_prints_a_table_or_json(tiny_split: Path) -> None:
-    line = f"ceiling {tiny_split} --memory window --conditions k0 k1"
+    line = f"ceiling {tiny_split} --memory window --conditions k0,k1"
     done = type_in(line)
     assert done.exit_code == 0, done.output
     lines = [line.split() for line in done.stdout.splitlines()]
@@ -50,9 +48,9 @@ def test_ceiling_prints_a_table_or_json(tiny_split: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("families", ["MoveCube VideoRepick", "MoveCube,VideoRepick"])
+@pytest.mark.parametrize("families", ["MoveCube --families VideoRepick", "MoveCube,VideoRepick"])
 def test_evaluate_writes_the_rows_as_json(tmp_path: Path, tiny_split: Path, families: str) -> None:
-    line = f"evaluate --policy hold {USUAL} --families {families} --conditions no-history k1 --json"
+    line = f"evaluate --policy hold {USUAL} --families {families} --conditions no-history,k1 --json"
     done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'}")
     assert done.exit_code == 0, done.output
     assert [

@@ -74,7 +74,7 @@ def test_the_table_by_family_and_condition(run: Run, indexed: Path) -> None:
 
 
 def test_only_what_is_asked_for(run: Run, indexed: Path) -> None:
-    picked = ("--families", "PatternLock", "MoveCube", "--conditions", "k3", "no-history")
+    picked = ("--families", "PatternLock,MoveCube", "--conditions", "k3,no-history")
     code, out, err = run("retrieval-score", indexed, *picked)
     assert code == 0 and "2 of 4 buffers hold no lesson" in err
     rows = [line.split()[:3] for line in out.splitlines()[4:7]]
@@ -86,7 +86,7 @@ def test_only_what_is_asked_for(run: Run, indexed: Path) -> None:
 
 
 def test_rules_side_by_side(run: Run, tmp_path: Path, indexed: Path) -> None:
-    options = ("--rules", "oracle", "last,max/-1", "--out", tmp_path)
+    options = ("--rules", "oracle,last,max/-1", "--out", tmp_path)
     code, out, err = run("retrieval-score", indexed, *options)
     assert code == 0 and f"{tmp_path}/cells.csv, rows.csv and retrieval.png written" in err
     lines = out.splitlines()

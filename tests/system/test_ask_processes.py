@@ -72,7 +72,7 @@ def test_a_question_that_takes_too_long_is_an_error(tmp_path: Path) -> None:
         return look(seen)
 
     with ChatServer(hang) as server:
-        families = ("--families", "PatternLock", "MoveCube", "--episodes", "0")
+        families = ("--families", "PatternLock,MoveCube", "--episodes", "0")
         running = start(server, tmp_path / "run", "--rollout-timeout", "8", *families)
         _, err = running.communicate(timeout=120)
     assert running.returncode == 1 and "1 questions broke" in err

@@ -136,11 +136,11 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
     [
         (["list", "{}/nowhere"], ("neither a folder nor", "namespace/name")),
         (["list", "{}", "--families", "MoveCub"], ("'MoveCub'", "Did you mean 'MoveCube'?")),
-        (["list", "{}", "--conditions", "k9"], ("'k9'", "--conditions no-history k0 k1 k3 k7 k9")),
+        (["list", "{}", "--conditions", "k9"], ("'k9'", "--conditions no-history,k0,k1,k3,k7,k9")),
         (["list", "{}", "--conditions", "seven"], ("'seven'", "k0")),
         (["show", "MoveCube/test/9", "k3", "--split", "{}"], ("MoveCube/test/9", EPISODE)),
         (["show", "MoveCube", "k3", "--split", "{}"], ("'MoveCube'", "<Family>/<split>/<index>")),
-        (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0 k1 k3 k7 k9")),
+        (["show", EPISODE, "k9", "--split", "{}"], ("'k9'", "k0,k1,k3,k7,k9")),
         (["show", EPISODE, "k3", "--split", "{}", "--camera", "nope"], ("camera 'nope'", "wrist")),
         (["verify", "{}/nowhere"], ("neither a folder nor",)),
         (["audit", "{}/nowhere"], ("neither a folder nor",)),
@@ -223,7 +223,7 @@ def test_the_condition_is_there_in_a_narrow_terminal(
         ([], 15),
         (["--conditions", "k3"], 3),
         (["--families", "MoveCube", "--difficulty", "easy"], 5),
-        (["--families", "MoveCube", "PatternLock", "--conditions", "k7", "k0"], 4),
+        (["--families", "MoveCube,PatternLock", "--conditions", "k7,k0"], 4),
     ],
 )
 def test_list_as_json_is_one_value(

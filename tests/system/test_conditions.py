@@ -33,7 +33,7 @@ def split(own_split: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Iterato
     """A split with buffers of kinds of conditions beyond the paper's."""
     names = ("no-history", "k0", "k1", "before-k1", "before-k3", "held-k1", "same-k1", "parts-k1")
     names += ("absent-k1",)
-    code, _, err = run("build", "manifests", own_split, "--conditions", *names)
+    code, _, err = run("build", "manifests", own_split, "--conditions", ",".join(names))
     assert code == 0, err
     monkeypatch.setenv(worlds.SPLIT, str(own_split))
     _forget_the_split()

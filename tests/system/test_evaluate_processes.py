@@ -40,7 +40,7 @@ def start(
     out: Path, pause: float = 0.0, policy: str = runs.CHEAT, words: Sequence[str] = ()
 ) -> subprocess.Popen[str]:
     usual = f"evaluate --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
-    usual += " --families VideoRepick MoveCube --json"
+    usual += " --families VideoRepick,MoveCube --json"
     called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split(), *words]
     return subprocess.Popen(
         [*called, "--split", os.environ[worlds.SPLIT], "--out", str(out)],

@@ -38,10 +38,10 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tabletop")
     played = "--source tabletop --episodes 0 --cameras front --workers 2"
     for words in (
-        f"demonstrations {played} --split test --families MoveCube RouteStick "
+        f"demonstrations {played} --split test --families MoveCube,RouteStick "
         f"--out {out}/demonstrations",
         f"distractors {played} --families PatternLock --out {out}/distractors",
-        f"manifests {out} --conditions no-history k0 k1",
+        f"manifests {out} --conditions no-history,k0,k1",
     ):
         command = [COMMAND, "build", *words.split()]
         done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)

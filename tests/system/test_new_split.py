@@ -46,7 +46,7 @@ def test_a_split_for_published_demonstrations(
 ) -> None:
     out = tmp_path / "own"
     given = ("--demonstrations", BASE, "--source", mine, "--out", out, "--workers", 1)
-    code, _, err = run("new-split", *given, "--conditions", "k0", "k1", "k2")
+    code, _, err = run("new-split", *given, "--conditions", "k0,k1,k2")
     assert code == 0, err
     assert "publish" in err
     split = load_split(out)
@@ -66,7 +66,7 @@ def test_retrieval_on_published_demonstrations(
     assert run("index", indexed)[0] == 0
     commit, out = hub.push(f"datasets/{BASE}", indexed), tmp_path / "own"
     given = ("--demonstrations", BASE, "--source", mine, "--out", out, "--workers", 1)
-    assert run("new-split", *given, "--conditions", "k0", "k2")[0] == 0
+    assert run("new-split", *given, "--conditions", "k0,k2")[0] == 0
     code, told, err = run("index", out)
     assert (code, told) == (0, f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n")
     assert f"{BASE}@{commit} has embeddings by the same encoder" in err

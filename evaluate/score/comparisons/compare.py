@@ -65,14 +65,14 @@ def compare(
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs",
-            f"To set k7 against k0 of one run: compare {first} --conditions k0 k7",
+            f"To set k7 against k0 of one run: compare {first} --conditions k0,k7",
         )
     for name in conditions:
         parse_condition(name)
     if second is not None and first.exists() and second.exists() and first.samefile(second):
         raise InvalidOptionError(
             f"{first} is given twice",
-            f"To set two conditions of it against each other: compare {first} --conditions k0 k7",
+            f"To set two conditions of it against each other: compare {first} --conditions k0,k7",
         )
     one = read_rows([first], systems[0], lenient)
     other = one if second is None else read_rows([second], systems[1], lenient)
