@@ -51,10 +51,15 @@ os.environ.update(_SET)
 
 # No deadline: the first example of a test may import a library. In CI the examples are the same
 # in every run, so that a change is never blamed for what another one did.
-hypothesis.settings.register_profile(
-    "repository", deadline=None, derandomize=bool(os.environ.get("CI"))
-)
-hypothesis.settings.load_profile("repository")
+for _profile, _examples in (("few", 30), ("all", 100)):
+    hypothesis.settings.register_profile(
+        _profile, max_examples=_examples, deadline=None, derandomize=bool(os.environ.get("CI"))
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Take all of hypothesis' examples only where slow tests run, too."""
+    hypothesis.settings.load_profile("few" if config.option.markexpr else "all")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
