@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from support.build_server import BuildServer
+from support.few import few
 from support.splits import contents
 
 from robomme_interference_data.build_dataset.stage import read_staged
@@ -60,7 +61,7 @@ def staged(out: Path) -> dict[Path, int]:
 
 
 @pytest.mark.parametrize("times", [1, pytest.param(12, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sent", few([signal.SIGKILL, signal.SIGINT, signal.SIGTERM], 1))
 def test_stopped_at_random_moments(
     server: BuildServer,
     undisturbed: tuple[dict[str, bytes], float],

@@ -120,7 +120,7 @@ def test_further_datasets_go_to_the_hub_and_back(
     root, sources = tmp_path / "split", ("--source", "sample", "--workers", "1")
     wanted = ("--split", "test", "--families", "MoveCube", "--cameras", "front")
     code, _, err = run(
-        *("build", "all", *sources, *wanted, "--conditions", "k1", *FURTHER),
+        *("build", "all", *sources, *wanted, "--conditions", ",".join(("k1", *FURTHER))),
         *("--unit-episodes", "0", "--out", root),
     )
     assert code == 0, err

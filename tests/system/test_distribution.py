@@ -18,6 +18,8 @@ from support.splits import GOLDEN, expected_frames, expected_states
 
 from robomme_interference_data import load_split
 
+pytestmark = pytest.mark.slow  # test_packaging.py compares the lists of files
+
 
 def build(tree: Path, out: Path, *kind: str) -> None:
     """Run `python -m build`, with the setuptools that is here."""
