@@ -101,7 +101,7 @@ class StageTask:
     plan: BuildPlan
 
     def __call__(self, task: Task, worker: Worker) -> Staged:
-        """Cut, encode and check one episode, hand in its files, and return what is known of it.
+        """Cut, encode and check one episode, send its files, and return what is known of it.
 
         Raises:
             InvalidOptionError: It has no such camera.
@@ -119,7 +119,7 @@ class StageTask:
                 raise error.about(episode.id) from error
             if staged.skipped is None:
                 for path in sorted(folder.iterdir()):
-                    worker.hand_in(path.name, path.read_bytes())
+                    worker.send_file(path.name, path.read_bytes())
         return staged
 
     def close(self) -> None:

@@ -127,5 +127,5 @@ class AskTask:
                 **{"question": question.text, "prompt": answered.prompt, "text": answered.text},
                 **{"answer": answered.letter, "right": question.letters[question.right]},
             }
-            worker.hand_in(*record_file("answers", item, [line]))
+            worker.send_file(*record_file("answers", item, [line]))
         return row

@@ -137,11 +137,11 @@ class RolloutTask:
         if status is not Status.ERROR:
             self._logs.clear()
         if self._writer is not None:
-            worker.hand_in(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
+            worker.send_file(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
         if clip is not None:
             clip.close(status, error)
             if clip.data is not None:
-                worker.hand_in(clip_name(item), clip.data)
+                worker.send_file(clip_name(item), clip.data)
 
     def _hand_in_logs(self, worker: Worker) -> None:
         """Hand in what servers that the worker started have printed.
@@ -152,7 +152,7 @@ class RolloutTask:
         if self._run.config.serve is not None and server is not None:
             self._logs[f"servers/{server.started}-{worker.number}.log"] = server.log()
         for log in self._logs.items():
-            worker.hand_in(*log)
+            worker.send_file(*log)
 
     def _check_served(self, policy: Policy) -> None:
         """Retire the worker if the server that it reaches is not what the run began with."""

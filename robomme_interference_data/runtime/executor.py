@@ -1,52 +1,37 @@
-"""Who runs tasks: this process (`Serial`) or worker processes (`Processes`).
+"""Who runs tasks: this process (`Serial`), processes (`Processes`), or a cluster (`RayWorkers`).
 
-Whatever has tasks is handed an executor, and gets outcomes as values. `concurrent.futures` gives
-up on all work when one process dies and cannot stop a hung task; pebble stops one, but neither
-tries it again, nor ends what the task had started, nor tells where it hung.
+Whatever has tasks takes an executor, and gets outcomes as values. `concurrent.futures` gives up
+on all work when one process dies and cannot stop a hung task; pebble stops one, but neither tries
+it again, nor ends what the task had started, nor reports where it hung.
 """
 
 import platform
-from collections import deque
-from collections.abc import Generator, Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, fields
-from functools import partial
 from importlib import metadata
-from typing import Any, Protocol, TypedDict, Unpack
+from typing import Any, Protocol, Unpack
 
 from robomme_interference_data.errors import InvalidOptionError, WorkerRetiredError
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.settings import setting
 
-from .process import (
-    Outcome,
-    Task,
-    Worker,
-    WorkerProcess,
-    attempt,
-    end_if_starting,
-    end_workers,
-    wait_for,
-)
+from .process import ProcessScheduler, end_if_starting
+from .scheduler import ATTEMPTS, Limits
+from .worker import Outcome, Task, Worker, attempt
 
-__all__ = ["Executor", "Outcome", "Processes", "Serial", "Task", "Worker", "end_if_starting"]
-
-
-ATTEMPTS = 2
-
-
-class Limits(TypedDict, total=False):
-    """What may be said of tasks.
-
-    Attributes:
-        time_limit: Seconds that one task may take, and as many for the start of a worker; None,
-            as if it is not given, for no limit.
-        attempts: How often a task is started before what went wrong is reported; 2 by default.
-        again: Errors of this package after which a task is started again; none by default.
-    """
-
-    time_limit: float | None
-    attempts: int
-    again: tuple[type[Exception], ...]
+__all__ = [
+    "Executor",
+    "Outcome",
+    "Processes",
+    "Serial",
+    "Session",
+    "Task",
+    "Worker",
+    "end_if_starting",
+    "make_executor",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,23 +48,18 @@ class WorkersConfig:
 
 
 def make_executor(config: WorkersConfig) -> "Executor":
-    """Make who does the work.
-
-    Raises:
-        InvalidOptionError: A setting is not what it may be, or says nothing of the others.
-        MissingExtraError: Ray is not installed.
-    """
+    """Make the executor of some settings."""
     if config.executor == "processes":
         for one in fields(WorkersConfig)[2:]:
             if getattr(config, one.name) != one.default:
                 raise InvalidOptionError(
-                    f"--{one.name.replace('_', '-')} says nothing of --executor processes",
-                    "Add --executor ray, or leave it out.",
+                    f'{one.name} has no effect with executor="processes"',
+                    'Set executor="ray", or leave it out.',
                 )
         return Processes(config.workers)
     if config.executor != "ray":
-        raise InvalidOptionError.one_of("--executor", config.executor, ("processes", "ray"))
-    make = load_extra(f"{__package__}.ray_cluster", "RayWorkers", "--executor ray", "cluster")
+        raise InvalidOptionError.one_of("executor", config.executor, ("processes", "ray"))
+    make = load_extra(f"{__package__}.ray_cluster", "RayWorkers", 'executor="ray"', "cluster")
     executor: Executor = make(
         config.workers, config.ray_address, config.cpus_per_worker, config.gpus_per_worker
     )
@@ -87,7 +67,7 @@ def make_executor(config: WorkersConfig) -> "Executor":
 
 
 def describe(function: Task) -> dict[str, str]:
-    """Return what has to be the same wherever a function does tasks, as text by name.
+    """Return what must be the same on all machines that run a function, as text by name.
 
     Versions of Python and this package, and what its method `describe` returns, if it has one.
     """
@@ -96,8 +76,30 @@ def describe(function: Task) -> dict[str, str]:
     return versions | getattr(function, "describe", dict)()
 
 
-class Executor(Protocol):
+class Session(Protocol):
+    """Workers that are kept, with what their copies of the function hold, from run to run."""
+
+    def run(self, tasks: Iterable[Any], **limits: Unpack[Limits]) -> Generator[Outcome]:
+        """Call the session's function on every task; see `Executor.run`."""
+        ...
+
+
+class Executor(ABC):
     """Runs tasks."""
+
+    @abstractmethod
+    def session(self, function: Task) -> AbstractContextManager[Session]:
+        """Keep workers for a function in the block, through several runs.
+
+        At its end all workers end: those without work may close what they hold.
+
+        Args:
+            function: What to do with each task.
+
+        Raises:
+            ClusterError: There is no cluster, it is this machine and has no room, nodes differ
+                from this process, or workers cannot be made.
+        """
 
     def run(
         self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
@@ -107,54 +109,59 @@ class Executor(Protocol):
         A worker that dies or exceeds a limit is replaced, and its task is started again, up to
         `attempts` times; so is a task that raises one of `again`. Any other exception is final. A
         worker whose function raises `WorkerRetiredError` gives its task back to the others and
-        ends. When the tasks are done, or the generator is closed, all workers end: those without
-        work may close what they hold, the others are stopped.
+        ends. If the generator is closed early, workers that have a task are stopped.
 
         Args:
-            function: What to do of a task.
+            function: What to do with each task.
             tasks: Picklable tasks.
             limits: See `Limits`.
 
         Raises:
             WorkerError: A worker ended before its first task, as it does when the script that it
                 imports starts work outside `if __name__ == "__main__":`.
-            WorkerRetiredError: No worker is left for the tasks that are; why the last one retired.
+            WorkerRetiredError: No worker is left for the remaining tasks; why the last retired.
+            ClusterError: See `session`.
         """
-        ...
+        end_if_starting()
+        todo = list(tasks)
+        if todo:
+            with self.session(function) as session:
+                yield from session.run(todo, **limits)
 
 
 @dataclass(frozen=True)
-class Serial:
+class Serial(Executor):
     """Runs tasks in this process, one after the other; there are no time limits."""
 
-    def run(
-        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
-    ) -> Generator[Outcome]:
-        """Call a function on every task; see `Executor.run`."""
-        attempts = limits.get("attempts", ATTEMPTS)
+    @contextmanager
+    def session(self, function: Task) -> Iterator[Session]:
+        """Close the function when the block ends; see `Executor.session`."""
         try:
-            for task in tasks:
-                for number in range(1, attempts + 1):
-                    files: dict[str, bytes] = {}
-                    worker = Worker(0, partial(_take_file, files))
-                    outcome = Outcome(task, *attempt(function, task, worker), number, files)
-                    if isinstance(outcome.error, WorkerRetiredError):
-                        raise outcome.error
-                    if not isinstance(outcome.error, limits.get("again", ())):
-                        break
-                yield outcome
+            yield _SerialSession(function)
         finally:
             getattr(function, "close", lambda: None)()
 
 
-def _take_file(files: dict[str, bytes], message: tuple[Any, ...]) -> None:
-    """Keep what a task hands in of what it tells."""
-    if message[0] == "file":
-        files.update([message[1:]])
+@dataclass(frozen=True)
+class _SerialSession:
+    function: Task
+
+    def run(self, tasks: Iterable[Any], **limits: Unpack[Limits]) -> Generator[Outcome]:
+        attempts = limits.get("attempts", ATTEMPTS)
+        worker = Worker()
+        for task in tasks:
+            for number in range(1, attempts + 1):
+                result = attempt(self.function, task, worker)
+                outcome = Outcome(task, *result, number, worker.take_files())
+                if isinstance(outcome.error, WorkerRetiredError):
+                    raise outcome.error
+                if not isinstance(outcome.error, limits.get("again", ())):
+                    break
+            yield outcome
 
 
 @dataclass(frozen=True)
-class Processes:
+class Processes(Executor):
     """Runs tasks in worker processes that may hang or die without taking the work with them.
 
     What workers print goes to stderr. They may start processes of their own, which end with them.
@@ -172,43 +179,9 @@ class Processes:
         if self.workers < 1:
             raise InvalidOptionError.expected("workers", self.workers, "1 or more")
 
-    def run(
-        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
-    ) -> Generator[Outcome]:
-        """Call a function on every task in worker processes; see `Executor.run`."""
+    @contextmanager
+    def session(self, function: Task) -> Iterator[Session]:
+        """Keep worker processes in the block; see `Executor.session`."""
         end_if_starting()
-        time_limit, again = limits.get("time_limit"), limits.get("again", ())
-        waiting = deque((task, 1) for task in tasks)
-        to_start = deque(range(self.workers))  # numbers of workers that do not run
-        running: list[WorkerProcess] = []
-        try:
-            while waiting or any(worker.busy for worker in running):
-                idle = [worker for worker in running if not worker.busy]
-                while waiting and (idle or to_start):
-                    if not idle:
-                        idle.append(WorkerProcess(function, to_start.popleft()))
-                        running.append(idle[-1])
-                    idle.pop().give(*waiting.popleft(), time_limit)
-                wait_for(running)
-                for worker in list(running):
-                    outcome = worker.settle()
-                    if outcome is None:
-                        continue
-                    if worker.over:
-                        worker.stop()
-                        running.remove(worker)
-                        to_start.append(worker.number)
-                    if isinstance(outcome.error, WorkerRetiredError):
-                        worker.stop()
-                        running.remove(worker)
-                        waiting.appendleft((outcome.task, outcome.attempts))
-                        if not running and not to_start:
-                            raise outcome.error
-                    elif outcome.attempts < limits.get("attempts", ATTEMPTS) and (
-                        worker.over or isinstance(outcome.error, again)
-                    ):
-                        waiting.append((outcome.task, outcome.attempts + 1))
-                    else:
-                        yield outcome
-        finally:
-            end_workers(running)
+        with closing(ProcessScheduler(function, self.workers)) as scheduler:
+            yield scheduler

@@ -1,48 +1,41 @@
 """Workers on a Ray cluster: the one place that imports Ray, which needs the extra `cluster`.
 
-A worker is an actor: Ray finds a node with room for it, starts it again elsewhere when the node is
-lost, and ends it with the job. In it runs a worker process as on one machine (`worker_process`),
-so limits, hangs and deaths are what they are there. Only the caller writes.
+A worker is an actor: Ray finds a node with room for it, and ends it with the job. One that died,
+or was lost with its node, is replaced by another. Only the caller writes.
 """
 
 import logging
 import os
+import shutil
+import signal
 import socket
 import sys
-import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Set
-from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, replace
-from functools import partial
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import closing, contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
 
 import ray
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from robomme_interference_data.cli.console import say
 from robomme_interference_data.errors import (
     ClusterError,
     InterferenceError,
     InvalidOptionError,
-    WorkerRetiredError,
     first_line,
 )
 
-from .executor import ATTEMPTS, Limits, describe
-from .process import (
-    CLOSE_S,
-    Outcome,
-    Task,
-    WorkerProcess,
-    end_if_starting,
-    end_workers,
-    wait_for,
-)
+from .executor import Executor, Session, describe
+from .process import CLOSE_S, end_if_starting
+from .scheduler import Reply, Scheduler
+from .worker import ProcessWorker, Task, left_behind, unpickled
+
+logger = logging.getLogger(__name__)
 
 _PASSED = ("PYTHONPATH", "HF_ENDPOINT", "HF_HUB_OFFLINE")
 """What the environment of this process says to workers: where modules are, and where the Hub."""
@@ -54,15 +47,18 @@ _TOKEN = (
 _CONNECT_S = 10.0
 """Seconds to wait for a cluster's head."""
 
-_LOSSES = 5
-"""How often a task's worker may be lost, with its node or to Ray's watch over memory."""
+_COLLECT_S = 30.0
+"""Seconds that a node has to say what a worker that died left there."""
 
-_LOOK_S = 30.0
-"""Seconds after which it is told that no worker could begin yet."""
+_FAILURES = 5
+"""How often a worker may fail to begin."""
+
+_WAIT_S = 30.0
+"""Seconds after which a message says that no worker could begin yet."""
 
 
 @dataclass(frozen=True)
-class RayWorkers:
+class RayWorkers(Executor):
     """Runs tasks in worker processes on the nodes of a Ray cluster; see `Executor`.
 
     Every node that has room for a worker is asked first what it has installed, and what the tasks
@@ -91,49 +87,39 @@ class RayWorkers:
             raise InvalidOptionError.expected("workers", self.workers, "1 or more")
         for name in ("cpus", "gpus"):
             if not 0 <= getattr(self, name) < float("inf"):
-                told = f"--{name}-per-worker"
-                raise InvalidOptionError.expected(told, getattr(self, name), "0 or more")
+                raise InvalidOptionError.expected(
+                    f"{name}_per_worker", getattr(self, name), "0 or more"
+                )
         if self.gpus > 1 and self.gpus % 1:  # so Ray has it
-            raise InvalidOptionError.expected("--gpus-per-worker", self.gpus, "1 or less, or whole")
+            raise InvalidOptionError.expected("gpus_per_worker", self.gpus, "1 or less, or whole")
         port = self.address.rpartition(":")[2]
         if self.address not in ("auto", "local") and not (
             port != self.address and port.isdecimal() and int(port) < 1 << 16
         ):
             raise InvalidOptionError.expected(
-                "--ray-address", self.address, "auto, local or HOST:PORT"
+                "ray_address", self.address, "auto, local or HOST:PORT"
             )
 
-    def run(
-        self, function: Task, tasks: Iterable[Any], **limits: Unpack[Limits]
-    ) -> Generator[Outcome]:
-        """Call a function on every task in worker processes of a cluster; see `Executor.run`.
+    @contextmanager
+    def session(self, function: Task) -> Iterator[Session]:
+        """Keep workers on nodes of a cluster in the block; see `Executor.session`.
 
-        A worker that is lost with its node counts as one that died. `Outcome.node` says where a
-        task ran.
-
-        Raises:
-            ClusterError: There is no cluster, it is this machine and has no room, nodes differ
-                from this process, or workers cannot be made.
+        A worker that is lost with its node costs only the task that it works on.
         """
         end_if_starting()
-        todo = list(tasks)
-        if not todo:
-            return
         with _connected(self.address):
-            # As a value of each call: what lies in Ray's store is lost with its node.
-            own, folder = describe(function), str(Path.cwd())
+            folder = str(Path.cwd())
+            own = describe(function)
             known = self._check_nodes(function, own, folder)
-            options = {"num_cpus": self.cpus, "num_gpus": self.gpus, "max_restarts": -1}
-            host: Any = _Host
-            make = partial(host.options(**options).remote, function, folder)
-            work = _Work(make, min(self.workers, len(todo)), limits, own, known)
-            try:
-                yield from work.run(todo, self._wanted)
-            finally:
-                work.end()
+            actor: Any = WorkerActor
+            make = actor.options(num_cpus=self.cpus, num_gpus=self.gpus, max_restarts=0).remote
+            scheduler = _RayScheduler(make, (function, folder), own, known, self)
+            with closing(scheduler):
+                yield scheduler
 
     @property
-    def _wanted(self) -> str:
+    def wanted(self) -> str:
+        """What a worker takes, for messages."""
         return f"{self.cpus:g} CPUs" + (f" and {self.gpus:g} GPUs" if self.gpus else "")
 
     def _check_nodes(self, function: Task, own: Mapping[str, str], folder: str) -> set[str]:
@@ -148,13 +134,11 @@ class RayWorkers:
         for node in _nodes():
             has = node["Resources"]
             if node["Alive"] and has.get("CPU", 0) >= self.cpus and has.get("GPU", 0) >= self.gpus:
-                there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-                call = _describe.options(num_cpus=0, scheduling_strategy=there)
-                asked[node["NodeID"]] = call.remote(function, folder)
+                asked[node["NodeID"]] = _on_node(_describe, node["NodeID"]).remote(function, folder)
         if not asked and self.address == "local":
             raise ClusterError(
-                f"this machine does not have {self._wanted} for a worker",
-                "Give less with --cpus-per-worker and --gpus-per-worker.",
+                f"this machine does not have {self.wanted} for a worker",
+                "Set smaller cpus_per_worker and gpus_per_worker.",
             )
         wrong, known = [], set()
         for node_id, answer in asked.items():
@@ -182,191 +166,168 @@ def _describe(function: Task, folder: str) -> dict[str, str]:
 
 
 @ray.remote
-class _Host:
-    """Holds one worker process, on whatever node Ray starts it."""
+def _left_behind(home: Path) -> tuple[TimeoutError | None, str | None, dict[str, bytes]]:
+    """Return what a worker that died left on its node."""
+    return left_behind(home)
 
-    def __init__(self, function: Task, folder: str, number: int):
+
+@ray.remote
+class WorkerActor:
+    """A worker, on whatever node Ray starts it."""
+
+    def begin(
+        self, number: int, function: Task, folder: str, known: Set[str]
+    ) -> tuple[str, Path, dict[str, str] | None]:
+        """Return the node's id, the worker's folder and, unless the node is known, `describe`."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         _enter(folder)
-        self._function, self._number, self._begun = function, number, False
-        self._process: WorkerProcess | None = None
-        self._node = ray.get_runtime_context().get_node_id()
-        self._name = _name(self._node)
+        home = Path(tempfile.mkdtemp(prefix="robomme-interference-"))
+        self._home, self._function, self._worker = home, function, ProcessWorker(number, home)
+        node = ray.get_runtime_context().get_node_id()
+        return node, home, None if node in known else describe(function)
 
-    def begin(self, known: Set[str]) -> tuple[str, dict[str, str] | None]:
-        """Return the node's id, and unless that is known, what `describe` says there."""
-        self._begun = True
-        return self._node, None if self._node in known else describe(self._function)
-
-    def work(
-        self, task: Any, attempts: int, time_limit: float | None
-    ) -> tuple[Outcome, bool] | None:
-        """Do a task; return what became of it, and whether the worker process went with it.
-
-        None, before `begin`: Ray has started it again, maybe on a node that nobody has looked at.
-        """
-        if not self._begun:
-            return None
-        self._process = self._process or WorkerProcess(self._function, self._number)
-        self._process.give(task, attempts, time_limit)
-        while (outcome := self._process.settle()) is None:
-            wait_for([self._process])
-        over = self._process.over
-        if over:
-            self._process.stop()
-            self._process = None
-        return replace(outcome, node=self._name), over
+    def work(self, task: Any, time_limit: float | None) -> tuple[bytes, dict[str, bytes]]:
+        """Return what came of a task, pickled, and the files that it sent."""
+        try:
+            done = self._worker.work(self._function, task, time_limit)
+        except SystemExit:  # which Ray would take for a wish of the actor
+            os._exit(1)
+        return done, self._worker.take_files()
 
     def end(self) -> None:
-        """Let the worker process, which has no task, close what it holds."""
-        end_workers([self._process] if self._process else [])
+        """Release what the function holds."""
+        getattr(self._function, "close", lambda: None)()
+        shutil.rmtree(self._home, ignore_errors=True)
 
 
-class _Given(NamedTuple):
-    """A task, with how often it broke its worker, and how often its worker was lost."""
+class _RayWorker:
+    """The driver's side of a worker; it begins as soon as there is room for it."""
 
-    task: Any
-    broke: int = 0
-    lost: int = 0
+    def __init__(self, scheduler: "_RayScheduler", number: int):
+        self._all, self.number, self.ready = scheduler, number, False
+        self._failures = 0
+        self._node, self._home = "", Path()
+        self._begin()
 
-    @property
-    def attempt(self) -> int:
-        return self.broke + self.lost + 1
+    def _begin(self) -> None:
+        self.actor = self._all.make()
+        self.call = self.actor.begin.remote(self.number, *self._all.given, self._all.known)
+
+    def settle(self) -> None:
+        """Take note that it has begun; where it cannot, begin elsewhere.
+
+        Raises:
+            ClusterError: It cannot, again and again.
+        """
+        try:
+            self._node, self._home, found = ray.get(self.call)
+        except RayTaskError as error:
+            self._leave_out(_cause(error))
+        except RayError as error:
+            self._failures += 1
+            if self._failures == _FAILURES:
+                raise ClusterError(f"a worker cannot begin: {_cause(error)}") from None
+            self._begin()
+        else:
+            wrong = [] if found is None else _differences(_name(self._node), found, self._all.own)
+            if wrong:
+                self._leave_out("; ".join(wrong))
+            else:
+                self._all.known.add(self._node)
+                self.ready = True
+
+    def _leave_out(self, why: str) -> None:
+        """Do without an actor, which keeps its place, so that the next one is put elsewhere."""
+        logger.warning("A worker is left out: %s", why)
+        self._all.left_out.append(self.actor)
+        self._begin()
+
+    def send(self, task: Any, time_limit: float | None) -> None:
+        """Let it work on a task."""
+        self.call = self.actor.work.remote(task, time_limit)
+
+    def receive(self) -> Reply:
+        """Return its answer, or what became of it."""
+        try:
+            data, files = ray.get(self.call)
+        except RayTaskError as error:
+            raise error.cause from None
+        except RayError as error:
+            return self._death(error)
+        return Reply(*unpickled(data), files, _name(self._node))
+
+    def _death(self, error: RayError) -> Reply:
+        """Tell a worker that broke, whose node can be asked why, from one that was lost."""
+        try:
+            if isinstance(error, OutOfMemoryError):
+                raise error
+            late, trace, files = ray.get(
+                _on_node(_left_behind, self._node).remote(self._home), timeout=_COLLECT_S
+            )
+        except RayError:
+            lost = RuntimeError(f"the worker was lost with its node: {_cause(error)}")
+            return Reply(error=lost, worker="lost")
+        broke = late or RuntimeError("the worker process died")
+        return Reply(None, broke, trace, files, _name(self._node), "dead")
+
+    def stop(self) -> None:
+        """End it now; its guard ends what it started."""
+        ray.kill(self.actor)
 
 
-class _Work:
-    """Hosts, and the tasks that they work on.
+class _RayScheduler(Scheduler[_RayWorker]):
+    """Runs tasks on the cluster.
 
     Args:
-        make: Makes a host of a number.
-        hosts: How many there are.
-        limits: Of the tasks.
-        own: What `describe` says here.
-        known: Ids of nodes where it says the same.
+        make: Makes an actor.
+        given: Function and folder, for `WorkerActor.begin`.
+        own: What `describe` returns here.
+        known: Ids of nodes where it returns the same.
+        config: How many workers there are, and what each takes.
     """
 
     def __init__(
         self,
-        make: Callable[[int], Any],
-        hosts: int,
-        limits: Limits,
+        make: Callable[[], Any],
+        given: tuple[Task, str],
         own: Mapping[str, str],
         known: set[str],
+        config: RayWorkers,
     ):
-        self._make, self._limits, self._own, self._known = make, limits, own, known
-        self._waiting: deque[_Given] = deque()
-        self._idle: list[Any] = []
-        self._left_out: list[Any] = []
-        self._calls: dict[Any, tuple[Any, _Given | None]] = {}
-        self._made = 0
-        self._why = ""
-        for _ in range(hosts):
-            self._begin(self._new())
+        super().__init__(config.workers)
+        self.make, self.given, self.own, self.known = make, given, own, known
+        self._wanted = config.wanted
+        self.left_out: list[Any] = []  # actors on nodes that differ
 
-    def run(self, tasks: Iterable[Any], wanted: str) -> Iterator[Outcome]:
-        """Yield outcomes as they come; `wanted` says what a worker takes, for who waits."""
-        self._waiting += map(_Given, tasks)
-        told = time.monotonic()
-        while self._waiting or any(given for _, given in self._calls.values()):
-            while self._waiting and self._idle:
-                host, given = self._idle.pop(), self._waiting.popleft()
-                call = host.work.remote(given.task, given.attempt, self._limits.get("time_limit"))
-                self._calls[call] = host, given
-            done, _ = ray.wait([*self._calls], timeout=_LOOK_S)
-            for call in done:
-                yield from self._settle(call, *self._calls.pop(call))
-            if self._idle or any(given for _, given in self._calls.values()):
-                told = time.monotonic()
-            elif time.monotonic() - told > _LOOK_S:
-                told = time.monotonic()
-                say(f"No node of the cluster has {wanted} for a worker; waiting for one{self._why}")
+    def start(self, number: int) -> _RayWorker:
+        """Start a worker, now or when there is room for it."""
+        return _RayWorker(self, number)
 
-    def end(self) -> None:
-        """End all hosts: those without a task may close what they hold, within a time."""
-        ends = [host.end.remote() for host in self._idle]
+    def wait(self, workers: Sequence[_RayWorker]) -> Iterable[_RayWorker]:
+        """Wait until some have an answer, or are ready; return those with an answer."""
+        calls = {one.call: one for one in workers}
+        done, _ = ray.wait([*calls], timeout=_WAIT_S)
+        if not done and not any(one.ready for one in workers):
+            logger.warning("No node of the cluster has %s for a worker; waiting", self._wanted)
+        answered = [calls[call] for call in done if calls[call].ready]
+        for call in done:
+            if not calls[call].ready:
+                calls[call].settle()
+        return answered
+
+    def close(self) -> None:
+        """End all actors."""
+        ends = [one.actor.end.remote() for one in self.workers if one.ready]
         if ends:
             ray.wait(ends, num_returns=len(ends), timeout=CLOSE_S)
-        working = [host for host, _ in self._calls.values()]
-        for host in (*self._idle, *self._left_out, *working):
-            ray.kill(host)
+        for actor in (*self.left_out, *(one.actor for one in self.workers)):
+            ray.kill(actor)
 
-    def _new(self) -> Any:
-        self._made += 1
-        return self._make(self._made - 1)
 
-    def _begin(self, host: Any) -> None:
-        self._calls[host.begin.remote(self._known)] = host, None
-
-    def _settle(self, call: Any, host: Any, given: _Given | None) -> Iterator[Outcome]:
-        """Take what came of a call; yield the outcome of its task, unless that is done again."""
-        try:
-            answer = ray.get(call)
-        except RayTaskError as error:
-            if given is not None:
-                raise error.cause from None
-            self._leave_out(host, _cause(error))
-        except RayError as error:
-            self._lose(host, error)
-            if given is not None:
-                yield from self._again(given._replace(lost=given.lost + 1), error)
-        else:
-            if given is None:
-                self._take(host, *answer)
-            elif answer is None:
-                self._waiting.append(given)
-                self._begin(host)
-            else:
-                yield from self._outcome(host, given, *answer)
-
-    def _take(self, host: Any, node: str, found: Mapping[str, str] | None) -> None:
-        """Let a host that has begun work, if its node is as it should be."""
-        wrong = [] if found is None else _differences(_name(node), found, self._own)
-        if wrong:
-            self._leave_out(host, "; ".join(wrong))
-        else:
-            self._known.add(node)
-            self._idle.append(host)
-
-    def _leave_out(self, host: Any, why: str) -> None:
-        """Do without a host, which keeps its place, so that the next one is put elsewhere."""
-        say(f"A worker is left out: {why}")
-        self._left_out.append(host)
-        self._begin(self._new())
-
-    def _lose(self, host: Any, error: RayError) -> None:
-        """Begin a host again that Ray starts again, where there is room; or do without it."""
-        self._why = f" (the last one: {_cause(error)})"
-        if getattr(error, "actor_init_failed", False):
-            self._retire(host, ClusterError(f"a worker cannot begin: {_cause(error)}"))
-        else:
-            self._begin(host)
-
-    def _outcome(self, host: Any, given: _Given, outcome: Outcome, over: bool) -> Iterator[Outcome]:
-        if isinstance(outcome.error, WorkerRetiredError):
-            self._waiting.appendleft(given)
-            self._retire(host, outcome.error)
-            return
-        self._idle.append(host)
-        broke = given._replace(broke=given.broke + 1)
-        again = over or isinstance(outcome.error, self._limits.get("again", ()))
-        if again and broke.broke < self._limits.get("attempts", ATTEMPTS):
-            self._waiting.append(broke)
-        else:
-            yield outcome
-
-    def _again(self, given: _Given, error: RayError) -> Iterator[Outcome]:
-        """Queue a task whose worker was lost, unless that was so often already."""
-        if given.lost < _LOSSES:
-            self._waiting.append(given)
-        else:
-            lost = RuntimeError(f"the worker was lost with its node: {_cause(error)}")
-            yield Outcome(given.task, None, lost, None, given.attempt - 1)
-
-    def _retire(self, host: Any, why: InterferenceError) -> None:
-        """Do without a host; if it was the last one, that is an error."""
-        ray.kill(host)
-        if not self._idle and not self._calls:
-            raise why
-        say(f"A worker is left out: {why.message}")
+def _on_node(function: Any, node_id: str) -> Any:
+    """Return a remote function that runs on one node, whatever else runs there."""
+    there = NodeAffinitySchedulingStrategy(node_id, soft=False)
+    return function.options(num_cpus=0, scheduling_strategy=there)
 
 
 def _enter(folder: str) -> None:
@@ -387,7 +348,7 @@ def _connected(address: str) -> Iterator[None]:
         return
     unreached = ClusterError(
         f"no Ray cluster can be reached at {address!r}",
-        "Start one with  ray start --head  and give its address, or --ray-address local.",
+        'Start one with  ray start --head  and give its address, or "local".',
     )
     host, colon, port = address.rpartition(":")
     if colon:  # Ray itself would wait for minutes

@@ -110,8 +110,8 @@ def test_workers_must_be_positive(workers: int) -> None:
 
 def test_what_is_handed_in_comes_with_the_outcome_however_the_task_ends() -> None:
     def write(task: str, worker: Worker) -> None:
-        worker.hand_in("a.txt", b"first")
-        worker.hand_in("a.txt", task.encode())
+        worker.send_file("a.txt", b"first")
+        worker.send_file("a.txt", task.encode())
         if task == "bad":
             raise ValueError("no")
 
@@ -124,7 +124,7 @@ def test_of_a_task_that_is_tried_again_only_the_last_files_count() -> None:
 
     def write(task: str, worker: Worker) -> None:
         if left:
-            worker.hand_in("early.txt", b"")
+            worker.send_file("early.txt", b"")
             raise SimulatorCrashError(str(left.pop()))
 
     (outcome,) = Serial().run(write, ["x"], again=(SimulatorCrashError,))
@@ -145,14 +145,14 @@ def test_the_executor_that_is_asked_for() -> None:
     [
         ({"executor": "rey"}, "'rey' is none of processes, ray"),
         ({"workers": 0}, "workers 0"),
-        ({"gpus_per_worker": 0.5}, "--gpus-per-worker says nothing of --executor processes"),
-        ({"ray_address": "local"}, "--ray-address says nothing of --executor processes"),
+        ({"gpus_per_worker": 0.5}, 'gpus_per_worker has no effect with executor="processes"'),
+        ({"ray_address": "local"}, 'ray_address has no effect with executor="processes"'),
         ({"executor": "ray", "workers": 0}, "workers 0"),
-        ({"executor": "ray", "gpus_per_worker": -1.0}, "--gpus-per-worker -1"),
-        ({"executor": "ray", "cpus_per_worker": float("nan")}, "--cpus-per-worker nan"),
-        ({"executor": "ray", "gpus_per_worker": 1.5}, "--gpus-per-worker 1.5"),
+        ({"executor": "ray", "gpus_per_worker": -1.0}, "gpus_per_worker -1"),
+        ({"executor": "ray", "cpus_per_worker": float("nan")}, "cpus_per_worker nan"),
+        ({"executor": "ray", "gpus_per_worker": 1.5}, "gpus_per_worker 1.5"),
         *(
-            ({"executor": "ray", "ray_address": given}, f"--ray-address {given!r}; expected auto")
+            ({"executor": "ray", "ray_address": given}, f"ray_address {given!r}; expected auto")
             for given in ("", "here", "here:", "10.0.0.1:head", "10.0.0.1:65536", "ray://a:1x")
         ),
     ],

@@ -22,6 +22,8 @@ pytestmark = pytest.mark.timeout(150)
 
 TESTS = Path(__file__).parent.parent
 
+DIED = {"the worker process died"}  # on a cluster, which does not know the exit code
+
 Run = Callable[..., list[Outcome]]
 
 
@@ -91,7 +93,7 @@ def test_whatever_a_task_does_the_others_are_done(tmp_path: Path, run: Run) -> N
     for key in (("raise", "no number"), ("lock", None), ("odd", None)):
         assert (found[key].attempts, type(found[key].error)) == (1, RuntimeError)
     for key, code in ((("exit", 4), 4), (("signal", signal.SIGKILL), -9)):
-        assert errors[key] == f"the worker process died (exit code {code})"
+        assert errors[key] in DIED | {f"the worker process died (exit code {code})"}
         assert found[key].attempts == 2
 
 
@@ -161,7 +163,7 @@ def test_workers_and_what_they_started_end_with_their_parent(
 
 def test_processes_of_a_dead_worker_end_though_they_hold_its_pipe(tmp_path: Path, run: Run) -> None:
     (outcome,) = run([("start", (str(tmp_path), 3))], attempts=1)
-    assert str(outcome.error) == "the worker process died (exit code 3)"
+    assert str(outcome.error) in DIED | {"the worker process died (exit code 3)"}
     wait_until_gone(pids_in(tmp_path, 2), seconds=5)
 
 
