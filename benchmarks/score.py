@@ -33,7 +33,7 @@ import pyarrow.parquet as pq
 from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score import Settings
+from robomme_interference_data.evaluate.score.config import Settings
 from robomme_interference_data.evaluate.score.scoring import score
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import Rollout

@@ -10,7 +10,7 @@ import typer
 from robomme_interference_data.cli.console import check_output, print_json, say, stoppable
 from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
-from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.config import Grid
 
 from .publish_config import PublishConfig, VersionConfig
 

@@ -145,7 +145,7 @@ def of_results(facts: ResultsFacts, about: Publication) -> dict[str, Any]:
         f"Rollouts of {', '.join(facts.systems)} on RoboMME-Interference: "
         f"{len(facts.score.rows):,} rows."
     )
-    simulators = tuple(facts.score.cubes)
+    simulators = tuple(facts.score.outcomes)
     families = tuple(facts.score.rows.names("family"))
     return {
         **_core(about, told),

@@ -7,8 +7,9 @@ from tempfile import TemporaryDirectory
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import PublishError
 from robomme_interference_data.evaluate.run.log import read_record
-from robomme_interference_data.evaluate.score import Grid, Settings
-from robomme_interference_data.evaluate.score.scoring import Score, score, write_score
+from robomme_interference_data.evaluate.score.config import Grid, Settings
+from robomme_interference_data.evaluate.score.scoring import Score, score
+from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 from robomme_interference_data.storage.files import canonical_json

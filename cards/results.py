@@ -11,7 +11,7 @@ from typing import Any
 from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_TABLES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.run.log import RunHeader
-from robomme_interference_data.evaluate.score import Grid, Settings
+from robomme_interference_data.evaluate.score.config import Grid, Settings
 from robomme_interference_data.evaluate.score.plots.curves import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
@@ -96,13 +96,13 @@ class ResultsFacts:
     @property
     def systems(self) -> list[str]:
         """The systems, as tables name them."""
-        names = (name for cube in self.score.cubes.values() for name in cube.systems)
+        names = (name for cube in self.score.outcomes.values() for name in cube.systems)
         return list(map(display_name, dict.fromkeys(names)))
 
     @property
     def limits(self) -> list[str]:
         """What the results do not tell, as plain text, a sentence or two each."""
-        found = [simulated(tuple(self.score.cubes)), *self.score.notes]
+        found = [simulated(tuple(self.score.outcomes)), *self.score.notes]
         if not all(cell.complete for cell in self.score.cells if not cell.part):
             found.append(
                 "Not every cell is complete: rates over parts of the grid cannot be compared with "
@@ -131,7 +131,7 @@ class ResultsFacts:
         """The simulators of which there is a figure, by the file of its picture."""
         return {
             f"README-{re.sub('[^A-Za-z0-9._-]', '-', simulator)}.png": simulator
-            for simulator in self.score.cubes
+            for simulator in self.score.outcomes
             if Data(self.score, simulator).cells
         }
 
@@ -185,10 +185,10 @@ def results_values(facts: ResultsFacts) -> dict[str, Any]:
     """Return what the template of results names, but for publication and provenance."""
     found = facts.score
     effects = found.tables["effects"]
-    statuses = Counter(map(str, found.rows.list("status")))
+    statuses = Counter(row.status for row in found.rows)
     return {
         "systems": facts.systems,
-        "headlines": {name: headline(found, name) for name in found.cubes},
+        "headlines": {name: headline(found, name) for name in found.outcomes},
         "figures": {
             file: f"Success by condition, {simulator}" for file, simulator in facts.figures.items()
         },

@@ -13,10 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, RunFolderError, first_line
@@ -277,21 +275,6 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
             ) from None
         rows[item] = row
     return rows
-
-
-def rows_that_count(rollout: NDArray[np.int64], broke: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the numbers of a record's rows that count, as `read_record` has it.
-
-    Of a rollout that is finished twice both are among them: whoever asks refuses that.
-
-    Args:
-        rollout: A number for the rollout that each row is of, `(N,)`.
-        broke: Whether it broke, `(N,)`.
-    """
-    _, last = np.unique(rollout[::-1], return_index=True)
-    count = ~broke
-    count[len(rollout) - 1 - last] = True
-    return np.flatnonzero(count)
 
 
 def whole_lines(record: Path) -> bytes:

@@ -10,10 +10,10 @@ import typer
 from robomme_interference_data.cli.console import check_output, command_line, print_json, say
 from robomme_interference_data.cli.options import AsJson, split_commas, with_settings
 
-from . import Settings
+from .config import Settings
 
 if TYPE_CHECKING:
-    from .rows.checked import Rows
+    from .rows.reading import Rows
 
 
 @with_settings
@@ -42,7 +42,7 @@ def score(
 
     from .report.headline import headline
     from .scoring import score as compute
-    from .scoring import write_score
+    from .writing import write_score
 
     check_output(out, export_to)
     found = compute(settings)
@@ -54,7 +54,9 @@ def score(
     if as_json:
         print_json(
             {
-                "headlines": {simulator: headline(found, simulator) for simulator in found.cubes},
+                "headlines": {
+                    simulator: headline(found, simulator) for simulator in found.outcomes
+                },
                 "rows": len(found.rows),
                 "bad_rows": found.rows.refused,
                 "notes": list(found.notes),

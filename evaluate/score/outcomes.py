@@ -1,6 +1,7 @@
 """What came of every rollout in one simulator, as one array."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -13,13 +14,14 @@ from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, na
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import effective
+from robomme_interference_data.stats.intervals import effective_n
 
-from . import Grid
-from .rows.checked import Rows
+from .config import Grid
+from .rows.reading import Rows
+from .rows.values import Row
 
 STATUSES = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
-"""By their numbers in a cube."""
+"""By their numbers in `Outcomes.status`."""
 
 TEST_EPISODES = 50
 _SUCCESS, _ERROR = 0, 3
@@ -29,7 +31,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Cube:
+class Outcomes:
     """What came of every rollout in one simulator: S systems, C conditions, E episodes, M seeds.
 
     Attributes:
@@ -155,48 +157,75 @@ def trials(status: Statuses) -> float:
     """Return how many independent trials a rate is worth: with repeats, more than its episodes.
 
     Args:
-        status: The rate's rollouts, `(E, M) int8` (see `stats.effective`).
+        status: The rate's rollouts, `(E, M) int8` (see `stats.intervals.effective_n`).
     """
     rates = success(status)
     rates = rates[~np.isnan(rates)]
     if len(rates) < 2:
         return len(rates)
     rollouts = int(counting(status).sum())
-    return effective(float(rates.mean()), float(rates.var(ddof=1)), len(rates), rollouts)
+    return effective_n(float(rates.mean()), float(rates.var(ddof=1)), len(rates), rollouts)
 
 
-def cubes_of(rows: Rows, grid: Grid) -> dict[str, Cube]:
+def outcomes_of(rows: Rows, grid: Grid) -> dict[str, Outcomes]:
     """Return simulator to the outcomes in it, by name, with the cells that are expected."""
-    return {name: _cube(part, name, grid) for name, part in rows.by("simulator").items()}
+    return {
+        name: _outcomes(part, name, grid, rows.unpinned)
+        for name, part in rows.by("simulator").items()
+    }
 
 
-def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
-    systems = tuple(sorted(rows.names("system"), key=_table_order))
-    given, model_seeds = rows.names("condition"), tuple(rows.names("model_seed"))
-    due = given if grid is Grid.GIVEN else DEFAULT_CONDITIONS
-    conditions = tuple(one.name for one in in_order({*given, *due}))
-    ids = list(zip(*map(rows.list, ("family", "episode_split", "episode")), strict=True))
-    wanted = {*ids}
+def _outcomes(
+    rows: Sequence[Row], simulator: str, grid: Grid, unpinned: frozenset[tuple[str, str]]
+) -> Outcomes:
+    systems = tuple(sorted({row.system for row in rows}, key=_table_order))
+    given = {row.condition for row in rows}
+    due = given if grid is Grid.GIVEN else {*DEFAULT_CONDITIONS}
+    conditions = tuple(one.name for one in in_order(given | due))
+    model_seeds = tuple(sorted({row.model_seed for row in rows}))
+    ids = {(row.family, row.episode_split, row.episode) for row in rows}
+    expected = ids
     if grid is Grid.BENCHMARK:
-        wanted = {(family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)}
-    episodes = sorted((EpisodeId(*one) for one in {*ids, *wanted}), key=lambda one: one.sort_key)
-    places = {(one.family, one.split, one.index): place for place, one in enumerate(episodes)}
-    at = np.array([places[one] for one in ids])
+        expected = {
+            (family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)
+        }
+    episodes = sorted((EpisodeId(*one) for one in ids | expected), key=lambda one: one.sort_key)
 
-    shape = (len(systems), len(conditions), len(episodes), len(model_seeds))
+    axes = [
+        {name: place for place, name in enumerate(axis)}
+        for axis in (
+            systems,
+            conditions,
+            [(one.family, one.split, one.index) for one in episodes],
+            model_seeds,
+        )
+    ]
+    at = tuple(
+        np.array(
+            [
+                (
+                    axes[0][row.system],
+                    axes[1][row.condition],
+                    axes[2][row.family, row.episode_split, row.episode],
+                    axes[3][row.model_seed],
+                )
+                for row in rows
+            ]
+        ).T
+    )
+    shape = tuple(map(len, axes))
     status, evidence = np.full(shape, -1, np.int8), np.full(shape, np.nan)
-    cell = (rows.places("system", systems), rows.places("condition", conditions))
-    axes = (*cell, at, rows.places("model_seed", model_seeds))
-    status[axes] = rows.places("status", STATUSES)
-    evidence[axes] = np.array(rows.list("evidence_kept"), float)  # None becomes NaN
-    difficulty = np.full(len(episodes), -1)
-    found = rows.places("difficulty", DIFFICULTIES)
-    difficulty[at[found >= 0]] = found[found >= 0]
-    chance, drawn = np.full(len(episodes), np.nan), np.array(rows.list("chance"), float)
-    chance[at[~np.isnan(drawn)]] = drawn[~np.isnan(drawn)]
+    status[at] = [STATUSES.index(row.status) for row in rows]
+    evidence[at] = np.array([row.evidence_kept for row in rows], float)  # None becomes NaN
+    difficulty, chance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
+    for row, place in zip(rows, at[2].tolist(), strict=True):
+        if row.difficulty is not None:
+            difficulty[place] = DIFFICULTIES.index(row.difficulty)
+        if row.chance is not None:
+            chance[place] = row.chance
     known = [name_system(system) for system in systems]
     applies = np.array([[one.applies(c) and c in due for c in conditions] for one in known])
-    return Cube(
+    return Outcomes(
         simulator,
         systems,
         conditions,
@@ -206,9 +235,9 @@ def _cube(rows: Rows, simulator: str, grid: Grid) -> Cube:
         evidence,
         difficulty,
         chance,
-        expected=np.array([key in wanted for key in places]),
+        expected=np.array([key in expected for key in axes[2]]),
         due=applies | (status >= 0).any(axis=(2, 3)),
-        unpinned=np.array([(simulator, system) in rows.unpinned for system in systems]),
+        unpinned=np.array([(simulator, system) in unpinned for system in systems]),
     )
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.stats.intervals import z_of
-from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.tables import percent
 
 from .comparisons.pairs import Pairs
@@ -82,7 +82,7 @@ def plan(margin: float, episodes: int, flips: float) -> Plan:
         *(episodes, flips, margin, z_of(0.95) * noise, power(margin, episodes, flips)),
         smallest=smallest(episodes, flips),
         needed=needed(margin, flips),
-        equal=(z_of(1 - 2 * SURE) + z_of(POWER)) * noise,
+        equal=(z_of(1 - 2 * ALPHA) + z_of(POWER)) * noise,
     )
 
 
@@ -102,7 +102,7 @@ def power(margin: float, episodes: int, flips: float) -> float:
     ways = np.where(rest >= 0, logs[d][:, None] - logs[x] - logs[np.maximum(rest, 0)], -np.inf)
     fair = np.exp(ways - d[:, None] * math.log(2))
     # Both tails are alike: x against the difference, and as many for it.
-    rare = 2 * fair.cumsum(axis=1) <= SURE
+    rare = 2 * fair.cumsum(axis=1) <= ALPHA
     against = _powers(flips / 2 / both, x) + _powers(1 - flips / 2 / both, rest)
     in_favour = _powers(flips / 2 / both, rest) + _powers(1 - flips / 2 / both, x)
     found = (np.exp(ways + against) + np.exp(ways + in_favour)) * (rare & (2 * x < d[:, None]))
@@ -125,7 +125,7 @@ def needed(margin: float, flips: float) -> int:
         flips: Share of the episodes that flips by itself.
     """
     both = flips + margin
-    wide = z_of(1 - SURE) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
+    wide = z_of(1 - ALPHA) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
     low, high = 0, math.ceil(((wide + math.sqrt(wide**2 + 4 * margin)) / 2 / margin) ** 2)
     while high <= MOST and high - low > 1:
         middle = (low + high) // 2

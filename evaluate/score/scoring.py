@@ -1,41 +1,32 @@
-"""A scoring, from rows to tables and to the folder that they are written to."""
+"""A scoring, from rows to tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import BadRowsError
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats.bootstrap import DRAWS
-from robomme_interference_data.storage.files import write_text
 from robomme_interference_data.viz.tables import Table
-from robomme_interference_data.viz.templates import load_jinja2
 
-from . import Against, Grid, Settings
-from .comparisons import contrasts, effects, equivalence, families, interaction, ranks
-from .outcomes import Cube, cubes_of
-from .rows.checked import Rows, read_rows
-from .tables import cells, chance, paper
-from .tables import evidence_kept as access
+from .comparisons import effects, families, interaction, ranks
+from .comparisons.contrast import Contrast
+from .comparisons.tables import comparison_table
+from .config import Against, Grid, Settings
+from .outcomes import Outcomes, outcomes_of
+from .rows.reading import Rows, read_rows
+from .tables import cells, chance, equivalence, evidence_kept, paper
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
-    *(
-        "interaction",
-        "equivalence",
-        "interference",
-        "access",
-        "ceiling",
-        "decay",
-        "noise",
-        "families",
-    ),
-    *("family_effects", "matrix", "coverage", "paper", "paper_family"),
+    *("interaction", "equivalence", "interference", "access", "ceiling", "decay", "noise"),
+    *("families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
 )
-"""Every table that a score may have."""
+"""Every table that a score may have, in order."""
 
-_SUFFIXES = (".csv", ".md", ".tex")
+_ALWAYS = {"main", "family", "difficulty", "lift", "effects", "decay", "noise", "coverage"}
+_ALWAYS |= {"paper", "paper_family"}
+"""Tables that are written without rows, too."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +38,9 @@ class Score:
         draws: Bootstrap samples.
         rows: The rows.
         notes: What a reader must know, such as that two systems are not paired.
-        cubes: What came of the rollouts, by simulator.
+        outcomes: What came of the rollouts, by simulator.
         contrasts: All comparisons of all systems, in the order of tables.
-        published: Rates of the paper, if the score is set against them.
+        published: Rates of the paper, if the score is compared with them.
         cells: System × condition, over all episodes, by family and by difficulty.
         tables: All tables by name, the paper's main table aside.
         grids: The paper's main table of each simulator.
@@ -59,8 +50,8 @@ class Score:
     draws: int
     rows: Rows
     notes: tuple[str, ...]
-    cubes: Mapping[str, Cube]
-    contrasts: Sequence[contrasts.Contrast]
+    outcomes: Mapping[str, Outcomes]
+    contrasts: Sequence[Contrast]
     published: Sequence[cells.Cell]
     cells: Sequence[cells.Cell]
     tables: Mapping[str, Table]
@@ -75,7 +66,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         draws: Bootstrap samples.
 
     Raises:
-        BadRowsError: Rows are bad, or there are none; and more, see `rows.read_rows`.
+        BadRowsError: Rows are bad, or there are none; and more, see `rows.reading.read_rows`.
     """
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     if not len(rows):
@@ -86,142 +77,77 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             else f"there are no rows {where}",
             "Without any sound row there is nothing to score.",
         )
-    cubes = cubes_of(rows, settings.grid)
-    compared: list[contrasts.Contrast] = []
-    decays: list[tuple[Any, ...]] = []
-    notes: list[str] = []
-    for cube in cubes.values():
-        for system in cube.systems:
-            beside = {"base": base_of(system), "ceiling": access.ceiling_of(system)}
-            for role, other in beside.items():
-                if other is None or other not in cube.systems:
-                    beside[role] = None
-                elif why := _unpaired(rows, cube, system, other):
-                    beside[role] = None
-                    notes.append(f"{system} and {other} in {cube.simulator} are not paired: {why}.")
-            found, decay = effects.effects_of(cube, system, **beside, draws=draws)
-            compared += found
-            decays += decay
-        compared += ranks.systems_of(cube) + interaction.interactions_of(cube)
-    every = cells.cells_of(cubes.values())
-    between = [
-        chance.chance_table(cubes, every),
-        contrasts.contrast_table(compared, "systems"),
-        ranks.rank_table(cubes.values(), draws),
-    ]
-    beyond = [
-        contrasts.interaction_table(compared),
-        contrasts.contrast_table(compared, "interference"),
-        access.access_table(cubes.values()),
-        contrasts.contrast_table(compared, "ceiling"),
-    ]
+    outcomes = outcomes_of(rows, settings.grid)
+    every = tuple(outcomes.values())
+    compared, decays, notes = _compared(rows, every, draws)
+    by_family = [one for own in every for one in families.family_effects(own, compared)]
+    found = cells.cells_of(every)
     published = paper.published() if settings.against is Against.PAPER else ()
-    if settings.margin is not None:
-        equal = equivalence.equivalence_table(compared, every, published, settings.margin)
-        beyond.insert(1, equal)
-    by_family = [
-        families.families_table(cubes.values(), compared),
-        families.family_effects_table(cubes.values(), compared),
-    ]
     tables = [
-        cells.rate_table(every, "main"),
-        *(one for one in between if one.rows),
-        *(cells.rate_table(every, name) for name in ("family", "difficulty")),
-        contrasts.lift_table(compared),
-        contrasts.contrast_table(compared, "effects"),
-        *(one for one in beyond if one.rows),
+        *(cells.rate_table(found, name) for name in ("main", "family", "difficulty")),
+        chance.chance_table(outcomes, found),
+        ranks.rank_table(every, draws),
+        *(comparison_table(name, compared) for name in ("lift", "effects", "interference")),
+        *(comparison_table(name, compared) for name in ("ceiling", "systems", "matrix")),
+        comparison_table("interaction", compared),
+        comparison_table("family_effects", by_family),
+        families.families_table(every, compared),
+        evidence_kept.access_table(every),
         effects.decay_table(decays),
-        effects.noise_table(cubes.values()),
-        *(one for one in by_family if one.rows),
-        *(one for one in [contrasts.contrast_table(compared, "matrix")] if one.rows),
-        cells.coverage_table(every),
+        effects.noise_table(every),
+        cells.coverage_table(found),
     ]
+    if settings.margin is not None:
+        margin = settings.margin
+        tables.append(equivalence.equivalence_table(compared, found, published, margin))
     if published:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
-        whole = cells.cells_of(cubes_of(rows, Grid.BENCHMARK).values())
+        whole = cells.cells_of(outcomes_of(rows, Grid.BENCHMARK).values())
         tables += [paper.paper_table(whole), paper.paper_family_table(whole)]
         notes += paper.not_compared(whole)
+    tables = [one for one in tables if one.rows or one.name in _ALWAYS]
     return Score(
         settings,
         draws,
         rows,
         tuple(notes),
-        cubes,
+        outcomes,
         compared,
         published,
-        every,
-        {table.name: table for table in tables},
-        cells.main_grids(every),
+        found,
+        {table.name: table for table in sorted(tables, key=lambda one: TABLES.index(one.name))},
+        cells.main_grids(found),
     )
 
 
-def _unpaired(rows: Rows, cube: Cube, system: str, other: str) -> str:
+def _compared(
+    rows: Rows, every: Sequence[Outcomes], draws: int
+) -> tuple[list[Contrast], list[tuple[Any, ...]], list[str]]:
+    """Return all comparisons, the rows of `decay`, and why systems are not paired."""
+    compared, decays, notes = list[Contrast](), list[tuple[Any, ...]](), list[str]()
+    for outcomes in every:
+        for system in outcomes.systems:
+            beside = {"base": base_of(system), "ceiling": evidence_kept.ceiling_of(system)}
+            for role, other in beside.items():
+                if other is None or other not in outcomes.systems:
+                    beside[role] = None
+                elif why := _unpaired(rows, outcomes, system, other):
+                    beside[role] = None
+                    simulator = outcomes.simulator
+                    notes.append(f"{system} and {other} in {simulator} are not paired: {why}.")
+            found, decay = effects.effects_of(outcomes, system, **beside, draws=draws)
+            compared += found
+            decays += decay
+        compared += ranks.systems_of(outcomes) + interaction.interactions_of(outcomes)
+    return compared, decays, notes
+
+
+def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:
     """Return why two systems differ in more than what is asked; nothing if they do not."""
-    if not cube.pairable(system, other):
-        (lone,) = (one for one in (system, other) if (cube.simulator, one) in rows.unpinned)
+    if not outcomes.pairable(system, other):
+        (lone,) = (one for one in (system, other) if (outcomes.simulator, one) in rows.unpinned)
         return f"the rows of {lone} name no revision of a split, so their histories may differ"
-    steps = [rows.retrieval.get((cube.simulator, one)) for one in (system, other)]
+    steps = [rows.retrieval.get((outcomes.simulator, one)) for one in (system, other)]
     if None not in steps and steps[0] != steps[1]:
         return f"they are behind other retrieval steps, {' and '.join(map(str, steps))}"
     return ""
-
-
-def write_score(
-    score: Score,
-    out: Path,
-    export_to: Path | None = None,
-    command: str | None = None,
-    *,
-    png: bool = False,
-) -> list[Path]:
-    """Write tables, figures and the report, each atomically and the report last.
-
-    What can be refused is refused before anything is written. Tables and figures of an earlier
-    score that this one does not have are removed; files of other names stay.
-
-    Args:
-        score: What is written.
-        out: Folder for `tables/`, `figures/`, `methods.md`, `methods.bib` and `report.html`.
-        export_to: Folder for the rows in the released layout (see `export`); None writes none.
-        command: The command line that made the score, for the report.
-        png: Whether figures are written as PNG, too, not as SVG alone.
-
-    Returns:
-        The exported files.
-
-    Raises:
-        MissingExtraError: matplotlib or jinja2 is not installed.
-        InvalidOptionError: The released layout cannot hold the rows (see `export`).
-    """
-    from robomme_interference_data.viz.figure import MAKER, open_figure
-
-    from .plots import figures
-    from .report import methods
-    from .report import page as report
-    from .rows import export
-
-    with open_figure():
-        load_jinja2("the report")
-    exported = [] if export_to is None else export.export(score.rows, export_to)
-    texts = {f"{name}.csv": table.csv() for name, table in score.tables.items()}
-    texts |= {f"{name}.md": table.markdown() for name, table in score.tables.items()}
-    texts |= {f"{name}.tex": table.latex() for name, table in score.tables.items()}
-    texts["main.md"] = "\n".join(grid.markdown() for grid in score.grids)
-    texts["main.tex"] = "\n".join(grid.latex() for grid in score.grids)
-    for name, text in texts.items():
-        write_text(out / "tables" / name, text)
-    for suffix, text in zip((".md", ".bib"), methods.methods(score), strict=True):
-        write_text(out / f"methods{suffix}", text)
-    drawn = figures.draw_figures(score, out / "figures", png=png)
-    for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - {*texts}:
-        (out / "tables" / name).unlink(missing_ok=True)
-    for kind in figures.FIGURES:
-        for drawing in (out / "figures").glob(f"{kind}-*.svg"):
-            if MAKER.encode() not in drawing.read_bytes():
-                continue  # somebody else's
-            if drawing.stem not in drawn or not png:
-                drawing.with_suffix(".png").unlink(missing_ok=True)
-            if drawing.stem not in drawn:
-                drawing.unlink()
-    report.write_report(score, drawn, out / "report.html", command)
-    return exported

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 DRAWS = 10_000
 """Bootstrap samples."""
 
-LEAST = 10
+MIN_EPISODES = 10
 """So many episodes must stand out for a slope, or a mean over families, to have an interval."""
 
 _CHUNK = 2**15  # numbers at a time: they stay in the cache, and BLAS starts no threads for them
@@ -50,15 +50,15 @@ def slope_weights(ks: Sequence[int]) -> Floats:
     return np.asarray(centred / (centred**2).sum())
 
 
-def enough(values: Floats) -> bool:
+def varies_enough(values: Floats) -> bool:
     """Whether what each episode adds to a comparison, `(E,)`, varies enough for a bootstrap.
 
-    At least `LEAST` episodes must have another value than the commonest one, which for a paired
-    difference is most often 0. With fewer, the resampled means fall on a coarse lattice, and
+    At least `MIN_EPISODES` episodes must have another value than the commonest one, which for a
+    paired difference is most often 0. With fewer, the resampled means fall on a coarse lattice, and
     intervals cover less than they promise, down to width zero where all episodes agree.
     """
     _, counts = np.unique(values.round(12), return_counts=True)
-    return len(values) - int(counts.max(initial=0)) >= LEAST
+    return len(values) - int(counts.max(initial=0)) >= MIN_EPISODES
 
 
 def bootstrap(values: Floats, key: str, draws: int = DRAWS) -> list[Interval]:

@@ -22,7 +22,7 @@ def wilson(successes: float, trials: float, level: float = LEVEL) -> tuple[float
     """Return the Wilson score interval of a rate; `(0, 1)` without trials.
 
     With z = 1.96 and p = successes / n: (p + z²/2n ± z √(p(1−p)/n + z²/4n²)) / (1 + z²/n).
-    Both are fractions where episodes were repeated (see `effective`).
+    Both are fractions where episodes were repeated (see `effective_n`).
 
     Source: Wilson (1927), Probable inference, the law of succession, and statistical inference,
     JASA 22, 209–212; the paper's own intervals are these.
@@ -39,7 +39,7 @@ def wilson(successes: float, trials: float, level: float = LEVEL) -> tuple[float
     return low, high
 
 
-def effective(rate: float, variance: float, episodes: int, rollouts: int) -> float:
+def effective_n(rate: float, variance: float, episodes: int, rollouts: int) -> float:
     """Return how many independent trials a rate of repeated episodes is worth.
 
     The rate p is the mean over n episodes, its variance s² / n with s² of the episodes' means: a
@@ -60,7 +60,7 @@ def effective(rate: float, variance: float, episodes: int, rollouts: int) -> flo
     return min(rollouts, max(episodes, rate * (1 - rate) * episodes / variance))
 
 
-def combined(
+def mover_interval(
     rate: float,
     bounds: tuple[float, float],
     other: float,
@@ -100,7 +100,7 @@ def newcombe(
 ) -> tuple[float, float]:
     """Return the hybrid score interval of the difference of two unpaired rates.
 
-    `combined` of their Wilson intervals; without trials on either side it is `(−1, 1)`.
+    `mover_interval` of their Wilson intervals; without trials on either side it is `(−1, 1)`.
 
     Source: Newcombe (1998), Interval estimation for the difference between independent
     proportions, Statistics in Medicine 17, 873–890, method 10.
@@ -109,7 +109,7 @@ def newcombe(
         return -1.0, 1.0
     sides = ((successes, trials), (other_successes, other_trials))
     (p, bounds), (q, others) = ((won / n, wilson(won, n, level)) for won, n in sides)
-    return combined(p, bounds, q, others)
+    return mover_interval(p, bounds, q, others)
 
 
 def newcombe_paired(
@@ -117,8 +117,8 @@ def newcombe_paired(
 ) -> tuple[float, float]:
     """Return the score interval of the difference of two paired rates, first − second.
 
-    With n pairs, `combined` of the Wilson intervals of (both + first) / n and (both + second) / n.
-    φ estimates the correlation: with A = both · neither − first · second it is
+    With n pairs, `mover_interval` of the Wilson intervals of (both + first) / n and
+    (both + second) / n. φ estimates the correlation: with A = both · neither − first · second it is
     A / √(n₁(n − n₁) n₂(n − n₂)), n₁ and n₂ the successes of the two sides, where a positive A is
     first lowered by n / 2, to no less than 0; φ is 0 where a factor of the root is.
 
@@ -141,7 +141,7 @@ def newcombe_paired(
     joint = max(0.0, joint - pairs / 2) if joint > 0 else joint
     phi = joint / math.sqrt(product) if product else 0.0
     bounds, others = wilson(one, pairs, level), wilson(other, pairs, level)
-    return combined(one / pairs, bounds, other / pairs, others, phi)
+    return mover_interval(one / pairs, bounds, other / pairs, others, phi)
 
 
 def fieller(

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-SURE = 0.05
+ALPHA = 0.05
 """Below this p something is taken as found."""
 
 _LATTICE = 27720  # divided by every number up to 12: means of so many repeats lie on it exactly

@@ -26,7 +26,7 @@ from robomme_interference_data.cards.render import (
 from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH, REPORT_PATH
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import FormatError, InvalidOptionError
-from robomme_interference_data.evaluate.score import Settings
+from robomme_interference_data.evaluate.score.config import Settings
 from robomme_interference_data.evaluate.score.scoring import score
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord

@@ -10,10 +10,10 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.stats.bootstrap import bootstrap, enough, slope_weights
+from robomme_interference_data.stats.bootstrap import bootstrap, varies_enough, slope_weights
 from robomme_interference_data.stats.intervals import (
     cohens_h,
-    effective,
+    effective_n,
     fieller,
     newcombe,
     newcombe_paired,
@@ -109,12 +109,12 @@ def test_no_paired_interval_has_width_zero(counts: tuple[int, int, int, int]) ->
 
 def test_what_repeats_are_worth_by_hand() -> None:
     # 0.5 · 0.5 / 0.05 is 5 trials an episode, but there are only 3 rollouts of each.
-    assert effective(0.5, 0.05, 10, 30) == 30
-    assert effective(0.5, 0.125, 10, 30) == pytest.approx(20)
+    assert effective_n(0.5, 0.05, 10, 30) == 30
+    assert effective_n(0.5, 0.125, 10, 30) == pytest.approx(20)
     # Single rollouts have p (1 − p) n / (n − 1): their number, and no fewer.
-    assert effective(0.5, 0.25 * 10 / 9, 10, 10) == 10
+    assert effective_n(0.5, 0.25 * 10 / 9, 10, 10) == 10
     # Where all episodes agree nothing tells repeats from copies.
-    assert effective(1.0, 0.0, 10, 30) == 10
+    assert effective_n(1.0, 0.0, 10, 30) == 10
 
 
 def test_two_proportions_by_hand() -> None:
@@ -277,16 +277,16 @@ def test_the_draws_are_these() -> None:
 
 
 def test_ten_episodes_must_stand_out_for_an_interval() -> None:
-    assert not enough(np.zeros(0))
-    assert not enough(np.array([1.0] * 9 + [0.0] * 441))
-    assert enough(np.array([1.0] * 10 + [0.0] * 440))
+    assert not varies_enough(np.zeros(0))
+    assert not varies_enough(np.array([1.0] * 9 + [0.0] * 441))
+    assert varies_enough(np.array([1.0] * 10 + [0.0] * 440))
     # All gained but nine: the draws are as coarse as where nine are gained.
-    assert not enough(np.array([1.0] * 441 + [0.0] * 9))
-    assert not enough(np.ones(450))
+    assert not varies_enough(np.array([1.0] * 441 + [0.0] * 9))
+    assert not varies_enough(np.ones(450))
     # Six differ one way and four the other.
-    assert enough(np.array([1.0] * 6 + [-1.0] * 4 + [0.0] * 20))
+    assert varies_enough(np.array([1.0] * 6 + [-1.0] * 4 + [0.0] * 20))
     # What rounding alone tells apart is equal.
-    assert not enough(np.array([0.1 + 0.2] * 10 + [0.3] * 20))
+    assert not varies_enough(np.array([0.1 + 0.2] * 10 + [0.3] * 20))
 
 
 def test_missing_episodes_do_not_count() -> None:

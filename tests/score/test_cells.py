@@ -8,7 +8,7 @@ from support import scoring as made
 from support.scoring import record
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score import Grid
+from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.intervals import wilson

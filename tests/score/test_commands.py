@@ -23,9 +23,10 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.score.plots import figures
-from robomme_interference_data.evaluate.score.rows.checked import read_rows
 from robomme_interference_data.evaluate.score.rows.export import RELEASED_COLUMNS, export
-from robomme_interference_data.evaluate.score.scoring import TABLES, write_score
+from robomme_interference_data.evaluate.score.rows.reading import read_rows
+from robomme_interference_data.evaluate.score.scoring import TABLES
+from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.viz.figure import MAKER
 
 
@@ -139,7 +140,7 @@ def test_a_score_leaves_nothing_of_an_earlier_one_and_all_of_others(
 ) -> None:
     def draw(score: Any, folder: Path, png: bool) -> dict[str, Path]:
         folder.mkdir(parents=True, exist_ok=True)
-        names = [f"success-{simulator}" for simulator in score.cubes]
+        names = [f"success-{simulator}" for simulator in score.outcomes]
         for name in names:
             (folder / f"{name}.svg").write_text(f"<svg>{MAKER}</svg>")
             if png:
@@ -192,7 +193,7 @@ def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     assert [cell.counts[0] for cell in cells] == [1, 7, 5, 3, 2]
     assert cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
     # Their simulator comes back, too: they never stand beside the paper's rates.
-    assert list(found.cubes) == ["tabletop"]
+    assert list(found.outcomes) == ["tabletop"]
     assert made.score(exported[1], system=OWN).cells[0].system == OWN  # what is given goes first
     assert {cell.system for cell in made.score(*exported).cells} == {OWN, BASE, RETRIEVAL}
     odd = exported[1].rename(tmp_path / "a b-tabletop_rollouts.csv")

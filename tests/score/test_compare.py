@@ -9,12 +9,12 @@ from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.comparisons.compare import Comparison, compare
+from robomme_interference_data.evaluate.score.comparisons.compare import RunComparison, compare
 from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.stats.intervals import newcombe_paired, wilson
 
 
-def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> Comparison:
+def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> RunComparison:
     paths = [made.write_csv(tmp_path / f"{n}.csv", r) for n, r in (("a", a), ("b", b))]
     return compare(*paths)
 

@@ -7,8 +7,8 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record
 
-from robomme_interference_data.evaluate.score import Grid
 from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.paper import by_family, differing, published

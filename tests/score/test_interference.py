@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, record, records
 
-from robomme_interference_data.evaluate.score.comparisons.contrasts import QUESTIONS, asked
+from robomme_interference_data.evaluate.score.comparisons.contrast import COMPARISONS, comparable
 from robomme_interference_data.evaluate.score.plots.curves import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure, draw_figures
 from robomme_interference_data.evaluate.score.report.headline import headline
@@ -123,26 +123,26 @@ NAMES = [kind.pattern.replace("<n>", n) for kind in KINDS.values() for n in "013
 @given(st.sets(st.sampled_from([NO_HISTORY, *NAMES])), st.booleans())
 def test_whatever_is_compared_differs_in_kind_alone(names: set[str], floor: bool) -> None:
     own = [one.name for one in in_order(names)] if names else []
-    found = dict(asked(OWN, own, (BASE, NO_HISTORY) if floor else None))
+    found = dict(comparable(OWN, own, (BASE, NO_HISTORY) if floor else None))
     assert [*found] == [name for name in own if name in found]  # in the order of tables
     for name, (system, against) in found.items():
         one, other = parse_condition(name), parse_condition(against)
-        assert QUESTIONS[one.kind.name].against == other.kind.name
+        assert COMPARISONS[one.kind.name].reference == other.kind.name
         if other.kind.counted:
             assert (system, one.k) == (OWN, other.k) and against in names
     # And whatever could be compared is.
     for name in own:
         one = parse_condition(name)
-        question = QUESTIONS.get(one.kind.name)
-        partner = question and KINDS[question.against].pattern.replace("<n>", str(one.k))
+        question = COMPARISONS.get(one.kind.name)
+        partner = question and KINDS[question.reference].pattern.replace("<n>", str(one.k))
         there = partner in names or (floor and partner == NO_HISTORY)
         assert (name in found) == there
 
 
 def test_every_kind_of_the_registry_is_asked_about() -> None:
     # held is what k is compared with, no-history what absent and misled are.
-    assert {*KINDS} - {*QUESTIONS} == {NO_HISTORY, "held"}
-    assert {question.against for question in QUESTIONS.values()} <= {*KINDS}
+    assert {*KINDS} - {*COMPARISONS} == {NO_HISTORY, "held"}
+    assert {question.reference for question in COMPARISONS.values()} <= {*KINDS}
 
 
 # --- access against use ------------------------------------------------------------------------

@@ -8,7 +8,8 @@ from support import scoring as made
 from support.scoring import BASE, OWN
 
 from robomme_interference_data.evaluate.score.report.methods import methods
-from robomme_interference_data.evaluate.score.scoring import Score, write_score
+from robomme_interference_data.evaluate.score.scoring import Score
+from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.viz.tables import Table
 
 

@@ -11,7 +11,7 @@ from support import scoring as made
 from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score import Grid, Settings
+from robomme_interference_data.evaluate.score.config import Grid, Settings
 from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.stats.intervals import newcombe, newcombe_paired

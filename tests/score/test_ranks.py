@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
-from robomme_interference_data.evaluate.score.comparisons.pairs import corrected
+from robomme_interference_data.evaluate.score.comparisons.tables import corrected
 from robomme_interference_data.evaluate.score.report.headline import headline
-from robomme_interference_data.stats.intervals import combined, newcombe, newcombe_paired
+from robomme_interference_data.stats.intervals import mover_interval, newcombe, newcombe_paired
 from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
 
 # Of 24 episodes: 12, 11, 6 and 5, each a part of the one before.
@@ -126,7 +126,7 @@ def test_which_system_falls_more(tmp_path: Path) -> None:
     changes = newcombe_paired(9, 0, 1, 10), newcombe_paired(2, 0, 8, 10)
     # Of the changes: mean product 0, means −0.05 and −0.4.
     phi = -0.05 * 0.4 / math.sqrt(0.05 * 0.95 * 0.4 * 0.6)
-    expected = combined(-0.05, changes[0], -0.4, changes[1], phi, limit=2)
+    expected = mover_interval(-0.05, changes[0], -0.4, changes[1], phi, limit=2)
     assert (row["low"], row["high"]) == pytest.approx(expected)
 
 

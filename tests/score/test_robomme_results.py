@@ -74,12 +74,9 @@ def test_every_failure_is_told(found: Score) -> None:
         for number in re.findall(r"\d+", numbers)
         if family != "MoveCube"
     }
-    rows = found.rows
-    names = ("system", "condition", "family", "episode", "status")
-    all_rows = zip(*(rows.list(name) for name in names), strict=True)
     failed = {
-        (system, condition, family, episode)
-        for system, condition, family, episode, status in all_rows
-        if status != "success" and family != "MoveCube" and condition != "no-history"
+        (row.system, row.condition, row.family, row.episode)
+        for row in found.rows
+        if row.status != "success" and row.family != "MoveCube" and row.condition != "no-history"
     }
     assert told == failed

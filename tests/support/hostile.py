@@ -28,7 +28,7 @@ from robomme_interference_data.data.embeddings import EmbeddingIndex
 from robomme_interference_data.data.questions import digest_questions, read_questions
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.run.log import read_run
-from robomme_interference_data.evaluate.score.rows.sources import read_part
+from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.storage.arrays import read_array
 from robomme_interference_data.storage.encode import decode_image
 from robomme_interference_data.storage.files import LocalFiles, read_sums
@@ -153,7 +153,7 @@ def _run(root: Path) -> None:
 def _record(root: Path) -> None:
     path = root / "run" / RUN_RECORD
     with suppress(InterferenceError):  # which is told again below
-        read_part(path, True)
+        read_rows([path], "mine", lenient=True)
     read_run(root / "run")
 
 

@@ -13,7 +13,8 @@ import typer
 from typer.testing import CliRunner
 
 from robomme_interference_data.evaluate.run.log import RunHeader
-from robomme_interference_data.evaluate.score import Against, Grid, Settings, commands
+from robomme_interference_data.evaluate.score import commands
+from robomme_interference_data.evaluate.score.config import Against, Grid, Settings
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.scoring import score as compute
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table

@@ -1,26 +1,29 @@
 """Two runs, or two conditions of one, paired over the episodes that both have."""
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score import Grid, power
-from robomme_interference_data.evaluate.score.outcomes import Cube, cubes_of
-from robomme_interference_data.evaluate.score.rows.checked import Rows, read_rows
+from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, outcomes_of
+from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows
 from robomme_interference_data.evaluate.score.rows.values import unshifted
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Table, percent
 
-from .pairs import COLUMNS, Pairs, how_to_read, pair, tested
+from .contrast import Contrast
+from .pairs import Pairs, pair
+from .tables import TEST, TableSpec, comparison_table
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """A paired comparison of two runs.
+class RunComparison:
+    """Two runs, compared.
 
     Attributes:
         table: A row per condition, or for the two that are compared, then the same by family.
@@ -40,7 +43,7 @@ def compare(
     systems: tuple[str | None, str | None] = (None, None),
     lenient: bool = False,
     conditions: Sequence[str] = (),
-) -> Comparison:
+) -> RunComparison:
     """Compare two runs of one simulator over the conditions and episodes that both have.
 
     A system that both runs hold is compared with itself, as a repeat is. If they hold none in
@@ -55,104 +58,103 @@ def compare(
         lenient: Leave bad rows out, and count them.
         conditions: The condition of the first and that of the second; none compares each
             condition with itself.
-
-    Raises:
-        InvalidOptionError: They have no simulator, system, condition or episode in common, or
-            there is nothing to compare a single run with.
-        BadRowsError: Rows are bad.
     """
+    _check_arguments(first, second, conditions)
+    one = read_rows([first], systems[0], lenient)
+    other = one if second is None else read_rows([second], systems[1], lenient)
+    _check_scenes(one, other)
+    sides = [_sides(rows) for rows in (one, other)]
+    matched = list(_matched((one, other), sides))
+    notes = list(_differing(one, other, matched))
+    found = list[Contrast]()
+    for a, b in matched:
+        both = [(c, c) for c in a.conditions if c in b.conditions]
+        if conditions:
+            both = [two for two in [(conditions[0], conditions[1])] if a.has(two[0], b, two[1])]
+        whole = {two: _pairs(a, b, two, "") for two in both}
+        for family in ("", *FAMILIES):
+            for two in both:
+                pairs = _pairs(a, b, two, family) if family else whole[two]
+                if pairs.n:
+                    names = (a.outcomes.simulator, b.system, two[1], (a.system, two[0]), "compare")
+                    complete = a.complete(two[0]) and b.complete(two[1])
+                    found.append(Contrast(*names, pairs, complete, family=family))
+        if a.repeats(b, one, other) and not conditions:
+            notes += _noise(a, b, {c: pairs for (c, _), pairs in whole.items()})
+    if not found:
+        runs = " and ".join(str(path) for path in (first, second) if path)
+        under = " and ".join(conditions) or "a common condition"
+        existing = [
+            "; ".join(f"{b.system}: {', '.join(b.conditions)}" for b in one.values())
+            for one in sides
+        ]
+        raise InvalidOptionError(
+            f"no episode of {runs} counts on both sides under {under}",
+            f"There are {' and '.join(dict.fromkeys(existing))}. Compare the same episodes.",
+        )
+    notes += _left_out("a", sides[0].values(), dict(matched), conditions)
+    notes += _left_out("b", sides[1].values(), {b: a for a, b in matched}, conditions[::-1])
+    spec = TableSpec(
+        "Two runs compared" if second else "Two conditions compared",
+        "simulator system_a=against_system system_b=system family condition_a=against_condition "
+        f"condition_b=condition n rate_a=against_rate rate_b=rate difference {TEST} complete",
+        "Over the n episodes that count in both; the difference is b − a, gained and lost are from "
+        "a to b. {how}",
+        lambda c: (c.simulator, bool(c.family)),
+        "the rows of all families, and those of single ones, of a simulator",
+        before=f"a: {first}; b: {second or first}. ",
+    )
+    table = comparison_table("compare", found, spec)
+    return RunComparison(table, tuple(notes), (one,) if other is one else (one, other))
+
+
+def _check_arguments(first: Path, second: Path | None, conditions: Sequence[str]) -> None:
+    command = f"compare {shlex.quote(str(first))} --conditions k0,k7"
     if len(conditions) not in (0, 2) or (second is None and len({*conditions}) < 2):
         raise InvalidOptionError(
             f"conditions to compare: {' '.join(conditions) or 'none'}; expected two different "
             "ones, or two runs",
-            f"To set k7 against k0 of one run: compare {first} --conditions k0,k7",
+            "Compare k7 with k0 of one run:",
+            command,
         )
     for name in conditions:
         parse_condition(name)
     if second is not None and first.exists() and second.exists() and first.samefile(second):
         raise InvalidOptionError(
             f"{first} is given twice",
-            f"To set two conditions of it against each other: compare {first} --conditions k0,k7",
+            "Compare two conditions of it:",
+            command,
         )
-    one = read_rows([first], systems[0], lenient)
-    other = one if second is None else read_rows([second], systems[1], lenient)
-    _check_scenes(one, other)
-    sides = [_sides(rows) for rows in (one, other)]
-    met = list(_met((one, other), sides))
-    notes, own = list(_differing(one, other, met)), list[tuple[str, ...]]()
-    found = list[tuple[Pairs, Hashable, bool]]()
-    for a, b in met:
-        common = _asked(a, b, conditions)
-        pairs = {(part, two): _pairs(a, b, two, part) for part in ("", *FAMILIES) for two in common}
-        for (part, two), here in pairs.items():
-            if here.n:
-                own.append((a.cube.simulator, a.system, b.system, part or "all", *two))
-                complete = a.complete(two[0]) and b.complete(two[1])
-                found.append((here, (a.cube.simulator, bool(part)), complete))
-        if a.repeats(b, one, other) and not conditions:
-            notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in common})
-    if not found:
-        runs = " and ".join(str(path) for path in (first, second) if path)
-        under = " and ".join(conditions) or "a common condition"
-        there = [
-            "; ".join(f"{b.system}: {', '.join(b.conditions)}" for b in one.values())
-            for one in sides
-        ]
-        raise InvalidOptionError(
-            f"no episode of {runs} counts on both sides under {under}",
-            f"There are {' and '.join(dict.fromkeys(there))}. Compare the same episodes.",
-        )
-    notes += _left_out("a", sides[0].values(), dict(met), conditions)
-    notes += _left_out("b", sides[1].values(), {b: a for a, b in met}, conditions[::-1])
-    table = Table.make(
-        "compare",
-        "Two runs compared" if second else "Two conditions compared",
-        "simulator system_a system_b family condition_a condition_b n:count rate_a:rate "
-        f"rate_b:rate difference:points {COLUMNS} complete:flag",
-        (
-            (*names, pairs.n, pairs.first, pairs.second, *test, complete)
-            for names, (pairs, _, complete), test in zip(own, found, tested(found), strict=True)
-        ),
-        f"a: {first}; b: {second or first}. Over the n episodes that count in both; the difference "
-        "is b − a, gained and lost are from a to b. "
-        + how_to_read(found, "the rows of all families, and those of single ones, of a simulator")
-        + power.note(one[0] for one, names in zip(found, own, strict=True) if "all" in names),
-    )
-    return Comparison(table, tuple(notes), (one,) if other is one else (one, other))
-
-
-def _asked(a: "_Side", b: "_Side", conditions: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the condition of each side in every comparison of two systems."""
-    if conditions:
-        one, other = conditions
-        return [(one, other)] if one in a.conditions and other in b.conditions else []
-    return [(c, c) for c in a.conditions if c in b.conditions]
 
 
 @dataclass(frozen=True, eq=False)
 class _Side:
     """One system in one simulator of a run."""
 
-    cube: Cube
+    outcomes: Outcomes
     system: str
 
     @property
     def conditions(self) -> list[str]:
-        return self.cube.ran(self.system)
+        return self.outcomes.ran(self.system)
+
+    def has(self, condition: str, other: "_Side", others: str) -> bool:
+        return condition in self.conditions and others in other.conditions
 
     def complete(self, condition: str) -> bool:
-        return bool(self.cube.complete[self.cube.cell(self.system, condition)])
+        return bool(self.outcomes.complete[self.outcomes.cell(self.system, condition)])
 
     def repeats(self, other: "_Side", rows: Rows, others: Rows) -> bool:
         """Whether another run's side is the same system, in the same scenes and histories."""
-        name = self.cube.simulator
-        same = (self.system, name) == (other.system, other.cube.simulator)
+        name = self.outcomes.simulator
+        same = (self.system, name) == (other.system, other.outcomes.simulator)
         return same and rows.revisions.get(name) == others.revisions.get(name)
 
     def counted(self, condition: str) -> set[EpisodeId]:
         if condition not in self.conditions:
             return set()
-        return {*self.cube.chosen(self.cube.counted[self.cube.cell(self.system, condition)])}
+        cell = self.outcomes.cell(self.system, condition)
+        return {*self.outcomes.chosen(self.outcomes.counted[cell])}
 
 
 _Sides = dict[tuple[str, str], _Side]
@@ -160,13 +162,14 @@ _Sides = dict[tuple[str, str], _Side]
 
 def _sides(rows: Rows) -> _Sides:
     """Return the systems of a run by simulator and name, in the order of tables."""
-    cubes = cubes_of(rows, Grid.GIVEN).values()
     return {
-        (cube.simulator, system): _Side(cube, system) for cube in cubes for system in cube.systems
+        (simulator, system): _Side(outcomes, system)
+        for simulator, outcomes in outcomes_of(rows, Grid.GIVEN).items()
+        for system in outcomes.systems
     }
 
 
-def _met(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side, _Side]]:
+def _matched(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side, _Side]]:
     """Yield what is compared, simulator by simulator, in the order of tables."""
     simulators, systems = ([rows.names(name) for rows in runs] for name in ("simulator", "system"))
     shared = {name: name for name in simulators[0] if name in simulators[1]}
@@ -192,12 +195,11 @@ def _met(runs: Sequence[Rows], sides: Sequence[_Sides]) -> Iterator[tuple[_Side,
 
 def _check_scenes(one: Rows, other: Rows) -> None:
     """Check that the two runs' scenes are the same: an episode's seed is one."""
-    names = ("simulator", "family", "episode_split", "episode", "seed")
     known, found = (
         {
-            (unshifted(row[0]), *row[1:-1]): row[-1]
-            for row in zip(*map(rows.list, names), strict=True)
-            if row[-1] is not None
+            (unshifted(row.simulator), row.family, row.episode_split, row.episode): row.seed
+            for row in rows
+            if row.seed is not None
         }
         for rows in (one, other)
     )
@@ -212,21 +214,23 @@ def _check_scenes(one: Rows, other: Rows) -> None:
 
 def _pairs(a: _Side, b: _Side, conditions: tuple[str, str], family: str) -> Pairs:
     """Compare two sides, each under its condition, over shared episodes, all or a family's."""
-    places = [{one: at for at, one in enumerate(side.cube.episodes)} for side in (a, b)]
+    places = [{one: at for at, one in enumerate(side.outcomes.episodes)} for side in (a, b)]
     shared = [one for one in places[0] if one in places[1] and family in ("", one.family)]
     first, second = (
-        side.cube.status[side.cube.cell(side.system, condition)][[at[one] for one in shared]]
+        side.outcomes.status[side.outcomes.cell(side.system, condition)][
+            [at[one] for one in shared]
+        ]
         for side, condition, at in zip((a, b), conditions, places, strict=True)
     )
     # Model seeds that the runs share are paired; if they share none, the lowest with the lowest.
-    seeds = a.cube.model_seeds, b.cube.model_seeds
+    seeds = a.outcomes.model_seeds, b.outcomes.model_seeds
     matched = [(seeds[0].index(one), seeds[1].index(one)) for one in seeds[0] if one in seeds[1]]
     matched = matched or [(place, place) for place in range(min(map(len, seeds)))]
     return pair(first, second, matched)
 
 
-def _differing(one: Rows, other: Rows, met: Iterable[tuple[_Side, _Side]]) -> Iterator[str]:
-    names = dict.fromkeys((a.cube.simulator, b.cube.simulator) for a, b in met)
+def _differing(one: Rows, other: Rows, matched: Iterable[tuple[_Side, _Side]]) -> Iterator[str]:
+    names = dict.fromkeys((a.outcomes.simulator, b.outcomes.simulator) for a, b in matched)
     for two in names:
         if two[0] != two[1]:
             yield (
@@ -258,9 +262,10 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
                 f"{condition} {percent(here.flips)} of {here.pairs} "
                 f"(95% interval {100 * low:.1f} to {100 * high:.1f})"
             )
-    other = "other" if set(a.cube.model_seeds).isdisjoint(b.cube.model_seeds) else "the same"
+    apart = set(a.outcomes.model_seeds).isdisjoint(b.outcomes.model_seeds)
     note = (
-        f"{a.system} ran in both, with {other} model seeds, in {a.cube.simulator}. If nothing else "
+        f"{a.system} ran in both, with {'other' if apart else 'the same'} model seeds, in "
+        f"{a.outcomes.simulator}. If nothing else "
         "differs, this share of episodes flips by itself, which is the noise floor: "
         f"{', '.join(shares)}."
     )
@@ -268,7 +273,7 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
 
 
 def _left_out(
-    name: str, sides: Iterable[_Side], met: Mapping[_Side, _Side], conditions: Sequence[str]
+    name: str, sides: Iterable[_Side], matched: Mapping[_Side, _Side], conditions: Sequence[str]
 ) -> list[str]:
     """Say what one run has and the comparison leaves out, nothing if that is nothing.
 
@@ -276,9 +281,9 @@ def _left_out(
     """
     parts = []
     for side in sides:
-        other = met[side].counted if side in met else (lambda condition: set())
-        own = [tuple(conditions)] if conditions else [(c, c) for c in side.conditions]
-        counts = {c: len(side.counted(c) - other(there)) for c, there in own}
+        other = matched[side].counted if side in matched else (lambda condition: set())
+        both = [tuple(conditions)] if conditions else [(c, c) for c in side.conditions]
+        counts = {c: len(side.counted(c) - other(others)) for c, others in both}
         if lone := ", ".join(f"{c} ({count:,})" for c, count in counts.items() if count):
-            parts.append(f"{side.system} in {side.cube.simulator}, {lone}")
+            parts.append(f"{side.system} in {side.outcomes.simulator}, {lone}")
     return [f"Only in {name}, and left out (episodes): {'; '.join(parts)}."] if parts else []

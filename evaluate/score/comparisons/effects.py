@@ -5,40 +5,41 @@ episode is what is drawn in the bootstrap.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Cube, counting, success
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting, success
 from robomme_interference_data.schema.conditions import NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import (
-    LEAST,
+    MIN_EPISODES,
     Floats,
     Interval,
     bootstrap,
-    enough,
     slope_weights,
+    varies_enough,
 )
 from robomme_interference_data.stats.intervals import fieller, wilson
-from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.tables import Table
 
-from .contrasts import START, Contrast, asked
+from .contrast import START, Contrast, comparable
 from .pairs import pair
 
 
 def effects_of(
-    cube: Cube, system: str, base: str | None, ceiling: str | None, draws: int
+    outcomes: Outcomes, system: str, base: str | None, ceiling: str | None, draws: int
 ) -> tuple[list[Contrast], list[tuple[Any, ...]]]:
     """Compare a system's conditions with each other, all intervals from the same draws.
 
-    Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as `QUESTIONS` has
+    Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as `COMPARISONS` has
     it, and under each condition a system with retrieval with the one without, and any with the
     ceiling of its memory.
 
     Args:
-        cube: What came of the rollouts.
+        outcomes: What came of the rollouts.
         system: Name of the system.
         base: For a system with retrieval the one without: its `no-history` is both systems'. None
             if the two are not paired.
@@ -48,57 +49,49 @@ def effects_of(
     Returns:
         The comparisons, and the row of `decay_table`, if there are at least two `k<n>`.
     """
-    cells = [(name, c) for name in (system, base, ceiling) if name for c in cube.ran(name)]
+    cells = [(name, c) for name in (system, base, ceiling) if name for c in outcomes.ran(name)]
     at = {cell: place for place, cell in enumerate(cells)}
-    here = np.logical_or.reduce([cube.there[cube.systems.index(n)] for n in (system, base) if n])
-    sides = [cube.status[cube.cell(*cell)][here] for cell in cells]
+    own = [outcomes.there[outcomes.systems.index(name)] for name in (system, base) if name]
+    here = np.logical_or.reduce(own)
+    sides = [outcomes.status[outcomes.cell(*cell)][here] for cell in cells]
     values = np.stack([success(side) for side in sides], axis=1)
-    complete = [bool(cube.complete[cube.cell(*cell)]) for cell in cells]
+    complete = [bool(outcomes.complete[outcomes.cell(*cell)]) for cell in cells]
 
-    own = cube.ran(system)
-    ks = [c for c in own if parse_condition(c).kind.name == "k"]
+    ran = outcomes.ran(system)
+    ks = [c for c in ran if parse_condition(c).kind.name == "k"]
     later = [c for c in ks if c != START] if START in ks else []
     floors = ((name, NO_HISTORY) for name in (system, base) if name)
     floor = next((one for one in floors if one in at), None)
     compared = {(c, floor): "lift" for c in ks if floor}
     compared |= {(c, (system, START)): "effects" for c in later}
-    compared |= {(c, (base, c)): "effects" for c in own if base and (base, c) in at}
+    compared |= {(c, (base, c)): "effects" for c in ran if base and (base, c) in at}
     compared |= {(c, (base, START)): "equivalence" for c in later if base and (base, START) in at}
-    compared |= {(c, there): "interference" for c, there in asked(system, own, floor)}
-    compared |= {(c, (ceiling, c)): "ceiling" for c in own if ceiling and (ceiling, c) in at}
-    pairs = {(c, there): pair(sides[at[there]], sides[at[system, c]]) for c, there in compared}
+    compared |= {(c, there): "interference" for c, there in comparable(system, ran, floor)}
+    compared |= {(c, (ceiling, c)): "ceiling" for c in ran if ceiling and (ceiling, c) in at}
+    found = {}
+    for (c, there), table in compared.items():
+        pairs, both = pair(sides[at[there]], sides[at[system, c]]), (at[there], at[system, c])
+        whole = all(complete[place] for place in both)
+        found[c, there] = Contrast(outcomes.simulator, system, c, there, table, pairs, whole)
     # A lift that is not above zero beyond doubt is nothing to have a share of.
-    lift = pairs.get((START, floor)) if floor else None
-    kept = {}
-    if floor and lift and lift.change.value > 0 and lift.p < SURE:
+    lift = found.get((START, floor)) if floor else None
+    if floor and lift and lift.pairs.change.value > 0 and lift.pairs.p < ALPHA:
         for c in later:
-            three = _together(values, (at[floor], at[system, START], at[system, c]))
-            none, start = pairs[c, floor], pairs[c, (system, START)]
-            kept[c, floor] = (retained(three, none.change, start.change), len(three))
-    contrasts = [
-        Contrast(
-            *(cube.simulator, system, c, there, table, pairs[c, there]),
-            complete[at[there]] and complete[at[system, c]],
-            *kept.get((c, there), ()),
-        )
-        for (c, there), table in compared.items()
-    ]
+            three = values[:, [at[floor], at[system, START], at[system, c]]]
+            three = three[~np.isnan(three).any(axis=1)]
+            none, start = found[c, floor], found[c, (system, START)].pairs
+            kept = retained(three, none.pairs.change, start.change)
+            found[c, floor] = replace(none, retention=kept, retention_n=len(three))
     decays = []
     if len(ks) > 1:
         falling = [at[system, c] for c in ks]
         each = values[:, falling] @ slope_weights([parse_condition(c).k for c in ks])
-        [fall] = bootstrap(each[:, None], cube.simulator, draws)
+        [fall] = bootstrap(each[:, None], outcomes.simulator, draws)
         changing = each[~np.isnan(each)]
-        known = fall if enough(changing) else Interval(fall.value)
+        known = fall if varies_enough(changing) else Interval(fall.value)
         whole = all(complete[place] for place in falling)
-        decays.append((cube.simulator, system, " ".join(ks), len(changing), *known, whole))
-    return contrasts, decays
-
-
-def _together(values: Floats, places: Sequence[int]) -> Floats:
-    """Return some columns, of the episodes that count in all of them."""
-    chosen = values[:, list(places)]
-    return chosen[~np.isnan(chosen).any(axis=1)]
+        decays.append((outcomes.simulator, system, " ".join(ks), len(changing), *known, whole))
+    return list(found.values()), decays
 
 
 def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
@@ -143,23 +136,23 @@ def decay_table(rows: Iterable[tuple[Any, ...]]) -> Table:
         rows,
         "slope: change of the success rate with each doubling of the sessions in the buffer, the "
         "lesson included: the least-squares line over log2(k + 1). 95% BCa bootstrap interval, "
-        f"clustered by episode, where at least {LEAST} episodes add to the slope.",
+        f"clustered by episode, where at least {MIN_EPISODES} episodes add to the slope.",
     )
 
 
-def noise_table(cubes: Iterable[Cube]) -> Table:
+def noise_table(every: Iterable[Outcomes]) -> Table:
     """Return how often two repeats of the same rollout disagree, where there are repeats."""
     rows = []
-    for cube in cubes:
-        for s, c in np.argwhere(cube.has_rows).tolist():
-            status = cube.status[s, c]
+    for outcomes in every:
+        for s, c in np.argwhere(outcomes.has_rows).tolist():
+            status = outcomes.status[s, c]
             counts = counting(status)
             order = counts.cumsum(axis=-1) * counts  # 1 for the lowest model seed that counts, …
             repeated = (order == 2).any(axis=-1)
             if pairs := int(repeated.sum()):
                 one, other = (((order == n) & (status == 0)).any(axis=-1) for n in (1, 2))
                 flips = int((one != other)[repeated].sum())
-                cell = (cube.simulator, cube.systems[s], cube.conditions[c])
+                cell = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c])
                 rows.append((*cell, pairs, flips, flips / pairs, *wilson(flips, pairs)))
     return Table.make(
         "noise",

@@ -2,23 +2,25 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score.outcomes import Cube, success
-from robomme_interference_data.stats.bootstrap import LEAST, Floats, enough, generator_of
-from robomme_interference_data.viz.tables import Provisional, Table
-
-from .contrasts import Contrast
-from .pairs import (
-    COLUMNS,
-    corrected,
-    how_to_read,
-    pair,
-    tested,
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, success
+from robomme_interference_data.stats.bootstrap import (
+    MIN_EPISODES,
+    Floats,
+    generator_of,
+    varies_enough,
 )
+from robomme_interference_data.viz.tables import Table
+
+from .contrast import Contrast
+from .pairs import pair
+from .tables import CELLS, TableSpec, comparison_table, corrected, provisional
 
 DRAWS = 2000
 """Permutations, and draws of families and episodes."""
@@ -28,80 +30,66 @@ _CHUNK = 2**18  # numbers that are dealt out at a time
 _TABLES = ("lift", "effects", "interference")
 
 
-def family_effects_table(cubes: Iterable[Cube], contrasts: Sequence[Contrast]) -> Table:
-    """Return each comparison of conditions in each family."""
-    own, tests = [], []
-    for cube in cubes:
-        parts = {name: cube.of_family(name) for name in FAMILIES}
-        for one in _of(cube, contrasts):
-            cells = [cube.cell(*one.against), cube.cell(one.system, one.condition)]
-            for name, here in parts.items():
-                pairs = pair(*(cube.status[cell][here] for cell in cells))
-                if pairs.n:
-                    whole = not any((cube.missing | cube.other)[c][here].any() for c in cells)
-                    names = (cube.simulator, one.system, one.condition, *one.against, name)
-                    own.append((*names, pairs.n, pairs.second, pairs.first))
-                    tests.append((pairs, cube.simulator, whole))
-    rows = (
-        (*names, *test, complete)
-        for names, test, (_, _, complete) in zip(own, tested(tests), tests, strict=True)
-    )
-    return Table.make(
-        "family_effects",
-        "Effects by family",
-        "simulator system condition against_system against_condition family n:count rate:rate "
-        f"against_rate:rate difference:points {COLUMNS} complete:flag",
-        rows,
-        "The lifts, effects and kinds of interference of the tables of those names, in each family "
-        "alone, over the n episodes that count on both sides. "
-        + how_to_read(tests, "the tests of this table in one simulator"),
-    )
+def family_effects(outcomes: Outcomes, contrasts: Sequence[Contrast]) -> Iterator[Contrast]:
+    """Yield each comparison of conditions again, in each family alone."""
+    parts = {name: outcomes.of_family(name) for name in FAMILIES}
+    wrong = outcomes.missing | outcomes.other
+    for one in _of(outcomes, contrasts):
+        cells = [outcomes.cell(*one.against), outcomes.cell(one.system, one.condition)]
+        for name, here in parts.items():
+            pairs = pair(*(outcomes.status[cell][here] for cell in cells))
+            if pairs.n:
+                names = (one.simulator, one.system, one.condition, one.against)
+                whole = not any(wrong[cell][here].any() for cell in cells)
+                yield Contrast(*names, "family_effects", pairs, whole, family=name)
 
 
-def families_table(cubes: Iterable[Cube], contrasts: Sequence[Contrast]) -> Table:
+_SPEC = TableSpec(
+    "Effects over families",
+    f"{CELLS} n families:count difference alike:points alike_low:points alike_high:points "
+    "sample_low:points sample_high:points p_families:p p_families_holm:p complete",
+    "difference: over all episodes, as in the other tables and the headline, which speak of "
+    "these families as they are. alike: the mean of the families' own differences. alike_low "
+    "to alike_high: 95% bootstrap interval of it for these families, episodes drawn within "
+    "each. sample_low to sample_high: the same where families are drawn too, as a sample of "
+    "such families: what holds for tasks beyond these, and much wider; of so few families "
+    f"still too narrow. Both from {DRAWS:,} draws, where at least {MIN_EPISODES} episodes differ. "
+    "p_families: whether the difference is another one in other families, by a permutation "
+    f"test of {DRAWS:,} draws; p_families_holm: corrected by Holm's method within a simulator.",
+    power=False,
+)
+_OVER = ("alike", "alike_low", "alike_high", "sample_low", "sample_high", "p_families")
+
+
+def families_table(every: Iterable[Outcomes], contrasts: Sequence[Contrast]) -> Table:
     """Return each comparison with families weighing alike, and whether it differs over them."""
-    rows = []
-    for cube in cubes:
-        found = _of(cube, contrasts)
-        labels = np.array([FAMILIES.index(one.family) for one in cube.episodes])
-        values = [
-            success(cube.status[cube.cell(one.system, one.condition)])
-            - success(cube.status[cube.cell(*one.against)])
-            for one in found
-        ]
-        shown = [n for n, one in enumerate(values) if len({*labels[~np.isnan(one)].tolist()}) > 1]
-        if not shown:
+    shown, more = list[Contrast](), list[dict[str, Any]]()
+    for outcomes in every:
+        labels = np.array([FAMILIES.index(one.family) for one in outcomes.episodes])
+        found = []
+        for one in _of(outcomes, contrasts):
+            sides = (one.against, (one.system, one.condition))
+            before, after = (success(outcomes.status[outcomes.cell(*side)]) for side in sides)
+            families = {*labels[~np.isnan(after - before)].tolist()}
+            if len(families) > 1:
+                found.append((one, after - before, len(families)))
+        if not found:
             continue
-        numbers = over_families(
-            np.stack([values[n] for n in shown], axis=1), labels, cube.simulator
-        )
-        holms = corrected([float(p) for *_, p in numbers], [0] * len(shown))
-        for n, (*told, p), p_holm in zip(shown, numbers, holms, strict=True):
-            one, known = found[n], ~np.isnan(values[n])
-            ps = [q if one.complete else Provisional(q) for q in (p, p_holm)]
-            counts = (int(known.sum()), len({*labels[known].tolist()}))
-            names = (cube.simulator, one.system, one.condition, *one.against)
-            rows.append((*names, *counts, one.pairs.change.value, *told, *ps, one.complete))
-    return Table.make(
-        "families",
-        "Effects over families",
-        "simulator system condition against_system against_condition n:count families:count "
-        "difference:points alike:points alike_low:points alike_high:points sample_low:points "
-        "sample_high:points p_families:p p_families_holm:p complete:flag",
-        rows,
-        "difference: over all episodes, as in the other tables and the headline, which speak of "
-        "these families as they are. alike: the mean of the families' own differences. alike_low "
-        "to alike_high: 95% bootstrap interval of it for these families, episodes drawn within "
-        "each. sample_low to sample_high: the same where families are drawn too, as a sample of "
-        "such families: what holds for tasks beyond these, and much wider; of so few families "
-        f"still too narrow. Both from {DRAWS:,} draws, where at least {LEAST} episodes differ. "
-        "p_families: whether the difference is another one in other families, by a permutation "
-        f"test of {DRAWS:,} draws; p_families_holm: corrected by Holm's method within a simulator.",
-    )
+        values = np.stack([differences for _, differences, _ in found], axis=1)
+        numbers = over_families(values, labels, outcomes.simulator)
+        holms = corrected([float(p) for *_, p in numbers], [0] * len(found))
+        for (one, _, count), told, p_holm in zip(found, numbers, holms, strict=True):
+            ps = {"p_families": told[-1], "p_families_holm": p_holm}
+            ps = {name: provisional(p, one.complete) for name, p in ps.items()}
+            more.append({"families": count, **dict(zip(_OVER, told, strict=True)), **ps})
+            shown.append(replace(one, table="families"))
+    return comparison_table("families", shown, _SPEC, more)
 
 
-def _of(cube: Cube, contrasts: Iterable[Contrast]) -> list[Contrast]:
-    return [one for one in contrasts if one.simulator == cube.simulator and one.table in _TABLES]
+def _of(outcomes: Outcomes, contrasts: Iterable[Contrast]) -> list[Contrast]:
+    return [
+        one for one in contrasts if one.simulator == outcomes.simulator and one.table in _TABLES
+    ]
 
 
 def over_families(
@@ -170,7 +158,7 @@ def _over(
         bounds = np.concatenate(intervals)[:, n].tolist()
         yield (
             float(alike[n]),
-            *(bounds if enough(column) else [math.nan] * len(bounds)),
+            *(bounds if varies_enough(column) else [math.nan] * len(bounds)),
             float(p[n]),
         )
 

@@ -2,69 +2,62 @@
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Cube, Flags, Statuses, success
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, Statuses, success
 from robomme_interference_data.evaluate.systems import base_of, is_bound
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
-from robomme_interference_data.stats.intervals import combined
+from robomme_interference_data.stats.intervals import mover_interval
 from robomme_interference_data.stats.significance import sign_flip
 
-from .contrasts import START, Contrast
+from .contrast import START, Contrast
 from .pairs import NO_PAIRS, Pairs, pair
 from .ranks import ranked, to_best
 
 
-def interactions_of(cube: Cube) -> list[Contrast]:
+def interactions_of(outcomes: Outcomes) -> list[Contrast]:
     """Compare the change of systems from k0 with that of the best at k0, and of their base.
 
     The change is to the most sessions under which both have rows. Systems whose histories may
     differ are left out, and so are bounds.
     """
-    leader = _leader(cube)
+    leader = _leader(outcomes)
     found = []
-    for system in cube.systems:
+    for system in outcomes.systems:
         if is_bound(system):
             continue
         others = dict.fromkeys(one for one in (leader, base_of(system)) if one and one != system)
         for other in others:
-            if other in cube.systems and cube.pairable(system, other):
-                found += _contrasts(cube, system, other)
+            if other in outcomes.systems and outcomes.pairable(system, other):
+                found += _contrasts(outcomes, system, other)
     return found
 
 
-def _leader(cube: Cube) -> str | None:
+def _leader(outcomes: Outcomes) -> str | None:
     """Return the system that leads at k0, None where no cell there is complete."""
-    systems = dict(ranked(cube)).get(START)
+    systems = dict(ranked(outcomes)).get(START)
     if not systems:
         return None
-    every: Flags = np.ones(len(cube.episodes), bool)
-    compared = to_best(cube, START, systems, every)
+    compared = to_best(outcomes, START, systems, np.ones(len(outcomes.episodes), bool))
     return next(system for system, pairs in compared.items() if pairs is None)
 
 
-def _contrasts(cube: Cube, system: str, other: str) -> list[Contrast]:
-    common = [parse_condition(c) for c in cube.ran(system) if c in cube.ran(other)]
-    ks = sorted(one.k for one in common if one.kind.name == "k")
-    if len(ks) < 2 or ks[0]:
+def _contrasts(outcomes: Outcomes, system: str, other: str) -> list[Contrast]:
+    common = [parse_condition(c) for c in outcomes.ran(system) if c in outcomes.ran(other)]
+    ks = {one.k: one.name for one in common if one.kind.name == "k"}
+    if len(ks) < 2 or 0 not in ks:
         return []
-    last = next(one.name for one in common if one.kind.name == "k" and one.k == ks[-1])
-    places = [cube.cell(name, c) for name in (other, system) for c in (START, last)]
-    sides = np.stack([cube.status[place] for place in places])
-    pairs = changes(sides[:2], sides[2:])
-    complete = all(bool(cube.complete[place]) for place in places)
-    against = (other, last)
-    return [
-        Contrast(
-            *(cube.simulator, system, last, against, "interaction", pairs),
-            complete=complete,
-        )
-    ]
+    last = ks[max(ks)]
+    places = [outcomes.cell(name, c) for name in (other, system) for c in (START, last)]
+    sides = np.stack([outcomes.status[place] for place in places])
+    complete = all(bool(outcomes.complete[place]) for place in places)
+    names = (outcomes.simulator, system, last, (other, last), "interaction")
+    return [Contrast(*names, changes(sides[:2], sides[2:]), complete)]
 
 
 def changes(first: Statuses, second: Statuses) -> Pairs:
     """Compare the change of one side with that of another, over the episodes that count in all.
 
-    The interval is `combined` of both changes' own, with the correlation of the changes over
+    The interval is `mover_interval` of both changes' own, with the correlation of the changes over
     episodes; the test is the exact sign-flip test of the episodes' differences of differences.
 
     Args:
@@ -86,7 +79,7 @@ def changes(first: Statuses, second: Statuses) -> Pairs:
     phi = float(((old - old.mean()) * (new - new.mean())).mean()) / spread if spread else 0.0
     gap = round(other.change.value - one.change.value, 12)
     change, within = (
-        Interval(gap, *combined(b.value, (b.low, b.high), a.value, (a.low, a.high), phi, 2.0))
+        Interval(gap, *mover_interval(b.value, (b.low, b.high), a.value, (a.low, a.high), phi, 2.0))
         for a, b in ((one.change, other.change), (one.within, other.within))
     )
     steps = (new - old).round(12)

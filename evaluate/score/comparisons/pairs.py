@@ -1,9 +1,8 @@
 """Two sides of a comparison, paired over the episodes that count on both."""
 
 import math
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,19 +10,12 @@ from robomme_interference_data.evaluate.score.outcomes import Statuses, counting
 from robomme_interference_data.stats.bootstrap import Floats, Interval
 from robomme_interference_data.stats.intervals import (
     LEVEL,
-    combined,
+    mover_interval,
     newcombe,
     newcombe_paired,
     wilson,
 )
-from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
-from robomme_interference_data.viz.tables import Provisional
-
-COLUMNS = (
-    "low:points high:points interval pairs:count gained:count lost:count flips:rate "
-    "p:p p_mid:p p_holm:p"
-)
-"""Columns of a table of comparisons, after the difference (see `tested`)."""
+from robomme_interference_data.stats.significance import mcnemar, sign_flip, two_proportions
 
 WITHIN = 0.90
 """Level of the interval that lies within a margin where two one-sided tests at 5% say so."""
@@ -61,6 +53,11 @@ class Pairs:
     lost: int
     p: float
     p_mid: float
+
+    @property
+    def paired(self) -> bool:
+        """Whether both sides had the same histories."""
+        return self.interval != "unpaired"
 
     @property
     def flips(self) -> float:
@@ -133,70 +130,13 @@ def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
     phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
     worth = [trials(side) for side in (first, second)]
     old, new = (wilson(r * m, m, level) for r, m in zip((before, after), worth, strict=True))
-    return Interval(round(after - before, 12), *combined(after, new, before, old, phi))
+    return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
 
 
-def apart(sides: Sequence[tuple[float, float, int]]) -> Pairs:
+def compare_unpaired(sides: Sequence[tuple[float, float, int]]) -> Pairs:
     """Compare two sides that cannot be paired: rate, trials that it is worth, and episodes."""
     (first, worth, n), (second, other_worth, m) = sides
     counts = (second * other_worth, other_worth, first * worth, worth)
     gap, p = round(second - first, 12), two_proportions(*counts)
     change, within = (Interval(gap, *newcombe(*counts, level)) for level in (LEVEL, WITHIN))
     return Pairs(min(n, m), first, second, change, within, "unpaired", 0, 0, 0, p, math.nan)
-
-
-def corrected(p_values: Sequence[float], groups: Sequence[Hashable]) -> list[float]:
-    """Return p-values by Holm's method, those of one group corrected among themselves."""
-    adjusted = [math.nan] * len(p_values)
-    for group in dict.fromkeys(groups):
-        places = [place for place, one in enumerate(groups) if one == group]
-        for place, p in zip(places, holm([p_values[at] for at in places]), strict=True):
-            adjusted[place] = p
-    return adjusted
-
-
-def tested(found: Sequence[tuple[Pairs, Hashable, bool]]) -> list[tuple[Any, ...]]:
-    """Return for each comparison of a table the difference and the values of `COLUMNS`.
-
-    Args:
-        found: The comparison, the group that it is corrected in, and whether it is complete: of
-            one that is not, every p is provisional.
-    """
-    holms = corrected([pairs.p for pairs, _, _ in found], [group for _, group, _ in found])
-    rows = []
-    for (one, _, complete), p_holm in zip(found, holms, strict=True):
-        ps = [p if complete else Provisional(p) for p in (one.p, one.p_mid, p_holm)]
-        counts = (one.pairs, one.gained, one.lost) if one.interval != "unpaired" else (None,) * 3
-        rows.append((*one.change, one.interval, *counts, one.flips, *ps))
-    return rows
-
-
-def how_to_read(found: Iterable[tuple[Pairs, Hashable, bool]], groups: str) -> str:
-    """Return how a table of comparisons is to be read.
-
-    Args:
-        found: As in `tested`.
-        groups: In words, which tests are corrected among themselves.
-    """
-    found = list(found)
-    kinds = {pairs.interval for pairs, _, _ in found}
-    note = (
-        "95% intervals (interval): newcombe, Newcombe's paired score interval. p: McNemar's exact "
-        "test; p_mid: its mid-p, which is less cautious; p_holm: p corrected by Holm's method "
-        f"among {groups}. pairs: one an episode; gained and lost: those whose outcome differs; "
-        "flips: their share."
-    )
-    if "clusters" in kinds:
-        note += (
-            " With repeats (clusters) interval and p are of the episodes' means: the score "
-            "interval from Wilson's of each side by clusters, and the exact sign-flip test; pairs "
-            "are of the lowest model seed that counts on both sides."
-        )
-    if "unpaired" in kinds:
-        note += (
-            " Where histories may differ (unpaired) nothing is paired: Newcombe's hybrid score "
-            "interval, and the test of two proportions."
-        )
-    if not all(complete for _, _, complete in found):
-        note += " p†: provisional, as a cell is not complete: looking early finds too much."
-    return note

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.evaluate.score.outcomes import (
-    Cube,
     Flags,
+    Outcomes,
     counting,
     rate_of,
     success,
@@ -16,37 +16,39 @@ from robomme_interference_data.evaluate.score.outcomes import (
 )
 from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.stats.bootstrap import DRAWS, Floats, drawn_means
-from robomme_interference_data.stats.significance import SURE, holm
+from robomme_interference_data.stats.significance import ALPHA, holm
 from robomme_interference_data.viz.tables import Table
 
-from .contrasts import Contrast
-from .pairs import Pairs, apart, pair
+from .contrast import Contrast
+from .pairs import Pairs, compare_unpaired, pair
 
 
-def against(cube: Cube, condition: str, one: str, other: str, here: Flags) -> Pairs:
+def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flags) -> Pairs:
     """Compare a system with another one under a condition, unpaired where their histories differ.
 
     Args:
-        cube: What came of the rollouts.
+        outcomes: What came of the rollouts.
         condition: Name of the condition.
         one: The system; differences are its rate − the other's.
         other: The other one.
         here: The episodes that are compared, `(E,) bool`.
     """
-    sides = [cube.status[cube.cell(name, condition)][here] for name in (other, one)]
-    if cube.pairable(one, other):
+    sides = [outcomes.status[outcomes.cell(name, condition)][here] for name in (other, one)]
+    if outcomes.pairable(one, other):
         return pair(*sides)
     counted = [int(counting(side).any(-1).sum()) for side in sides]
-    return apart([(rate_of(s), trials(s), n) for s, n in zip(sides, counted, strict=True)])
+    return compare_unpaired(
+        [(rate_of(s), trials(s), n) for s, n in zip(sides, counted, strict=True)]
+    )
 
 
 def to_best(
-    cube: Cube, condition: str, systems: Sequence[str], here: Flags
+    outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
 ) -> dict[str, Pairs | None]:
     """Compare systems with the one of the highest rate, of equal ones the first.
 
     Args:
-        cube: What came of the rollouts.
+        outcomes: What came of the rollouts.
         condition: Name of the condition, under which each system has a complete cell.
         systems: Their names, in the order of tables.
         here: The episodes that are compared, `(E,) bool`.
@@ -54,74 +56,71 @@ def to_best(
     Returns:
         System to its comparison, and the best to None.
     """
-    best = max(systems, key=lambda one: rate_of(cube.status[cube.cell(one, condition)][here]))
-    return {s: None if s == best else against(cube, condition, s, best, here) for s in systems}
+    best = max(
+        systems, key=lambda one: rate_of(outcomes.status[outcomes.cell(one, condition)][here])
+    )
+    return {s: None if s == best else against(outcomes, condition, s, best, here) for s in systems}
 
 
-def cannot_be_told(compared: Mapping[str, Pairs | None]) -> set[str]:
+def tied_with_best(compared: Mapping[str, Pairs | None]) -> set[str]:
     """Return the systems that cannot be told from the best, itself included; none of one alone.
 
     Args:
         compared: As `to_best` returns it.
     """
     others = {system: pairs.p for system, pairs in compared.items() if pairs}
-    near = {s for s, p in zip(others, holm([*others.values()]), strict=True) if not p < SURE}
+    near = {s for s, p in zip(others, holm([*others.values()]), strict=True) if not p < ALPHA}
     return near | {*compared} - {*others} if others else set()
 
 
-def ranked(cube: Cube) -> Iterator[tuple[str, list[str]]]:
+def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
     """Yield each condition and the systems that are ranked in it: of complete cells, no bounds."""
-    for place, condition in enumerate(cube.conditions):
-        whole = zip(cube.systems, cube.complete[:, place], strict=True)
+    for place, condition in enumerate(outcomes.conditions):
+        whole = zip(outcomes.systems, outcomes.complete[:, place], strict=True)
         yield condition, [system for system, has in whole if has and not is_bound(system)]
 
 
-def systems_of(cube: Cube) -> list[Contrast]:
+def systems_of(outcomes: Outcomes) -> list[Contrast]:
     """Compare the ranked systems of each condition with the best, then all pairs of them.
 
     The first are of the table `systems`, the others of `matrix`: each with those after it.
     """
-    every: Flags = np.ones(len(cube.episodes), bool)
-    found, pairs = [], []
-    for condition, systems in ranked(cube):
+    every: Flags = np.ones(len(outcomes.episodes), bool)
+    found, matrix = list[Contrast](), list[Contrast]()
+    for condition, systems in ranked(outcomes):
         if len(systems) < 2:
             continue
-        compared = to_best(cube, condition, systems, every)
+
+        def contrast(
+            system: str, other: str, table: str, pairs: Pairs, condition: str = condition
+        ) -> Contrast:
+            names = (outcomes.simulator, system, condition, (other, condition))
+            return Contrast(*names, table, pairs, complete=True)
+
+        compared = to_best(outcomes, condition, systems, every)
         best = next(system for system, pairs in compared.items() if pairs is None)
-        found += [
-            _contrast(cube, condition, system, best, "systems", pairs)
-            for system, pairs in compared.items()
-            if pairs is not None
-        ]
-        pairs += [
-            _contrast(cube, condition, *two, "matrix", against(cube, condition, *two, every))
-            for two in combinations(systems, 2)
-        ]
-    return found + pairs
+        found += [contrast(s, best, "systems", pairs) for s, pairs in compared.items() if pairs]
+        for two in combinations(systems, 2):
+            pairs = against(outcomes, condition, *two, every)
+            matrix.append(contrast(*two, "matrix", pairs))
+    return found + matrix
 
 
-def _contrast(
-    cube: Cube, condition: str, system: str, other: str, table: str, pairs: Pairs
-) -> Contrast:
-    return Contrast(
-        *(cube.simulator, system, condition, (other, condition), table, pairs),
-        complete=True,
-    )
-
-
-def rank_table(cubes: Iterable[Cube], draws: int = DRAWS) -> Table:
+def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
     """Return the rank of each ranked system with the interval that draws of episodes give it."""
     rows = []
-    for cube in cubes:
-        for condition, systems in ranked(cube):
+    for outcomes in every:
+        for condition, systems in ranked(outcomes):
             if len(systems) < 2:
                 continue
-            sides = [cube.status[cube.cell(s, condition)][cube.expected] for s in systems]
-            means = drawn_means(np.stack([*map(success, sides)], axis=1), cube.simulator, draws)
+            sides = [
+                outcomes.status[outcomes.cell(s, condition)][outcomes.expected] for s in systems
+            ]
+            means = drawn_means(np.stack([*map(success, sides)], axis=1), outcomes.simulator, draws)
             rates = np.array([*map(rate_of, sides)])
             bounds = np.quantile(_ranks(means), (0.025, 0.975), axis=0, method="nearest").T
             rows += [
-                (cube.simulator, condition, system, float(rate), int(rank), int(low), int(high))
+                (outcomes.simulator, condition, system, float(rate), int(rank), int(low), int(high))
                 for system, rate, rank, (low, high) in zip(
                     systems, rates, _ranks(rates[None])[0], bounds, strict=True
                 )

@@ -17,7 +17,7 @@ from robomme_interference_data.schema.conditions import (
     in_order,
     parse_condition,
 )
-from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK, tidy
 
 from .styles import Look, looks_of
@@ -61,7 +61,7 @@ class Data:
         self.apart = {
             (one["condition"], frozenset((one["system"], one["against_system"])))
             for one in (score.tables["matrix"].records() if "matrix" in score.tables else ())
-            if one["simulator"] == simulator and one["p_holm"] < SURE
+            if one["simulator"] == simulator and one["p_holm"] < ALPHA
         }
         access = score.tables.get("access")
         self.access = [row[1:] for row in access.rows if row[0] == simulator] if access else []

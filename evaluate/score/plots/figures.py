@@ -12,7 +12,7 @@ from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
-from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK, ink_on, open_figure, save_figure
 
 from . import curves, forests
@@ -53,7 +53,7 @@ def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, 
         Name without suffix to the SVG, in the order of `FIGURES`.
     """
     drawn = {}
-    for simulator in score.cubes:
+    for simulator in score.outcomes:
         data = Data(score, simulator)
         for kind in FIGURES:
             with open_figure() as figure:
@@ -222,7 +222,8 @@ def _matrix(figure: Any, data: Data) -> bool:
         changes = {(one.system, one.against[0]): 100 * one.pairs.change.value for one in found}
         changes |= {(other, one): -change for (one, other), change in changes.items()}
         systems = sorted(
-            {one for one, _ in changes}, key=lambda s: -data.cells[s, condition, ""].rate
+            (one for one in data.systems if any(one in two for two in changes)),
+            key=lambda s: -data.cells[s, condition, ""].rate,
         )
         values = np.full((len(systems), len(systems)), np.nan)
         for y, x in combinations(range(len(systems)), 2):
@@ -233,7 +234,7 @@ def _matrix(figure: Any, data: Data) -> bool:
                 values[y, x] = change
             look: dict[str, Any] = {"weight": "bold", "color": "black"} if apart else {"color": INK}
             look |= {"ha": "center", "va": "center", "in_layout": False}
-            axes.text(x, y, f"{change:.0f}".replace("-", "−"), size=7, **look)
+            axes.text(x, y, f"{round(change) + 0:.0f}".replace("-", "−"), size=7, **look)
         axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
         labels = [data.looks[system].label for system in systems]
         axes.set_xticks(range(len(systems)), labels, size=7, rotation=90)
@@ -242,5 +243,5 @@ def _matrix(figure: Any, data: Data) -> bool:
         axes.spines[:].set_visible(False)
         axes.set_title(condition, size=9, color=INK)
     figure.suptitle(f"Row − column, points, {data.simulator}", size=10, color=INK)
-    legend(figure, f"filled and bold: told apart, p < {SURE} after Holm's correction; else not")
+    legend(figure, f"filled and bold: told apart, p < {ALPHA} after Holm's correction; else not")
     return True

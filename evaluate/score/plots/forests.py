@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
-from robomme_interference_data.evaluate.score.comparisons.contrasts import (
-    QUESTIONS,
+from robomme_interference_data.evaluate.score.comparisons.contrast import (
+    COMPARISONS,
     START,
     Contrast,
 )
 from robomme_interference_data.schema.conditions import KINDS, parse_condition
-from robomme_interference_data.stats.significance import SURE
+from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import GREY, INK, Hue, tidy
 
 from .curves import (
@@ -143,7 +143,7 @@ def retention(figure: Any, data: Data) -> bool:
     shown = {contrast.system for contrast in found}
     absent = [data.looks[system].label for system in data.systems if system not in shown]
     note = fill(
-        f"Not shown (no lift at k0 with p < {SURE}, or rows missing at {last}): "
+        f"Not shown (no lift at k0 with p < {ALPHA}, or rows missing at {last}): "
         f"{', '.join(absent)}",
         110,
     )
@@ -247,7 +247,7 @@ def _most_asked(contrasts: Iterable[Contrast]) -> dict[str, dict[str, Contrast]]
     counts = Counter(k for by_k in found.values() for k in by_k)
     most = max(counts, key=lambda k: (counts[k], k))
     shown = {}
-    for asks in (KINDS["k"].asks, *(question.asks for question in QUESTIONS.values())):
+    for asks in (KINDS["k"].asks, *(question.asks for question in COMPARISONS.values())):
         if by_k := found.get(asks):
             chosen = by_k.get(most) or by_k[max(by_k)]
             name = f"{asks}\n{chosen[0].condition} − {chosen[0].against[1]}"

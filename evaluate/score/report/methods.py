@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.evaluate.score.comparisons import families
-from robomme_interference_data.evaluate.score.outcomes import Cube
+from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.viz.templates import fill
@@ -33,7 +33,7 @@ def methods(score: Score) -> tuple[str, str]:
     }
     lifts = score.tables["lift"].records()
     values: dict[str, Any] = {
-        "parts": [_part(score, cube) for cube in score.cubes.values()],
+        "parts": [_part(score, outcomes) for outcomes in score.outcomes.values()],
         "repeats": bool(score.tables["noise"].rows),
         "tables": {name for name, table in score.tables.items() if table.rows},
         "intervals": intervals,
@@ -52,18 +52,18 @@ def methods(score: Score) -> tuple[str, str]:
     return text, "\n\n".join(chosen) + "\n"
 
 
-def _part(score: Score, cube: Cube) -> dict[str, Any]:
-    there = np.flatnonzero(cube.there.any(axis=0)).tolist()
-    cells = [one for one in score.cells if one.simulator == cube.simulator and not one.part]
+def _part(score: Score, outcomes: Outcomes) -> dict[str, Any]:
+    there = np.flatnonzero(outcomes.there.any(axis=0)).tolist()
+    cells = [one for one in score.cells if one.simulator == outcomes.simulator and not one.part]
     return {
-        "simulator": cube.simulator,
-        "asked": bool((cube.chance >= 0).any()),
-        "systems": list(map(display_name, cube.systems)),
+        "simulator": outcomes.simulator,
+        "asked": bool((outcomes.chance >= 0).any()),
+        "systems": list(map(display_name, outcomes.systems)),
         "conditions": list(dict.fromkeys(one.condition for one in cells if one.n)),
         "rollouts": sum(sum(one.counts) for one in cells),
         "episodes": len(there),
-        "families": len({cube.episodes[place].family for place in there}),
-        "seeds": len(cube.model_seeds),
+        "families": len({outcomes.episodes[place].family for place in there}),
+        "seeds": len(outcomes.model_seeds),
         "complete": sum(one.complete for one in cells),
         "cells": len(cells),
         "errors": sum(one.errors for one in cells),

@@ -16,12 +16,12 @@ import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.run.log import RunHeader
-from robomme_interference_data.evaluate.score import Grid
-from robomme_interference_data.evaluate.score.comparisons.contrasts import START
+from robomme_interference_data.evaluate.score.comparisons.contrast import START
+from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, success
 from robomme_interference_data.evaluate.score.plots.curves import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
-from robomme_interference_data.evaluate.score.rows.checked import Rows
+from robomme_interference_data.evaluate.score.rows.reading import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import SYSTEMS, display_name
 from robomme_interference_data.schema.codec import to_dict
@@ -63,10 +63,10 @@ def write_report(
     Raises:
         MissingExtraError: jinja2 is not installed.
     """
-    cubes = score.cubes.values()
-    conditions = [one.name for one in in_order({c for cube in cubes for c in cube.conditions})]
+    names = {name for one in score.outcomes.values() for name in one.conditions}
+    conditions = [one.name for one in in_order(names)]
     values = {
-        "headlines": {simulator: headline(score, simulator) for simulator in score.cubes},
+        "headlines": {simulator: headline(score, simulator) for simulator in score.outcomes},
         "grids": score.grids,
         "tables": score.tables.values(),
         "systems": _names(score),
@@ -94,7 +94,11 @@ def _number(text: str) -> str:
 def _leader(score: Score) -> str:
     """Return the system that figures set apart at first; none of few."""
     best = [c.system for c in score.cells if c.rank == 1 and not c.part and c.condition == START]
-    return best[0] if best and max(len(cube.systems) for cube in score.cubes.values()) > FEW else ""
+    return (
+        best[0]
+        if best and max(len(outcomes.systems) for outcomes in score.outcomes.values()) > FEW
+        else ""
+    )
 
 
 def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
@@ -119,7 +123,7 @@ def _part(text: str, number: int, title: str) -> str:
 
 def _names(score: Score) -> dict[str, str]:
     """Return what the systems that have rows are called."""
-    systems = {one: None for cube in score.cubes.values() for one in cube.systems}
+    systems = {one: None for outcomes in score.outcomes.values() for one in outcomes.systems}
     return {system: display_name(system) for system in systems}
 
 
@@ -135,19 +139,21 @@ def _episodes(score: Score, conditions: Sequence[str], folder: Path) -> str:
     """
     videos = _videos(score.rows)
     rows = []
-    for cube in score.cubes.values():
-        for place, system in enumerate(cube.systems):
-            counts = cube.counts[place].transpose(1, 0, 2).tolist()
-            rates = success(cube.status[place]).T.tolist()
-            for number in np.flatnonzero(cube.there[place]).tolist():
-                episode, hard = cube.episodes[number], int(cube.difficulty[number])
-                came = dict(zip(cube.conditions, counts[number], strict=True))
-                found = [videos.get((cube.simulator, system, c, str(episode))) for c in conditions]
+    for outcomes in score.outcomes.values():
+        for place, system in enumerate(outcomes.systems):
+            counts = outcomes.counts[place].transpose(1, 0, 2).tolist()
+            rates = success(outcomes.status[place]).T.tolist()
+            for number in np.flatnonzero(outcomes.there[place]).tolist():
+                episode, hard = outcomes.episodes[number], int(outcomes.difficulty[number])
+                came = dict(zip(outcomes.conditions, counts[number], strict=True))
+                found = [
+                    videos.get((outcomes.simulator, system, c, str(episode))) for c in conditions
+                ]
                 row = (
-                    *(cube.simulator, system, episode.family),
+                    *(outcomes.simulator, system, episode.family),
                     *(f"{episode.split}/{episode.index}", DIFFICULTIES[hard] if hard >= 0 else ""),
                     [_outcome(came[c]) if c in came else "" for c in conditions],
-                    flips(cube.conditions, rates[number]),
+                    flips(outcomes.conditions, rates[number]),
                     [_address(one, folder) if one else "" for one in found],
                 )
                 rows.append(row)
@@ -188,14 +194,12 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
 
     Of repeats it is that of the lowest model seed.
     """
-    chosen = rows.chosen(rows.places("video", [None]) < 0)
-    names = ("model_seed", "simulator", "system", "condition", "family", "episode_split", "episode")
-    columns = (chosen.list(name) for name in (*names, "video"))
     found: dict[tuple[str, ...], Path] = {}
-    for _, *cell, family, split, index, video in sorted(zip(*columns, strict=True)):
-        key = (*cell, f"{family}/{split}/{index}")
-        if key not in found and video.is_file():
-            found[key] = video
+    for row in sorted((one for one in rows if one.video), key=lambda one: one.model_seed):
+        episode = f"{row.family}/{row.episode_split}/{row.episode}"
+        key = (row.simulator, row.system, row.condition, episode)
+        if key not in found and row.video.is_file():
+            found[key] = row.video
     return found
 
 

@@ -1,14 +1,17 @@
 """Write rows in the layout of the released CSV."""
 
 import csv
-from dataclasses import replace
+from collections import defaultdict
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.files import atomic_path
 
-from .checked import RELEASED_SIMULATOR, Rows
+from .reading import Rows
+from .values import RELEASED_SIMULATOR, Row
 
 RELEASED_COLUMNS = (
     *("family", "condition", "episode", "seed", "difficulty", "status", "success", "steps"),
@@ -38,7 +41,7 @@ def export(rows: Rows, folder: Path) -> list[Path]:
             model seeds, or episodes that are not `test`. Or bad rows were left out.
     """
     seeds = len(rows.names("model_seed"))
-    other = int((rows.places("episode_split", ["test"]) < 0).sum())
+    other = sum(row.episode_split != "test" for row in rows)
     wrong = [f"{seeds} model seeds"] * (seeds > 1)
     wrong += [f"{other:,} rows of train or val episodes"] * (other > 0)
     wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)
@@ -48,21 +51,23 @@ def export(rows: Rows, folder: Path) -> list[Path]:
             "model seed",
             "The released layout has no column for more: export such rows only.",
         )
-    told = {Status.TIMEOUT: Status.ONGOING}
-    values = {
-        "status": [told.get(one, one) for one in rows.values["status"]],
-        "success": [one if one is None else int(one) for one in rows.values["success"]],
-    }
-    written = []
-    for simulator, part in replace(rows, values=rows.values | values).by("simulator").items():
-        names = [*RELEASED_COLUMNS, *["simulator"] * (simulator != RELEASED_SIMULATOR)]
-        for system, own in part.by("system").items():
-            written.append(folder / f"{system}-{simulator}_rollouts.csv")
-            with (
-                atomic_path(written[-1]) as partial,
-                partial.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
-            ):
-                writer = csv.writer(file)  # with CRLF, as released
-                writer.writerow(names)
-                writer.writerows(zip(*map(own.list, names), strict=True))
-    return sorted(written)
+    files = defaultdict[Path, list[Row]](list)
+    for row in rows:
+        files[folder / f"{row.system}-{row.simulator}_rollouts.csv"].append(row)
+    for path, found in files.items():
+        extra = ["simulator"] * (found[0].simulator != RELEASED_SIMULATOR)
+        columns = attrgetter(*RELEASED_COLUMNS, *extra)
+        with (
+            atomic_path(path) as partial,
+            partial.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+        ):
+            writer = csv.writer(file)  # with CRLF, as released
+            writer.writerow([*RELEASED_COLUMNS, *extra])
+            writer.writerows(columns(_released(row)) for row in found)
+    return sorted(files)
+
+
+def _released(row: Row) -> Row:
+    status = str(Status.ONGOING) if row.status == Status.TIMEOUT else row.status
+    success: Any = None if row.success is None else int(row.success)
+    return row._replace(status=status, success=success)

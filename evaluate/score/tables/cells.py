@@ -9,8 +9,14 @@ from itertools import groupby
 import numpy as np
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
-from robomme_interference_data.evaluate.score.comparisons.ranks import cannot_be_told, to_best
-from robomme_interference_data.evaluate.score.outcomes import STATUSES, Cube, Flags, rate_of, trials
+from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best, to_best
+from robomme_interference_data.evaluate.score.outcomes import (
+    STATUSES,
+    Flags,
+    Outcomes,
+    rate_of,
+    trials,
+)
 from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
@@ -83,55 +89,66 @@ class Cell:
         return self.counts[_ERROR]
 
 
-def cells_of(cubes: Iterable[Cube]) -> list[Cell]:
+def cells_of(every: Iterable[Outcomes]) -> list[Cell]:
     """Return the cells of every system and condition, in the order of tables.
 
     Each comes over all episodes, then by family and by difficulty. An expected episode of unknown
     difficulty is missing in all three.
     """
-    return [cell for cube in cubes for cell in _cells(cube)]
+    return [cell for outcomes in every for cell in _cells(outcomes)]
 
 
-def _cells(cube: Cube) -> list[Cell]:
-    every: Flags = np.ones(len(cube.episodes), bool)
+def _cells(outcomes: Outcomes) -> list[Cell]:
+    every: Flags = np.ones(len(outcomes.episodes), bool)
     parts = {"": (every, every)}  # name to its episodes, and to those that are expected in it
-    parts |= {name: (here, here) for name in FAMILIES if (here := cube.of_family(name)).any()}
+    parts |= {name: (here, here) for name in FAMILIES if (here := outcomes.of_family(name)).any()}
     for place, name in enumerate(DIFFICULTIES):
-        here = cube.difficulty == place
-        parts[name] = (here, here | (cube.difficulty < 0))
+        here = outcomes.difficulty == place
+        parts[name] = (here, here | (outcomes.difficulty < 0))
     cells = []
-    for s, c in np.argwhere(cube.due).tolist():
+    for s, c in np.argwhere(outcomes.due).tolist():
         for name, (here, wanted) in parts.items():
-            if not ((here & cube.there[s]) | (wanted & cube.expected)).any():
+            if not ((here & outcomes.there[s]) | (wanted & outcomes.expected)).any():
                 continue
-            counted = here & cube.counted[s, c]
-            n, counts, status = int(counted.sum()), cube.counts[s, c], cube.status[s, c, here]
+            counted = here & outcomes.counted[s, c]
+            n, counts, status = (
+                int(counted.sum()),
+                outcomes.counts[s, c],
+                outcomes.status[s, c, here],
+            )
             rate, worth = rate_of(status), trials(status)
             cells.append(
                 Cell(
-                    *(cube.simulator, cube.systems[s], cube.conditions[c], name, n, rate),
+                    *(
+                        outcomes.simulator,
+                        outcomes.systems[s],
+                        outcomes.conditions[c],
+                        name,
+                        n,
+                        rate,
+                    ),
                     interval=wilson(rate * worth if n else 0, worth),
                     trials=worth,
                     counts=tuple(counts[here].sum(axis=0).tolist()),
-                    chance=float(cube.chance[counted].mean()) if n else math.nan,
-                    expected=int((wanted & cube.expected).sum()),
-                    missing=cube.chosen(wanted & cube.missing[s, c]),
-                    broken=cube.chosen(here & (counts[:, _ERROR] > 0)),
-                    other=cube.chosen(here & cube.other[s, c]),
+                    chance=float(outcomes.chance[counted].mean()) if n else math.nan,
+                    expected=int((wanted & outcomes.expected).sum()),
+                    missing=outcomes.chosen(wanted & outcomes.missing[s, c]),
+                    broken=outcomes.chosen(here & (counts[:, _ERROR] > 0)),
+                    other=outcomes.chosen(here & outcomes.other[s, c]),
                 )
             )
-    return _ranked(cube, cells, {name: here for name, (here, _) in parts.items()})
+    return _ranked(outcomes, cells, {name: here for name, (here, _) in parts.items()})
 
 
-def _ranked(cube: Cube, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
+def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -> list[Cell]:
     groups = defaultdict[tuple[str, str], list[int]](list)
     for place, cell in enumerate(cells):
         if cell.complete and not is_bound(cell.system):
             groups[cell.condition, cell.part].append(place)
     for (condition, part), places in groups.items():
         own = [cells[place] for place in places]
-        against = to_best(cube, condition, [cell.system for cell in own], parts[part])
-        best = cannot_be_told(against)
+        against = to_best(outcomes, condition, [cell.system for cell in own], parts[part])
+        best = tied_with_best(against)
         for place, cell in zip(places, own, strict=True):
             rank = 1 + sum(other.rate > cell.rate for other in own)
             cells[place] = replace(cell, rank=rank, best=cell.system in best)

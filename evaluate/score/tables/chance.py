@@ -3,11 +3,11 @@
 import math
 from collections.abc import Iterable, Mapping
 
-from robomme_interference_data.evaluate.score.comparisons.pairs import corrected
-from robomme_interference_data.evaluate.score.outcomes import Cube
+from robomme_interference_data.evaluate.score.comparisons.tables import corrected, provisional
+from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.stats.intervals import above_chance
-from robomme_interference_data.stats.significance import SURE, poisson_binomial
-from robomme_interference_data.viz.tables import Provisional, Table
+from robomme_interference_data.stats.significance import ALPHA, poisson_binomial
+from robomme_interference_data.viz.tables import Table
 
 from .cells import Cell
 
@@ -19,7 +19,7 @@ _NOTE = (
     "(Poisson-binomial, one-sided); p_holm: p corrected by Holm's method among the tests of this "
     "table in one simulator. An answer that names no option is wrong: who often names none lies "
     "below chance. Who sees nothing of the past has to be at chance, such as the controls blank "
-    f"and text, and anyone under no-history: p_holm below {SURE} there is a leak, by which "
+    f"and text, and anyone under no-history: p_holm below {ALPHA} there is a leak, by which "
     "questions are answered without memory; a larger one does not prove that there is none."
 )
 _REPEATS = (
@@ -29,21 +29,21 @@ _REPEATS = (
 _EARLY = " p†: provisional, as a cell is not complete."
 
 
-def chance_table(cubes: Mapping[str, Cube], cells: Iterable[Cell]) -> Table:
+def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Table:
     """Return how far each cell is above chance, of those whose episodes are all questions.
 
     Args:
-        cubes: What came of the rollouts, by simulator.
-        cells: Those of the cubes; parts of the episodes are left out.
+        outcomes: What came of the rollouts, by simulator.
+        cells: Those of the outcomes; parts of the episodes are left out.
     """
     found = [one for one in cells if not (one.part or math.isnan(one.chance))]
-    ps = [_p(cubes[one.simulator], one) for one in found]
+    ps = [_p(outcomes[one.simulator], one) for one in found]
     tests = zip(found, ps, corrected(ps, [one.simulator for one in found]), strict=True)
     rows = [
         (
             *(cell.simulator, cell.system, cell.condition, cell.n, cell.rate, cell.chance),
             *(above_chance(one, cell.chance) for one in (cell.rate, *cell.interval)),
-            *(one if cell.complete else Provisional(one) for one in p),
+            *(provisional(one, cell.complete) for one in p),
             cell.complete,
         )
         for cell, *p in tests
@@ -60,7 +60,7 @@ def chance_table(cubes: Mapping[str, Cube], cells: Iterable[Cell]) -> Table:
     )
 
 
-def _p(cube: Cube, cell: Cell) -> float:
-    counted = cube.counted[cube.cell(cell.system, cell.condition)]
+def _p(outcomes: Outcomes, cell: Cell) -> float:
+    counted = outcomes.counted[outcomes.cell(cell.system, cell.condition)]
     right = math.floor(round(cell.rate * cell.n, 9))
-    return poisson_binomial(right, cube.chance[counted].tolist())
+    return poisson_binomial(right, outcomes.chance[counted].tolist())

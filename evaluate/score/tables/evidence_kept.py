@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Cube, counting, rate_of, trials
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting, rate_of, trials
 from robomme_interference_data.evaluate.systems import known_system
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Table
@@ -27,20 +27,20 @@ def ceiling_of(system: str) -> str | None:
     return name + known.step
 
 
-def access_table(cubes: Iterable[Cube]) -> Table:
+def access_table(every: Iterable[Outcomes]) -> Table:
     """Return the rates where all, some and none of the evidence was kept, by system and condition.
 
     Cells of which no rollout tells what was kept are left out, and so are levels without episodes.
     """
     rows = []
-    for cube in cubes:
-        kept = cube.evidence
+    for outcomes in every:
+        kept = outcomes.evidence
         levels = {"all": kept == 1, "some": (kept > 0) & (kept < 1), "none": kept == 0}
-        for s, c in np.argwhere(cube.has_rows).tolist():
+        for s, c in np.argwhere(outcomes.has_rows).tolist():
             for name, chosen in levels.items():
-                status = np.where(chosen[s, c], cube.status[s, c], np.int8(-1))
+                status = np.where(chosen[s, c], outcomes.status[s, c], np.int8(-1))
                 if n := int(counting(status).any(axis=-1).sum()):
-                    cell = (cube.simulator, cube.systems[s], cube.conditions[c], name)
+                    cell = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
                     rate, worth = rate_of(status), trials(status)
                     rows.append((*cell, n, rate, *wilson(rate * worth, worth)))
     return Table.make(

@@ -8,9 +8,9 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from robomme_interference_data.evaluate.score.comparisons.pairs import apart
-from robomme_interference_data.evaluate.score.comparisons.ranks import cannot_be_told
-from robomme_interference_data.evaluate.score.rows.checked import RELEASED_SIMULATOR
+from robomme_interference_data.evaluate.score.comparisons.pairs import compare_unpaired
+from robomme_interference_data.evaluate.score.comparisons.ranks import tied_with_best
+from robomme_interference_data.evaluate.score.rows.values import RELEASED_SIMULATOR
 from robomme_interference_data.evaluate.systems import base_of, display_name
 from robomme_interference_data.stats.intervals import newcombe, wilson
 from robomme_interference_data.viz.tables import Table
@@ -65,10 +65,10 @@ def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
     best = max(cells, key=lambda cell: cell.rate)
     first = sides[cells.index(best)]
     compared = {
-        cell.system: None if cell is best else apart([first, side])
+        cell.system: None if cell is best else compare_unpaired([first, side])
         for cell, side in zip(cells, sides, strict=True)
     }
-    return {(system, best.condition) for system in cannot_be_told(compared)}
+    return {(system, best.condition) for system in tied_with_best(compared)}
 
 
 @cache

@@ -1,0 +1,172 @@
+"""Find files of rollout rows and read them as plain values; `reading` judges the values."""
+
+import codecs
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.json as pa_json
+
+from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
+from robomme_interference_data.schema.codec import arrow_schema, read_header
+from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
+from robomme_interference_data.storage.files import read_bytes
+from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
+
+_SCHEMA = arrow_schema(Rollout)
+_REQUIRED = ("family", "condition", "episode", "status", "success")
+_RUN_ONLY = {"split", "revision", "episode_split", "shift", "model_seed", "protocol_version"}
+"""Key columns of a run's rows. The released layout is without them, and without `simulator`,
+which exported rows of other simulators have as one column more."""
+_ALIASES = {"variant": "system"}  # its name in the paper's released tables
+
+
+class RawRow(NamedTuple):
+    """A row of a file.
+
+    Attributes:
+        line: The line on which it begins; in parquet its number from 1.
+        values: Column of `Rollout` to what the file has there; or why it is no row.
+    """
+
+    line: int
+    values: Mapping[str, Any] | str
+
+
+def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
+    """Find the file of rows that each path stands for: of a run's folder it is the record.
+
+    Returns:
+        File to what `run.json` says about its run, None for a file outside a run's folder.
+    """
+    found: dict[Path, RunHeader | None] = {}
+    for given in paths:
+        path = given / RUN_RECORD if given.is_dir() else given
+        if not path.is_file():
+            raise MissingFileError(
+                f"there is no file {path}",
+                "Give folders of runs, or .csv, .parquet or .jsonl files.",
+            )
+        if any(path.samefile(other) for other in found):
+            raise InvalidOptionError(f"{path} is given twice", "Give each file once.")
+        run = path.parent / RUN_HEADER
+        of_run = path.name in (RUN_RECORD, *RUN_TABLES) and run.is_file()
+        found[path] = read_header(run, RunHeader) if of_run else None
+    return found
+
+
+def system_of(path: Path) -> str | None:
+    """Return the system in the name of an exported file (see `export`), or None."""
+    found = re.fullmatch(r"(.+)-[^-]+_rollouts\.csv", path.name)
+    return found[1] if found else None
+
+
+def read_file(path: Path, names: Sequence[str], has_system: bool) -> list[RawRow]:
+    """Read columns of a file's rows, as far as the file has them.
+
+    Args:
+        path: The file: `.jsonl`, `.parquet` or `.csv`.
+        names: Names of the columns.
+        has_system: Whether the system of rows that name none is known.
+
+    Raises:
+        FormatError: The file cannot be read, lacks columns, or has one that reads like another,
+            two of one name, or one of nested values.
+    """
+    readers = {".parquet": _read_parquet, ".csv": _read_csv, ".jsonl": _read_record}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise FormatError(f"{path} is no {' or '.join(readers)} file", "Give a file of rows.")
+    with reading(path):
+        return list(reader(path, names, has_system))
+
+
+def _match(
+    path: Path, existing: Sequence[str], names: Sequence[str], has_system: bool
+) -> dict[str, str]:
+    """Return which of the wanted columns is which of the file's."""
+    ours = {_ALIASES.get(name, name): name for name in existing}
+    for name in existing:
+        known = [*_SCHEMA.names, *_ALIASES]
+        near = [] if name in known else get_close_matches(name, known, n=1, cutoff=0.8)
+        if near:
+            raise FormatError(f"{path} has the column {name!r}", f"Did you mean {near[0]!r}?")
+        if existing.count(name) > 1:
+            raise FormatError(f"{path} has two columns {name!r}", "Rename one of them.")
+    of_run = "simulator" in ours and not _RUN_ONLY.isdisjoint(ours)
+    required = dict.fromkeys((*KEY_COLUMNS, *_REQUIRED) if of_run else _REQUIRED)
+    if missing := [name for name in required if name not in ours]:
+        raise FormatError(
+            f"{path} lacks the columns {', '.join(missing)}; it has "
+            f"{', '.join(existing) or 'none'}",
+            "Expected the rows of a run, or of the released CSVs (docs/score.md).",
+        )
+    if "system" not in ours and not has_system:
+        raise FormatError(
+            f"{path} names no system: it has no column 'system', nor is it called "
+            "SYSTEM-SIMULATOR_rollouts.csv",
+            'Name it, such as system="retrieval-framesamp-modul" '
+            "(of two files that are compared: system_a, system_b).",
+        )
+    return {name: ours[name] for name in names if name in ours}
+
+
+def _values(path: Path, table: pa.Table) -> Iterator[dict[str, Any]]:
+    for column in table.columns:
+        kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+        if pa.types.is_nested(kind):
+            raise FormatError.damaged(path, f"a column holds {kind}; expected text and numbers")
+    columns = [column.to_pylist() for column in table.columns]
+    names = table.column_names
+    return (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
+
+
+def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Iterator[RawRow]:
+    with open_parquet(path) as file:
+        chosen = _match(path, file.schema_arrow.names, names, has_system)
+        table = read_table(file, path, list(chosen.values()))
+    table = table.select(list(chosen.values())).rename_columns(list(chosen))
+    for number, row in enumerate(_values(path, table), 1):
+        yield RawRow(number, row)
+
+
+def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Iterator[RawRow]:
+    text = read_bytes(path, MOST_BYTES).removeprefix(codecs.BOM_UTF8).decode()
+    csv.field_size_limit(len(text) + 1)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        header = next(reader, [])
+        chosen = _match(path, header, names, has_system)
+        places = [(name, header.index(existing)) for name, existing in chosen.items()]
+        line = reader.line_num + 1
+        for fields in reader:
+            if len(fields) == len(header):
+                yield RawRow(line, {name: fields[place] for name, place in places})
+            else:
+                why = f"the line has {len(fields)} fields; expected {len(header)}"
+                yield RawRow(line, why)
+            line = reader.line_num + 1  # quoted text may hold line breaks
+    except csv.Error as error:
+        raise ValueError(f"line {reader.line_num}: {error}") from None
+
+
+def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Iterator[RawRow]:
+    """Read the record of a run: every finished row, and of other rollouts the last row."""
+    if not (whole := whole_lines(path)):
+        return
+    schema = pa.schema([_SCHEMA.field(name) for name in dict.fromkeys((*names, *KEY_COLUMNS))])
+    options = pa_json.ParseOptions(schema, unexpected_field_behavior="ignore")
+    table = pa_json.read_json(pa.BufferReader(whole), parse_options=options)
+    rows = list(_values(path, table))
+    keys = [tuple(map(row.get, KEY_COLUMNS)) for row in rows]
+    last = dict(zip(keys, range(len(keys)), strict=True))
+    for number, (row, key) in enumerate(zip(rows, keys, strict=True)):
+        if row["status"] != Status.ERROR or last[key] == number:
+            yield RawRow(number + 1, row)

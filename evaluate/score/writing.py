@@ -1,0 +1,69 @@
+"""Write a score into a folder: tables, figures, the methods and the report."""
+
+from pathlib import Path
+
+from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.viz.figure import MAKER, open_figure
+from robomme_interference_data.viz.templates import load_jinja2
+
+from .plots import figures
+from .report.methods import methods
+from .report.page import write_report
+from .rows.export import export
+from .scoring import TABLES, Score
+
+_SUFFIXES = (".csv", ".md", ".tex")
+
+
+def write_score(
+    score: Score,
+    out: Path,
+    export_to: Path | None = None,
+    command: str | None = None,
+    *,
+    png: bool = False,
+) -> list[Path]:
+    """Write tables, figures and the report, each atomically and the report last.
+
+    What can be refused is refused before anything is written. Tables and figures of an earlier
+    score that this one does not have are removed; files of other names stay.
+
+    Args:
+        score: What is written.
+        out: Folder for `tables/`, `figures/`, `methods.md`, `methods.bib` and `report.html`.
+        export_to: Folder for the rows in the released layout (see `export`); None writes none.
+        command: The command line that made the score, for the report.
+        png: Whether figures are written as PNG, too, not as SVG alone.
+
+    Returns:
+        The exported files.
+
+    Raises:
+        MissingExtraError: matplotlib or jinja2 is not installed.
+        InvalidOptionError: The released layout cannot hold the rows (see `export`).
+    """
+    with open_figure():
+        load_jinja2("the report")
+    exported = [] if export_to is None else export(score.rows, export_to)
+    texts = {f"{name}.csv": table.csv() for name, table in score.tables.items()}
+    texts |= {f"{name}.md": table.markdown() for name, table in score.tables.items()}
+    texts |= {f"{name}.tex": table.latex() for name, table in score.tables.items()}
+    texts["main.md"] = "\n".join(grid.markdown() for grid in score.grids)
+    texts["main.tex"] = "\n".join(grid.latex() for grid in score.grids)
+    for name, text in texts.items():
+        write_text(out / "tables" / name, text)
+    for suffix, text in zip((".md", ".bib"), methods(score), strict=True):
+        write_text(out / f"methods{suffix}", text)
+    drawn = figures.draw_figures(score, out / "figures", png=png)
+    for name in {f"{table}{suffix}" for table in TABLES for suffix in _SUFFIXES} - {*texts}:
+        (out / "tables" / name).unlink(missing_ok=True)
+    for kind in figures.FIGURES:
+        for drawing in (out / "figures").glob(f"{kind}-*.svg"):
+            if MAKER.encode() not in drawing.read_bytes():
+                continue  # somebody else's
+            if drawing.stem not in drawn or not png:
+                drawing.with_suffix(".png").unlink(missing_ok=True)
+            if drawing.stem not in drawn:
+                drawing.unlink()
+    write_report(score, drawn, out / "report.html", command)
+    return exported
