@@ -10,7 +10,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robomme_interference_data.stats.bootstrap import bootstrap, varies_enough, slope_weights
+from robomme_interference_data.stats.bootstrap import bootstrap, slope_weights, varies_enough
 from robomme_interference_data.stats.intervals import (
     cohens_h,
     effective_n,
