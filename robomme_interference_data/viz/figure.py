@@ -259,5 +259,28 @@ def ink_on(color: str) -> str:
     return "black" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "white"
 
 
+def mapped(colours: str, share: float) -> str:
+    """Return the colour, `#rrggbb`, that one of matplotlib's colour maps has at a share."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return str(to_hex(colormaps[colours](share)))
+
+
+def right_of(axes: Any, inches: float) -> Any:
+    """Return the transform of what lies so far right of axes; its y is in data."""
+    from matplotlib.transforms import ScaledTranslation
+
+    return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, axes.figure.dpi_scale_trans)
+
+
+def connect_right(axes: Any, value: float, label: float, inches: float, **line: Any) -> Any:
+    """Draw a line from a value on the right edge of axes to the height of its label beside it."""
+    from matplotlib.patches import ConnectionPatch
+
+    ends = {"coordsA": right_of(axes, 0), "coordsB": right_of(axes, inches)}
+    return axes.add_artist(ConnectionPatch((1, value), (1, label), **ends, **line, clip_on=False))
+
+
 def _rgb(color: str) -> list[float]:
     return [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]

@@ -15,7 +15,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.evaluate.score.plots.curves import Data, spread
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES, draw_figure
-from robomme_interference_data.evaluate.score.plots.styles import Look, looks_of
+from robomme_interference_data.evaluate.score.plots.styles import SeriesStyle, styles_of
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import Rollout
@@ -44,24 +44,24 @@ def names(figure: Any) -> list[set[str]]:
     return [found for found in panels if found]
 
 
-# --- looks -------------------------------------------------------------------------------------
+# --- styles -------------------------------------------------------------------------------------
 
 
-def shapes(looks: Iterable[Look], *, colour: bool = False) -> set[tuple[str, ...]]:
-    return {(look.colour * colour, look.marker, str(look.line)) for look in looks}
+def shapes(styles: Iterable[SeriesStyle], *, colour: bool = False) -> set[tuple[str, ...]]:
+    return {(style.colour * colour, style.marker, str(style.line)) for look in styles}
 
 
 def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> None:
     own = [f"own-{number}" for number in range(48)]
     without = [name for name, system in SYSTEMS.items() if not system.retrieval]
-    together = looks_of([*own, *without])
+    together = styles_of([*own, *without])
     assert len(shapes(together.values(), colour=True)) == len(together)
     for name in without:
-        assert looks_of([name])[name] == together[name]
+        assert styles_of([name])[name] == together[name]
     # Two dozen of one's own are told apart without colour, too.
     mine, table = (shapes(together[n] for n in names) for names in (own[:24], without))
     assert len(mine) == 24 and not mine & table
-    paper = looks_of([system.name for system in PAPER_SYSTEMS]).values()
+    paper = styles_of([system.name for system in PAPER_SYSTEMS]).values()
     assert len(shapes(paper, colour=True)) == 13
 
 
@@ -144,7 +144,7 @@ def test_twelve_systems_are_named_at_their_values_without_dodge(
     tmp_path: Path, figure: Any
 ) -> None:
     shown = Data(made.score(full_grid.write(tmp_path / "a.parquet"), draws=50), "robomme")
-    everyone = {shown.looks[system].label for system in shown.systems}
+    everyone = {shown.styles[system].label for system in shown.systems}
     places = {shown.x(name) for name in shown.shown(shown.systems)}
     for kind, panels in (("success", 1), ("families", 9), ("difficulty", 3)):
         with open_figure() as other:

@@ -18,9 +18,9 @@ from robomme_interference_data.schema.conditions import (
     parse_condition,
 )
 from robomme_interference_data.stats.significance import ALPHA
-from robomme_interference_data.viz.figure import INK, tidy
+from robomme_interference_data.viz.figure import INK, connect_right, right_of, tidy
 
-from .styles import Look, looks_of
+from .styles import SeriesStyle, styles_of
 
 _PUBLISHED = ", published"
 _CHANCE = "(chance)"  # among systems: no name of one has brackets
@@ -39,7 +39,7 @@ class Data:
         systems: Those that have rows.
         absent: Published ones without rows here, behind a retrieval step that has: drawn in full.
         beside: Published ones of systems with rows: dashes beside their points.
-        looks: Of all of them, and of the chance level.
+        styles: Of all of them, and of the chance level.
         conditions: Of all of them, in the order of tables.
         least: The fewest sessions that one of them counts.
         contrasts: The comparisons of the systems that have rows.
@@ -68,19 +68,23 @@ class Data:
         asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
         self.chance = {one.part: one.chance for one in asked}
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
-        self.looks = looks_of([*self.systems, *bases])
-        self.looks[_CHANCE] = Look("chance", INK, "", ":", 0.9)
+        self.styles = styles_of([*self.systems, *bases])
+        self.styles[_CHANCE] = SeriesStyle("chance", INK, "", ":", 0.9)
         self.cells: dict[tuple[str, str, str], Cell] = {
             (one.system, one.condition, one.part): one for one in found
         }
         self.absent, self.beside = list[str](), list[str]()
         for one in (*score.published, *(by_family() if score.published else ())):
-            if one.simulator == simulator and one.system in self.looks:
+            if one.simulator == simulator and one.system in self.styles:
                 name = f"{one.system}{_PUBLISHED}"
                 names = self.absent if one.system in bases else self.beside
                 names += [name] if name not in names else []
-                look, line = self.looks[one.system], (0, (4, 2)) if one.system in bases else "none"
-                self.looks[name] = Look(f"{look.label}, published", look.colour, "_", line, 1.2)
+                style, line = (
+                    self.styles[one.system],
+                    (0, (4, 2)) if one.system in bases else "none",
+                )
+                label = f"{style.label}, published"
+                self.styles[name] = SeriesStyle(label, style.colour, "_", line, 1.2)
                 self.cells[name, one.condition, one.part] = one
         conditions = {condition for _, condition, _ in self.cells}
         self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
@@ -145,36 +149,57 @@ def curve(
     Returns:
         The system's last rate in percent; nothing without any rate.
     """
-    look = data.looks[system]
+    style = data.styles[system]
     found = [c for one in data.conditions if (c := data.cells.get((system, one.name, part)))]
     if not found:
         return {}
-    points = [(c.condition, data.x(c.condition) + shift, 100 * c.rate) for c in found]
+    points = [
+        (data.x(c.condition) + shift, 100 * c.rate, *(100 * bound for bound in c.interval))
+        for c in found
+    ]
     drawn = []
-    for kind, group in groupby(points, lambda point: parse_condition(point[0]).kind):
-        _, xs, ys = zip(*group, strict=True)
+    for kind, places in groupby(
+        range(len(found)), lambda place: parse_condition(found[place].condition).kind
+    ):
+        xs, ys = zip(*(points[place][:2] for place in places), strict=True)
         if kind.counted:
-            line = {"linestyle": look.line, "linewidth": look.width}
-            drawn += axes.plot(xs, ys, color=look.colour, **line)
-    if points[0][0] == NO_HISTORY and look.line != "none":
+            line = {"linestyle": style.line, "linewidth": style.width}
+            drawn += axes.plot(xs, ys, color=style.colour, **line)
+    if found[0].condition == NO_HISTORY and style.line != "none":
         if len(points) > 1:
-            _, xs, ys = zip(*points[:2], strict=True)
-            drawn += axes.plot(xs, ys, ":", color=look.colour, linewidth=0.7)
+            xs, ys = zip(*(point[:2] for point in points[:2]), strict=True)
+            drawn += axes.plot(xs, ys, ":", color=style.colour, linewidth=0.7)
         elif len(data.conditions) > 1:  # without memory: the floor
             floor = {"linewidth": 0.8, "linestyle": "--", "zorder": 0}
-            drawn.append(axes.axhline(points[0][2], color=look.colour, **floor))
+            drawn.append(axes.axhline(points[0][1], color=style.colour, **floor))
+    whole = [cell.complete for cell in found]
+    drawn += points_with_bars(axes, points, style, {"linestyle": "none"}, whole, bars=bars)
+    mark(drawn, system)
+    return {system: points[-1][1]}
+
+
+def points_with_bars(
+    axes: Any,
+    points: Sequence[Sequence[float]],
+    style: SeriesStyle,
+    line: Mapping[str, Any],
+    whole: Sequence[bool] | None = None,
+    *,
+    bars: bool = True,
+) -> list[Any]:
+    """Draw points, `(x, value, low, high)` each, with their bars; hollow where not `whole`."""
+    drawn = []
     if bars:
-        low, high = zip(*([100 * bound for bound in cell.interval] for cell in found), strict=True)
-        places = [x for _, x, _ in points]
-        drawn.append(axes.vlines(places, low, high, color=look.colour, linewidth=0.9, alpha=0.7))
-    for whole, face in ((True, look.colour), (False, "white")):
-        chosen = [(x, y) for (_, x, y), c in zip(points, found, strict=True) if c.complete is whole]
+        xs, _, low, high = zip(*points, strict=True)
+        drawn.append(axes.vlines(xs, low, high, color=style.colour, linewidth=0.9, alpha=0.7))
+    full = whole or [True] * len(points)
+    for wanted, face in ((True, style.colour), (False, "white")):
+        chosen = [point[:2] for point, one in zip(points, full, strict=True) if one is wanted]
         if chosen:
             # Not clipped: whole at 0 and at 100%.
-            style = look.point | {"markerfacecolor": face, "linestyle": "none"}
-            drawn += axes.plot(*zip(*chosen, strict=True), **style, clip_on=False, zorder=3)
-    mark(drawn, system)
-    return {system: points[-1][2]}
+            shape = style.point | {"markerfacecolor": face, **line}
+            drawn += axes.plot(*zip(*chosen, strict=True), **shape, clip_on=False, zorder=3)
+    return drawn
 
 
 def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
@@ -185,12 +210,23 @@ def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
     """
     if part not in data.chance:
         return {}
-    level, look = 100 * data.chance[part], data.looks[_CHANCE]
-    axes.axhline(level, color=look.colour, linestyle=look.line, linewidth=look.width, zorder=0)
+    level, style = 100 * data.chance[part], data.styles[_CHANCE]
+    axes.axhline(level, color=style.colour, linestyle=style.line, linewidth=style.width, zorder=0)
     return {_CHANCE: level}
 
 
 # --- axes and labels ---------------------------------------------------------------------------
+
+
+def panel_grid(figure: Any, count: int, wide: int, *, sharex: bool = True) -> list[Any]:
+    """Return so many panels, `wide` in a row; the lowest of each column has labels below."""
+    grid = figure.subplots(-(-count // wide), wide, sharex=sharex, sharey=True, squeeze=False)
+    for number, axes in enumerate(grid.flat):
+        if number >= count:
+            axes.set_axis_off()
+        elif sharex:
+            axes.tick_params(labelbottom=number + wide >= count)
+    return list(grid.flat[:count])
 
 
 def set_axes(axes: Any, data: Data, systems: Sequence[str], ylabel: str) -> None:
@@ -233,7 +269,7 @@ def legend(figure: Any, note: str) -> None:
 def label_ends(
     axes: Any,
     ends: Mapping[str, float],
-    looks: Mapping[str, Look],
+    styles: Mapping[str, SeriesStyle],
     height: float,
     size: float,
     of: str | None = None,
@@ -244,26 +280,18 @@ def label_ends(
     axes have their final limits, and are about `height` inches high; letters are `size` points.
     Where the lines are not systems, but all `of` one, they are marked as that one's.
     """
-    from matplotlib.patches import ConnectionPatch
-    from matplotlib.transforms import ScaledTranslation
-
-    def beside(inches: float) -> Any:  # from the right edge, y in data
-        scale = axes.figure.dpi_scale_trans
-        return axes.get_yaxis_transform() + ScaledTranslation(inches, 0, scale)
-
     letters: dict[str, Any] = {"color": INK, "size": size, "va": "center"}
     top = axes.get_ylim()[1]
     ordered = sorted(ends.items(), key=lambda end: end[1])
     gap = min(top * 1.2 * size / 72 / height, top / max(1, len(ordered) - 1))
     heights = spread([value for _, value in ordered], gap, 0, top)
     for (system, value), label in zip(ordered, heights, strict=True):
-        look = looks[system]
-        ends_at: dict[str, Any] = {"coordsA": beside(0), "coordsB": beside(0.02 * size)}
-        line: dict[str, Any] = {"color": look.colour, "linewidth": 0.5, "clip_on": False}
+        style = styles[system]
+        place, words = (right_of(axes, inches * size) for inches in (0.029, 0.041))
         drawn = [
-            axes.add_artist(ConnectionPatch((1, value), (1, label), **ends_at, **line)),
-            *axes.plot(1, label, **look.point, clip_on=False, transform=beside(0.029 * size)),
-            axes.text(1, label, look.label, transform=beside(0.041 * size), **letters),
+            connect_right(axes, value, label, 0.02 * size, color=style.colour, linewidth=0.5),
+            *axes.plot(1, label, **style.point, clip_on=False, transform=place),
+            axes.text(1, label, style.label, transform=words, **letters),
         ]
         if system != _CHANCE:
             mark(drawn, of or system)

@@ -13,7 +13,13 @@ from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.stats.significance import ALPHA
-from robomme_interference_data.viz.figure import INK, ink_on, open_figure, save_figure
+from robomme_interference_data.viz.figure import (
+    INK,
+    ink_on,
+    mapped,
+    open_figure,
+    save_figure,
+)
 
 from . import curves, forests
 from .curves import FEW, Data, curve, explained, legend
@@ -98,7 +104,7 @@ def _success(figure: Any, data: Data) -> bool:
         curve(axes, data, name, "", shift, bars=False)
     ends |= curves.chance_level(axes, data, "")
     curves.set_axes(axes, data, [*places, *beside], "success, %")
-    curves.label_ends(axes, ends, data.looks, high - 1, 8)
+    curves.label_ends(axes, ends, data.styles, high - 1, 8)
     note = "published rates: in the table “paper”" if len(beside) < len(data.beside) else ""
     legend(figure, explained(data, [*places, *beside], [""], note))
     bars = "with 95% Wilson intervals" if few else "intervals in the table “main”"
@@ -147,33 +153,26 @@ def _panels(
     if not (panels and systems):
         return False
     wide, bars = 3, len(systems) <= FEW
-    rows, high = -(-len(panels) // wide), 2.0 if bars else 2.4
-    figure.set_size_inches(10.5, 0.9 + high * rows)
-    grid = figure.subplots(rows, wide, sharex=True, sharey=True, squeeze=False)
+    high = 2.0 if bars else 2.4
+    figure.set_size_inches(10.5, 0.9 + high * -(-len(panels) // wide))
+    grid = curves.panel_grid(figure, len(panels), wide)
     ends: list[dict[str, float]] = []
-    for axes, (title, (shown, part)) in zip(grid.flat, panels.items(), strict=False):
+    for axes, (title, (shown, part)) in zip(grid, panels.items(), strict=True):
         ends.append({})
         for system, shift in curves.shifts(systems).items():
             ends[-1] |= curve(axes, shown, system, part, shift, bars=bars)
         ends[-1] |= curves.chance_level(axes, shown, part)
         axes.set_title(title, size=9, color=INK, weight="bold" if title == _ALL else "normal")
-    for number, axes in enumerate(grid.flat):
-        if number < len(panels):
-            curves.set_axes(axes, data, systems, "" if number % wide else "success, %")
-            axes.tick_params(labelbottom=number + wide >= len(panels))  # nothing below
-    for axes, found in zip(grid.flat, ends, strict=False):
-        curves.label_ends(axes, found, data.looks, high - 0.45, 6.5)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_axis_off()
+    for number, axes in enumerate(grid):
+        curves.set_axes(axes, data, systems, "" if number % wide else "success, %")
+    for axes, found in zip(grid, ends, strict=True):
+        curves.label_ends(axes, found, data.styles, high - 0.45, 6.5)
     note = f"95% {'Wilson intervals' if bars else 'intervals: in the table'}"
     legend(figure, explained(data, systems, [p for _, p in panels.values()], note))
     return True
 
 
 def _heatmap(figure: Any, data: Data) -> bool:
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
     names, conditions = data.parts(FAMILIES), data.shown(data.systems)
     labels = [curves.short(condition) for condition in conditions]
     turned = 90 if max(map(len, labels)) > len("none") else 0
@@ -181,16 +180,16 @@ def _heatmap(figure: Any, data: Data) -> bool:
     rows = -(-len(data.systems) // max(1, 25 // many))
     wide = -(-len(data.systems) // rows)
     figure.set_size_inches(1.3 + 1.65 * wide * many / 5, 0.6 + (0.6 + 0.24 * len(names)) * rows)
-    panels = figure.subplots(rows, wide, sharey=True, squeeze=False)
-    colours = colormaps["cividis"]  # the same to the colour-blind, and even in grey
+    panels = curves.panel_grid(figure, len(data.systems), wide, sharex=False)
+    colours = "cividis"  # the same to the colour-blind, and even in grey
     highest = max(cell.rate for (*_, part), cell in data.cells.items() if part in names)
-    for axes, system in zip(panels.flat, data.systems, strict=False):
+    for axes, system in zip(panels, data.systems, strict=True):
         rates = np.full((len(names), len(conditions)), np.nan)
         for (y, name), (x, condition) in product(enumerate(names), enumerate(conditions)):
             if cell := data.cells.get((system, condition, name)):
                 rates[y, x] = cell.rate
                 text = f"{100 * cell.rate:.0f}" + ("" if cell.complete else "†")
-                ink = ink_on(to_hex(colours(cell.rate / highest if highest else 0.0)))
+                ink = ink_on(mapped(colours, cell.rate / highest if highest else 0.0))
                 inside: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
                 axes.text(x, y, text, **inside, size=7, color=ink)
         axes.imshow(rates, cmap=colours, vmin=0, vmax=highest, aspect="auto")
@@ -198,9 +197,7 @@ def _heatmap(figure: Any, data: Data) -> bool:
         axes.set_yticks(range(len(names)), names, size=7)
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
-        axes.set_title(fill(data.looks[system].label, 26), size=8, color=INK)
-    for axes in panels.flat[len(data.systems) :]:
-        axes.set_axis_off()
+        axes.set_title(fill(data.styles[system].label, 26), size=8, color=INK)
     figure.suptitle(f"Success in %, {data.simulator}", size=9, color=INK)
     return True
 
@@ -236,7 +233,7 @@ def _matrix(figure: Any, data: Data) -> bool:
             look |= {"ha": "center", "va": "center", "in_layout": False}
             axes.text(x, y, f"{round(change) + 0:.0f}".replace("-", "−"), size=7, **look)
         axes.imshow(values, cmap="RdBu", vmin=-2 * widest, vmax=2 * widest, aspect="auto")
-        labels = [data.looks[system].label for system in systems]
+        labels = [data.styles[system].label for system in systems]
         axes.set_xticks(range(len(systems)), labels, size=7, rotation=90)
         axes.set_yticks(range(len(systems)), labels, size=7)
         axes.tick_params(length=0)

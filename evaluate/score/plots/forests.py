@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
@@ -12,36 +12,65 @@ from robomme_interference_data.evaluate.score.comparisons.contrast import (
     Contrast,
 )
 from robomme_interference_data.schema.conditions import KINDS, parse_condition
+from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import GREY, INK, Hue, tidy
 
-from .curves import (
-    Data,
-    label_ends,
-    legend,
-    mark,
-    set_axes,
-    short,
-)
-from .styles import Look
+from .curves import Data, label_ends, legend, mark, panel_grid, points_with_bars, set_axes, short
+from .styles import SeriesStyle
 
 _FLIPS = 0.06
 """Share of outcomes that flip when RoboMME's episodes are repeated on a GPU, at the least."""
 
 _LEVELS = {
-    "all": Look("all kept", Hue.BLUE, "o", "-"),
-    "some": Look("some kept", Hue.ORANGE, "s", "--"),
-    "none": Look("none kept", Hue.VERMILION, "^", ":"),
+    "all": SeriesStyle("all kept", Hue.BLUE, "o", "-"),
+    "some": SeriesStyle("some kept", Hue.ORANGE, "s", "--"),
+    "none": SeriesStyle("none kept", Hue.VERMILION, "^", ":"),
 }
 
 _HOLLOW = "hollow: cell not complete"
+_Groups = dict[str, dict[str, Contrast]]
+"""What is compared, in words, to each system's comparison."""
+
+
+def _points(one: Contrast) -> Interval:
+    return Interval(*(100 * value for value in one.pairs.change))
+
+
+def draw_rows(
+    axes: Any,
+    data: Data,
+    rows: Iterable[tuple[int, Contrast]],
+    value: Callable[[Contrast], Interval] = _points,
+    guides: Mapping[float, str] | None = None,
+) -> None:
+    """Draw values with their intervals, each in its row, over upright lines.
+
+    Args:
+        axes: The panel.
+        data: What figures show: it has the styles of systems.
+        rows: Number of a row and its comparison; hollow where a cell is not complete.
+        value: What is drawn of a comparison; bounds that are NaN are left out.
+        guides: Value to the style of a line at it; None draws one at 0.
+    """
+    for place, line in (guides or {0: "-"}).items():
+        axes.axvline(place, color=GREY, linewidth=0.8, linestyle=line, zorder=0)
+    for row, contrast in rows:
+        style, (middle, low, high) = data.styles[contrast.system], value(contrast)
+        drawn = []
+        if not math.isnan(low):
+            drawn += axes.plot((low, high), (row, row), color=style.colour, linewidth=1.5)
+        face = style.colour if contrast.complete else "white"
+        drawn += axes.plot(middle, row, **style.point | {"markerfacecolor": face})
+        mark(drawn, contrast.system)
+    tidy(axes)
 
 
 def effects(figure: Any, data: Data) -> bool:
     """Draw what each condition with sessions changes, system by system, over a band of noise."""
     own = [c for c in data.contrasts if c.pairs.n and parse_condition(c.condition).kind.name == "k"]
     last = max((parse_condition(c.condition).k for c in own), default=0)
-    found: dict[str, dict[str, Contrast]] = {}
+    found: _Groups = {}
     for one in own:
         name = ""
         if one.table == "lift" and one.condition == START:
@@ -55,12 +84,12 @@ def effects(figure: Any, data: Data) -> bool:
     if not found:
         return False
     flips = _FLIPS if data.flips is None else data.flips
-    said = "assumed, there are no repeats" if data.flips is None else "measured over repeats"
+    source = "assumed, there are no repeats" if data.flips is None else "measured over repeats"
     most = max(c.pairs.n for group in found.values() for c in group.values())
     band = 196 * math.sqrt(flips / most)
     note = (
         f"grey: ±{band:.1f} points, which chance alone stays within in 95% of comparisons of "
-        f"{most} episodes if {100 * flips:.0f}% of outcomes flip between repeats ({said})"
+        f"{most} episodes if {100 * flips:.0f}% of outcomes flip between repeats ({source})"
     )
     title = f"What each condition changes, paired over episodes, {data.simulator}"
     _forest(figure, data, found, title, "difference of success, points", band, note)
@@ -69,7 +98,7 @@ def effects(figure: Any, data: Data) -> bool:
 
 def ceiling(figure: Any, data: Data) -> bool:
     """Draw how far systems stay below the ideal observer with their memory."""
-    found: dict[str, dict[str, Contrast]] = {}
+    found: _Groups = {}
     for one in data.contrasts:
         if one.table == "ceiling" and one.pairs.n:
             found.setdefault(one.condition, {})[one.system] = one
@@ -83,7 +112,7 @@ def ceiling(figure: Any, data: Data) -> bool:
 def _forest(
     figure: Any,
     data: Data,
-    found: Mapping[str, Mapping[str, Contrast]],
+    found: _Groups,
     title: str,
     xlabel: str,
     band: float = 0.0,
@@ -101,33 +130,22 @@ def _forest(
         systems, key=lambda s: -leading[s].pairs.change.value if s in leading else math.inf
     )
     figure.set_size_inches(10, 1.5 + 0.27 * max(3, len(ranked)))
-    panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
+    panels = panel_grid(figure, len(found), len(found))
     for axes, (name, group) in zip(panels, found.items(), strict=True):
         if band:
             axes.axvspan(-band, band, color=GREY, alpha=0.2, linewidth=0, zorder=0)
-        axes.axvline(0, color=GREY, linewidth=0.8, zorder=0)
-        for system, contrast in group.items():
-            change = [100 * value for value in contrast.pairs.change]
-            _dot(axes, change, ranked.index(system), data, contrast)
-        tidy(axes)
+        draw_rows(axes, data, ((ranked.index(system), one) for system, one in group.items()))
         axes.set_title(fill(name, 22), size=9, color=INK)
-    panels[0].set_yticks(range(len(ranked)), [data.looks[system].label for system in ranked])
+    panels[0].set_yticks(range(len(ranked)), [data.styles[system].label for system in ranked])
     panels[0].set_ylim(len(ranked) - 0.4, -0.6)
     figure.suptitle(title, size=10, color=INK)
-    whole = all(c.complete for group in found.values() for c in group.values())
-    said = [f"{xlabel}; bars: 95% intervals", "" if whole else _HOLLOW, fill(note, 150)]
-    legend(figure, "\n".join(filter(None, said)))
+    lines = [f"{xlabel}; bars: 95% intervals", _hollow(found), fill(note, 150)]
+    legend(figure, "\n".join(filter(None, lines)))
 
 
-def _dot(axes: Any, interval: Sequence[float], place: int, data: Data, contrast: Contrast) -> None:
-    """Draw a value with its bounds, as far as it has any; hollow where a cell is not complete."""
-    look, (value, low, high) = data.looks[contrast.system], interval
-    drawn = []
-    if not math.isnan(low):
-        drawn += axes.plot((low, high), (place, place), color=look.colour, linewidth=1.5)
-    face = look.colour if contrast.complete else "white"
-    drawn += axes.plot(value, place, **look.point | {"markerfacecolor": face})
-    mark(drawn, contrast.system)
+def _hollow(found: _Groups) -> str:
+    whole = all(one.complete for group in found.values() for one in group.values())
+    return "" if whole else _HOLLOW
 
 
 def retention(figure: Any, data: Data) -> bool:
@@ -141,7 +159,7 @@ def retention(figure: Any, data: Data) -> bool:
         (c for c in found if c.condition == last), key=lambda c: (c.complete, c.retention.value)
     )
     shown = {contrast.system for contrast in found}
-    absent = [data.looks[system].label for system in data.systems if system not in shown]
+    absent = [data.styles[system].label for system in data.systems if system not in shown]
     note = fill(
         f"Not shown (no lift at k0 with p < {ALPHA}, or rows missing at {last}): "
         f"{', '.join(absent)}",
@@ -149,13 +167,9 @@ def retention(figure: Any, data: Data) -> bool:
     )
     figure.set_size_inches(8, 1.4 + 0.3 * max(2, len(found)))
     axes = figure.subplots()
-    for place, contrast in enumerate(found):
-        _dot(axes, contrast.retention, place, data, contrast)
-    for value, style in ((0, "-"), (1, "--")):
-        axes.axvline(value, color=GREY, linewidth=0.8, linestyle=style, zorder=0)
-    tidy(axes)
+    draw_rows(axes, data, enumerate(found), lambda one: one.retention, {0: "-", 1: "--"})
     axes.grid(visible=False)
-    labels = [data.looks[c.system].label + ("" if c.complete else " † not ranked") for c in found]
+    labels = [data.styles[c.system].label + ("" if c.complete else " † not ranked") for c in found]
     axes.set_yticks(range(len(found)), labels)
     axes.set_ylim(-0.6, len(found) - 0.4)
     scale = f"({last} − no history) / (k0 − no history); 0 nothing left, 1 all; bars: 95% intervals"
@@ -173,30 +187,25 @@ def access(figure: Any, data: Data) -> bool:
     if not systems:
         return False
     wide = min(3, len(systems))
-    high = -(-len(systems) // wide)
-    figure.set_size_inches(max(6.0, 3.6 * wide), 0.9 + 2.3 * high)
-    panels = figure.subplots(high, wide, sharex=True, sharey=True, squeeze=False)
+    figure.set_size_inches(max(6.0, 3.6 * wide), 0.9 + 2.3 * -(-len(systems) // wide))
+    panels = panel_grid(figure, len(systems), wide)
     ends: dict[str, dict[str, float]] = {system: {} for system in systems}
-    for axes, system in zip(panels.flat, systems, strict=False):
-        for number, (level, look) in enumerate(_LEVELS.items()):
-            points = [row[1:2] + row[4:] for row in rows if row[0] == system and row[2] == level]
-            if not points:
+    for axes, system in zip(panels, systems, strict=True):
+        for number, (level, style) in enumerate(_LEVELS.items()):
+            cells = [row for row in rows if row[0] == system and row[2] == level]
+            if not cells:
                 continue
-            xs = [data.x(point[0]) + 0.09 * (number - 1) for point in points]
-            rates, *bounds = zip(*([100 * v for v in point[1:]] for point in points), strict=True)
-            style = look.point | {"linestyle": look.line, "linewidth": look.width}
-            drawn = [*axes.plot(xs, rates, **style, clip_on=False, zorder=3)]
-            drawn.append(axes.vlines(xs, *bounds, color=look.colour, linewidth=0.9, alpha=0.7))
-            mark(drawn, system)
-            ends[system][level] = rates[-1]
-        axes.set_title(data.looks[system].label, size=9, color=INK)
-    for number, axes in enumerate(panels.flat):
-        if number < len(systems):
-            set_axes(axes, data, systems, "" if number % wide else "success, %")
-            axes.tick_params(labelbottom=number + wide >= len(systems))  # nothing below
-            label_ends(axes, ends[systems[number]], _LEVELS, 1.8, 7, systems[number])
-        else:
-            axes.set_axis_off()
+            points = [
+                (data.x(condition) + 0.09 * (number - 1), *(100 * value for value in values))
+                for _, condition, _, _, *values in cells
+            ]
+            line = {"linestyle": style.line, "linewidth": style.width}
+            mark(points_with_bars(axes, points, style, line), system)
+            ends[system][level] = points[-1][1]
+        axes.set_title(data.styles[system].label, size=9, color=INK)
+    for number, (axes, system) in enumerate(zip(panels, systems, strict=True)):
+        set_axes(axes, data, systems, "" if number % wide else "success, %")
+        label_ends(axes, ends[system], _LEVELS, 1.8, 7, system)
     note = "Different episodes: nothing is paired. Bars: 95% Wilson intervals; n in the table."
     legend(figure, f"Where all, some or none of the evidence was in the memory. {note}")
     return True
@@ -212,27 +221,19 @@ def interference(figure: Any, data: Data) -> bool:
     wide = min(3, len(systems))
     rows = -(-len(systems) // wide)
     figure.set_size_inches(7.5, 0.7 + (0.5 + 0.34 * len(shown)) * rows)
-    panels = figure.subplots(rows, wide, sharex=True, sharey=True, squeeze=False)
-    for number, (axes, system) in enumerate(zip(panels.flat, systems, strict=False)):
-        axes.axvline(0, color=GREY, linewidth=0.8, zorder=0)
-        for place, found in enumerate(shown.values()):
-            if contrast := found.get(system):
-                change = [100 * value for value in contrast.pairs.change]
-                _dot(axes, change, place, data, contrast)
-        tidy(axes)
-        axes.tick_params(labelbottom=number + wide >= len(systems))  # nothing below
+    panels = panel_grid(figure, len(systems), wide)
+    for axes, system in zip(panels, systems, strict=True):
+        found = enumerate(group.get(system) for group in shown.values())
+        draw_rows(axes, data, ((place, one) for place, one in found if one))
         axes.set_yticks(range(len(shown)), list(shown), size=7)
-        axes.set_title(fill(data.looks[system].label, 26), size=9, color=INK)
-    panels[0, 0].set_ylim(len(shown) - 0.5, -0.5)  # downwards, as in the table
-    for axes in panels.flat[len(systems) :]:
-        axes.set_axis_off()
+        axes.set_title(fill(data.styles[system].label, 26), size=9, color=INK)
+    panels[0].set_ylim(len(shown) - 0.5, -0.5)  # downwards, as in the table
     figure.supxlabel("difference of success, points, with 95% intervals", size=8, color=INK)
-    whole = all(contrast.complete for found in shown.values() for contrast in found.values())
-    legend(figure, "" if whole else _HOLLOW)
+    legend(figure, _hollow(shown))
     return True
 
 
-def _most_asked(contrasts: Iterable[Contrast]) -> dict[str, dict[str, Contrast]]:
+def _most_asked(contrasts: Sequence[Contrast]) -> _Groups:
     """Return what is asked, in words, to each system's comparison, of equally many sessions.
 
     They are as many as most questions are answered with, of several the most; where a question is
@@ -247,7 +248,7 @@ def _most_asked(contrasts: Iterable[Contrast]) -> dict[str, dict[str, Contrast]]
     counts = Counter(k for by_k in found.values() for k in by_k)
     most = max(counts, key=lambda k: (counts[k], k))
     shown = {}
-    for asks in (KINDS["k"].asks, *(question.asks for question in COMPARISONS.values())):
+    for asks in (KINDS["k"].asks, *(one.asks for one in COMPARISONS.values())):
         if by_k := found.get(asks):
             chosen = by_k.get(most) or by_k[max(by_k)]
             name = f"{asks}\n{chosen[0].condition} − {chosen[0].against[1]}"

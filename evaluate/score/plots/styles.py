@@ -31,7 +31,7 @@ _LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
 
 
 @dataclass(frozen=True)
-class Look:
+class SeriesStyle:
     """How a system is drawn: `#rrggbb`, matplotlib's marker and line style, width in points."""
 
     label: str
@@ -51,7 +51,7 @@ class Look:
 # Of those that share no shape with the paper's, each has its own pair of marker and line.
 _FREE = [(marker, line) for line in _LINES for marker in "vPX<>dph8"]
 _TABLE = {
-    system.name: Look(
+    system.name: SeriesStyle(
         system.display,
         _COLOURS[system.representation],
         *(_SHAPES.get(system.integration or "") or _FREE.pop(0)),
@@ -61,25 +61,27 @@ _TABLE = {
 }
 
 
-def looks_of(names: Sequence[str]) -> dict[str, Look]:
-    """Return the looks of systems; those of the table look the same in every figure.
+def styles_of(names: Sequence[str]) -> dict[str, SeriesStyle]:
+    """Return the styles of systems; those of the table look the same in every figure.
 
     A system with retrieval is a dark star; several are stars in the colours of what they are
     without it. Systems that are not in the table differ from each other and from the rest by
     marker or line, up to two dozen; beyond that colours tell them apart.
     """
-    looks: dict[str, Look] = {}
+    styles: dict[str, SeriesStyle] = {}
     known = {name: system for name in names if (system := known_system(name)) is not None}
     retrieving = [name for name, system in known.items() if system.retrieval]
     own = [name for name in names if name not in known]
     for name in names:
         if name in own:
             round_, shape = divmod(own.index(name), len(_FREE))
-            looks[name] = Look(name, _OWN[(shape + round_) % len(_OWN)], *_FREE[shape])
+            styles[name] = SeriesStyle(name, _OWN[(shape + round_) % len(_OWN)], *_FREE[shape])
         elif name in retrieving:
             system, number = known[name], retrieving.index(name)
             colour = _COLOURS[system.representation] if len(retrieving) > 1 else INK
-            looks[name] = Look(system.display, colour, "*", _LINES[number % len(_LINES)], 2.2)
+            styles[name] = SeriesStyle(
+                system.display, colour, "*", _LINES[number % len(_LINES)], 2.2
+            )
         else:
-            looks[name] = _TABLE[name]
-    return looks
+            styles[name] = _TABLE[name]
+    return styles
