@@ -19,8 +19,6 @@ from robomme_interference_data.stats.intervals import z_of
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.tables import percent
 
-from .comparisons.pairs import Pairs
-
 POWER = 0.8
 """The power that is planned for."""
 
@@ -152,17 +150,20 @@ def smallest(episodes: int, flips: float) -> float | None:
     return high
 
 
-def note(found: Iterable[Pairs]) -> str:
+def note(counts: Iterable[tuple[int, int, int]]) -> str:
     """Return in a sentence what comparisons like some could show; nothing where none is paired.
 
     Their episodes are those of the most, and the flips the median of what goes both ways: twice
     the fewer of gained and lost.
+
+    Args:
+        counts: Pairs, gained and lost of each comparison.
     """
-    pairs = [one for one in found if one.pairs]
-    if not pairs:
+    found = [one for one in counts if one[0]]
+    if not found:
         return ""
-    n = min(MOST, max(one.pairs for one in pairs))
-    flips = round(median(2 * min(one.gained, one.lost) / one.pairs for one in pairs), 3)
+    n = min(MOST, max(pairs for pairs, _, _ in found))
+    flips = round(median(2 * min(gained, lost) / pairs for pairs, gained, lost in found), 3)
     least = smallest(n, flips)
     shown = "no difference" if least is None else f"a difference of {100 * least:.1f} points"
     return (

@@ -48,7 +48,7 @@ def names(figure: Any) -> list[set[str]]:
 
 
 def shapes(styles: Iterable[SeriesStyle], *, colour: bool = False) -> set[tuple[str, ...]]:
-    return {(style.colour * colour, style.marker, str(style.line)) for look in styles}
+    return {(style.colour * colour, style.marker, str(style.line)) for style in styles}
 
 
 def test_systems_differ_from_each_other_and_look_the_same_in_every_figure() -> None:

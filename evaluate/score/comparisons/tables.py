@@ -171,7 +171,8 @@ def comparison_table(
         )
     note = spec.before + spec.note.format(how=_how_to_read(found, spec.among))
     if spec.power:
-        note += power.note(one.pairs for one in found if not one.family)
+        pairs = [one.pairs for one in found if not one.family]
+        note += power.note((one.pairs, one.gained, one.lost) for one in pairs)
     return Table.make(name, spec.title, " ".join(column for column, _ in columns), rows, note)
 
 
