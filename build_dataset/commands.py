@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import Group, print_json, say, stoppable
+from robomme_interference_data.cli.console import Group, echo, print_json, say, stoppable
 from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -16,7 +16,7 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
     SHIFTED,
 )
-from robomme_interference_data.errors import MissingFileError, visible
+from robomme_interference_data.errors import MissingFileError
 from robomme_interference_data.runtime.executor import WorkersConfig, make_executor
 
 from .config import (
@@ -325,7 +325,7 @@ def verify(
         print_json([vars(violation) for violation in violations])
     else:
         for violation in violations:
-            typer.echo(visible(f"{violation.where}: {violation.what}"))
+            echo(f"{violation.where}: {violation.what}")
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
         say(
             f"{len(violations)} violation{'s' * (len(violations) > 1)}"
@@ -356,9 +356,9 @@ def audit(
         print_json(report.as_dict())
     else:
         for table in report.tables():
-            typer.echo(table.text() + "\n")
+            echo(table.text() + "\n")
         for leak in report.leaks:
-            typer.echo(f"LEAK, {leak.kind}: {leak.where}")
+            echo(f"LEAK, {leak.kind}: {leak.where}")
         say(
             f"{len(report.leaks)} leak{'s' * (len(report.leaks) > 1)}"
             if report.leaks

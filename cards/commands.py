@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, print_json, say, stoppable
+from robomme_interference_data.cli.console import check_output, echo, print_json, say, stoppable
 from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.config import Grid
@@ -54,7 +54,7 @@ def card(
     """
     from .publication import Publication
 
-    typer.echo(card_text(source, Publication(repo_id, version, licence)), nl=False)
+    echo(card_text(source, Publication(repo_id, version, licence)), nl=False)
 
 
 def card_text(source: str, about: "Publication") -> str:

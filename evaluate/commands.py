@@ -8,6 +8,7 @@ import typer
 from robomme_interference_data.cli.console import (
     check_output,
     command_line,
+    echo,
     print_json,
     say,
     stoppable,
@@ -49,7 +50,7 @@ def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) 
     if config.retrieval is not None:
         title += f", behind retrieval {config.retrieval}, rule {config.retrieval_rule}"
         title += "" if config.shift == NO_SHIFT else f", shift {config.shift}"
-    typer.echo(module.ceiling_table(cells, title).text())
+    echo(module.ceiling_table(cells, title).text())
 
 
 @with_settings
@@ -138,10 +139,10 @@ def _tell(result: "RunResult", unit: str, *, as_json: bool) -> None:
     if as_json:
         print_json([to_dict(row) for row in result.rows])
     else:
-        typer.echo(rate_table(result.rows).text())
+        echo(rate_table(result.rows).text())
         chances = [row.chance for row in result.rows if row.chance is not None]
         chance = f"; chance is {sum(chances) / len(chances):.1%}" if chances else ""
-        typer.echo(f"{len(result.rows)} of {result.planned} {unit} in {result.folder}{chance}")
+        echo(f"{len(result.rows)} of {result.planned} {unit} in {result.folder}{chance}")
     if result.stopped is not None:
         say(f"Stopped: {result.stopped}", fg="red")
     if broken := result.counts["error"]:
@@ -180,13 +181,13 @@ def merge(
         }
         print_json({"planned": merged.planned, "rows": len(merged.rows), **told})
         return
-    typer.echo(rate_table(merged.rows).text())
+    echo(rate_table(merged.rows).text())
     for name, items in lists.items():
         if items:
             more = f" and {len(items) - 5:,} more" if len(items) > 5 else ""
             shown = ", ".join(map(str, items[:5]))
             say(f"{len(items):,} {_TOLD[name]}: {shown}{more}")
-    typer.echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
+    echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
 
 
 _TOLD = {

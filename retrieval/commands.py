@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, print_json, say, stoppable
+from robomme_interference_data.cli.console import check_output, echo, print_json, say, stoppable
 from robomme_interference_data.cli.options import (
     AsJson,
     ConditionName,
@@ -103,7 +103,7 @@ def index(
     wanted = {"in": made.computed_in, "batch": made.batch}
     for report in reports:
         frames, found = report.header.frames, report.header.computed
-        typer.echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
+        echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
         if found != wanted:
             say(
                 f"{report.folder} is kept, computed with {found['in']}, {found['batch']} images at "
@@ -155,7 +155,7 @@ def retrieve(
     if as_json:
         print_json(to_dict(found))
     else:
-        typer.echo(found.text())
+        echo(found.text())
 
 
 def retrieval_score(
@@ -214,7 +214,7 @@ def retrieval_score(
         about |= {"rules": list(map(str, wanted)), "pass_mark": grade.PASS_MARK}
         print_json(about | {"cells": [to_dict(cell) for cell in cells]})
     else:
-        typer.echo(f"{grade.cell_table(cells, title).text()}\n\n{grade.verdict(cells)}.")
+        echo(f"{grade.cell_table(cells, title).text()}\n\n{grade.verdict(cells)}.")
 
 
 def calibrate(
@@ -259,7 +259,7 @@ def calibrate(
     if as_json:
         print_json(about | to_dict(found))
     else:
-        typer.echo(found.text(title))
+        echo(found.text(title))
 
 
 def _measured(

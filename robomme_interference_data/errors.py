@@ -268,9 +268,9 @@ def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
     return more + ", ".join(names[:10]) + rest
 
 
-def visible(text: str) -> str:
-    """Return text with control characters by their number: a terminal would obey them."""
-    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+def visible(text: str, escape: str = "\\x{:02x}") -> str:
+    """Return text with control characters escaped: a terminal would obey them."""
+    return _CONTROL.sub(lambda match: escape.format(ord(match[0])), text)
 
 
 def printed_last(lines: Sequence[bytes]) -> str | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, command_line, print_json, say
+from robomme_interference_data.cli.console import check_output, command_line, echo, print_json, say
 from robomme_interference_data.cli.options import AsJson, split_commas, with_settings
 
 from .config import Settings
@@ -66,7 +66,7 @@ def score(
         )
     else:
         for grid in found.grids:
-            typer.echo(f"{grid.text()}\n")
+            echo(f"{grid.text()}\n")
     say(f"Report: {out / 'report.html'}")
 
 
@@ -114,7 +114,7 @@ def compare(
         bad = [rows.refused for rows in found.runs]
         print_json({"bad_rows": bad, "notes": list(found.notes), "rows": found.table.records()})
     else:
-        typer.echo(found.table.text())
+        echo(found.table.text())
 
 
 def power(
@@ -150,10 +150,10 @@ def power(
         f"episodes that find {margin:g} points with 80% power": f"{found.needed:,}",
         "smallest margin of an equivalence, with 80% power": f"±{100 * found.equal:.1f} points",
     }
-    typer.echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by themselves\n")
+    echo(f"{episodes:,} episodes, of which {100 * flips:g}% flip by themselves\n")
     wide = max(map(len, told))
     for name, value in told.items():
-        typer.echo(f"{name:{wide}}  {value}")
+        echo(f"{name:{wide}}  {value}")
 
 
 def _tell(found: "Sequence[Rows]", notes: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ from robomme_interference_data.data.fetch import FetchConfig
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
-from .console import check_output, print_json, say, stoppable
+from .console import check_output, echo, print_json, say, stoppable
 from .options import (
     AsJson,
     ConditionName,
@@ -59,7 +59,7 @@ def list_buffers(
         map(values, found),
         "lesson, history: frames; share: of lesson in an even 32-frame sample",
     )
-    typer.echo(table.text())
+    echo(table.text())
 
 
 def list_conditions(as_json: AsJson = False) -> None:
@@ -86,7 +86,7 @@ def list_conditions(as_json: AsJson = False) -> None:
     if as_json:
         print_json(table.records())
     else:
-        typer.echo(table.text())
+        echo(table.text())
 
 
 def show(
@@ -144,7 +144,7 @@ def show(
         f"{len(buffer)} history frames; an even 32-frame sample at the first step holds "
         f"{manifest.lesson_share:.0%} lesson",
     )
-    typer.echo(table.text())
+    echo(table.text())
     if evidence:
         spans = Table.make(
             "evidence",
@@ -156,7 +156,7 @@ def show(
             ),
             "frames: in the buffer",
         )
-        typer.echo(f"\n{spans.text()}")
+        echo(f"\n{spans.text()}")
 
 
 def show_question(
@@ -197,7 +197,7 @@ def show_question(
         return
     for name, text in told.items():
         lines = text if isinstance(text, tuple) else (text,)
-        typer.echo("\n".join(f"{name if not n else '':8}  {line}" for n, line in enumerate(lines)))
+        echo("\n".join(f"{name if not n else '':8}  {line}" for n, line in enumerate(lines)))
 
 
 @with_settings
@@ -253,7 +253,7 @@ def fetch(
 
 
 def doctor(as_json: AsJson = False) -> None:
-    """Tell what works on this machine, and the command that mends what does not.
+    """Check what works on this machine, and print the command that mends what does not.
 
     Example:
     ```
@@ -266,6 +266,6 @@ def doctor(as_json: AsJson = False) -> None:
     if as_json:
         print_json([asdict(row) for row in rows])
     else:
-        typer.echo(module.report(rows).text())
-    if module.any_failed(rows):
+        echo(module.report(rows).text())
+    if any(row.ok is False for row in rows):
         raise typer.Exit(1)

@@ -33,6 +33,11 @@ class Group(TyperGroup):
                 formatter.write_dl(told)
 
 
+def echo(text: str, *, nl: bool = True) -> None:
+    """Print output to stdout; what a terminal would obey instead of showing it is escaped."""
+    typer.echo(visible(text), nl=nl)
+
+
 def say(text: str, **style: Any) -> None:
     """Print a message to stderr; styles are those of `typer.secho`."""
     typer.secho(visible(text), err=True, **style)
@@ -70,7 +75,8 @@ def check_output(*paths: Path | None) -> None:
 
 def print_json(value: Any) -> None:
     """Print one JSON value to stdout."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+    text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+    typer.echo(visible(text, "\\u{:04x}"))
 
 
 def command_line() -> str:

@@ -1,39 +1,42 @@
 """Find out what works on this machine, and which command mends what does not.
 
 Nothing heavy is imported: installed versions are read from the packages' metadata, and other
-processes are asked whether the simulators work.
+processes find out whether the simulators work.
 """
 
-import ctypes
+import logging
 import os
 import platform
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata, util
-from pathlib import Path
 
 from packaging.requirements import Requirement
 
 from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.viz.tables import Column, Table
 
+logger = logging.getLogger(__name__)
+
 DISTRIBUTION = "robomme-interference-data"
 
-CODECS = (("libaom-av1", "w"), ("libsvtav1", "w"), ("libdav1d", "r"))
-"""Codecs that datasets are written and read with: FFmpeg's name, `w` encoder or `r` decoder."""
-
-LIBAVUTIL = range(60, 55, -1)
-"""Versions of libavutil in FFmpeg 8 to 4, which torchcodec can load."""
+EXTRAS = {
+    "build": "Build datasets",
+    "sim": "Simulator",
+    "evaluate": "Evaluate",
+    "vlm": "Vision-language models",
+    "cluster": "Clusters",
+    "retrieval": "Retrieval",
+    "score": "Score",
+}
 
 RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
 """The program that draws a picture: a broken driver can crash its process or never return."""
 
-RENDERER_S, ROBOMME_S = 30, 120
-"""Seconds that the simulators have to answer."""
+RENDERER_S, ROBOMME_S, HUB_S = 30, 120, 10
+"""Seconds that the simulators and the Hub have to answer."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Check:
     """One row of the doctor's table.
 
     Attributes:
-        name: What was looked at.
+        name: What was checked.
         ok: True if it works, False if something needed does not, None if something optional is
             absent or cannot be used.
         detail: Versions, names, or what is wrong.
@@ -55,30 +58,16 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """Look at everything; takes a few seconds, and a minute more where RoboMME is."""
+    """Check everything; takes a few seconds, and a minute more where RoboMME is."""
     return [
         Check("Python", True, f"{platform.python_version()} ({sys.executable})"),
         check_packages("Core libraries"),
-        check_video(CODECS),
-        check_packages("Build datasets", "build"),
-        check_shared_ffmpeg(LIBAVUTIL),
-        check_opencv(),
-        check_packages("Simulator", "sim"),
+        check_video(),
+        *(check_packages(f"{name} [{extra}]", extra) for extra, name in EXTRAS.items()),
         check_renderer(),
         check_robomme(),
-        check_packages("Evaluate", "evaluate"),
-        check_packages("Vision-language models", "vlm"),
-        check_packages("Clusters", "cluster"),
-        check_packages("Retrieval", "retrieval"),
-        check_packages("Score", "score"),
-        check_hub_token(),
-        check_hub_cache(),
+        check_hub(),
     ]
-
-
-def any_failed(rows: Sequence[Check]) -> bool:
-    """Tell whether something needed does not work; absent optional parts do not count."""
-    return any(row.ok is False for row in rows)
 
 
 def report(rows: Sequence[Check]) -> Table:
@@ -93,20 +82,13 @@ def report(rows: Sequence[Check]) -> Table:
     return Table("doctor", "", columns, tuple(lines))
 
 
-# --- packages ----------------------------------------------------------------------------------
-
-
 def check_packages(name: str, extra: str = "") -> Check:
-    """Look at the packages of an extra; without one, at those that are always needed."""
-    name = f"{name} [{extra}]" if extra else name
-    try:
-        needed = _requirements(DISTRIBUTION, extra)
-        problems = [problem for requirement in needed for problem in _problems(requirement)]
-    except metadata.PackageNotFoundError:
-        needed, problems = [], [f"{DISTRIBUTION} itself is not installed"]
+    """Check the packages of an extra; without one, those that are always needed."""
+    needed = _requirements(DISTRIBUTION, extra)
+    problems = [problem for requirement in needed for problem in _problems(requirement)]
     if not problems:
-        found = [f"{item.name} {metadata.version(item.name)}" for item in needed]
-        return Check(name, True, ", ".join(found))
+        found = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in needed)
+        return Check(name, True, found)
     if extra:
         return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
     return Check(name, False, ", ".join(problems), f"pip install --upgrade {DISTRIBUTION}")
@@ -136,60 +118,19 @@ def _problems(requirement: Requirement) -> Iterator[str]:
             yield from _problems(nested)
 
 
-def check_opencv() -> Check:
-    """Look whether two packages of OpenCV overwrite each other's files."""
-    found = []
-    for name in ("opencv-python", "opencv-python-headless"):
-        with suppress(metadata.PackageNotFoundError):
-            found.append(f"{name} {metadata.version(name)}")
-    if len(found) < 2:
-        return Check("OpenCV", True if found else None, "".join(found) or "not installed")
-    return Check(
-        "OpenCV",
-        False,
-        f"{', '.join(found)} overwrite each other's files",
-        "pip uninstall -y opencv-python opencv-python-headless && "
-        'pip install "opencv-python-headless<4.14"',
-    )
-
-
-# --- video ---------------------------------------------------------------------------------------
-
-
-def check_video(codecs: Sequence[tuple[str, str]]) -> Check:
-    """Look for codecs in PyAV's own FFmpeg."""
+def check_video(decoder: str = "libdav1d", encoder: str = "libaom-av1") -> Check:
+    """Check that PyAV can decode videos of datasets, and encode them, which only builds need."""
     name = "Video (PyAV)"
     fix = 'pip install --force-reinstall --only-binary av "av>=14"'
     try:
         import av
     except ImportError as error:
         return Check(name, False, str(error), fix)
-    versions = f"FFmpeg {av.ffmpeg_version_info} in PyAV {av.__version__}"
-    for codec, mode in codecs:
-        try:
-            av.codec.Codec(codec, mode)
-        except ValueError:
-            what = "encoder" if mode == "w" else "decoder"
-            return Check(name, False, f"{versions} has no {what} {codec}", fix)
-    return Check(name, True, f"{versions} with {', '.join(codec for codec, _ in codecs)}")
-
-
-def check_shared_ffmpeg(versions: Sequence[int]) -> Check:
-    """Look for FFmpeg's shared libraries."""
-    name = "FFmpeg's shared libraries"
-    mac = sys.platform == "darwin"
-    for version in versions:
-        library = f"libavutil.{version}.dylib" if mac else f"libavutil.so.{version}"
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            continue
-        return Check(name, True, f"{library}, for torchcodec")
-    install = "brew install ffmpeg" if mac else "sudo apt-get install ffmpeg"
-    return Check(name, None, "not found; only torchcodec needs them", install)
-
-
-# --- simulators ----------------------------------------------------------------------------------
+    found = f"PyAV {av.__version__}"
+    for ok, codec, what in ((False, decoder, "decoder"), (None, encoder, "encoder")):
+        if codec not in av.codecs_available:
+            return Check(name, ok, f"{found} has no {what} {codec}", fix)
+    return Check(name, True, f"{found} with {decoder} and {encoder}")
 
 
 def check_renderer(module: str = RENDERER, seconds: float = RENDERER_S) -> Check:
@@ -219,16 +160,13 @@ def check_robomme() -> Check:
     from robomme_interference_data.simulators.robomme.process import PYTHON_VARIABLE
     from robomme_interference_data.simulators.robomme.simulator import ARMS, RoboMMESimulator
 
-    from .console import say
-
     name = "Official simulator"
     fix = f"export {PYTHON_VARIABLE}=PATH, the Python of an environment that has RoboMME"
     python = os.environ.get(PYTHON_VARIABLE)
     if not python:
-        detail = f"{PYTHON_VARIABLE} is not set; only --simulator robomme needs it"
+        detail = f"{PYTHON_VARIABLE} is not set; only the simulator robomme needs it"
         return Check(name, None, detail, fix)
-    played = " and ".join(f"{family}/test/0" for family in ARMS)
-    say(f"RoboMME plays {played}, one with each of its arms: a minute or so")
+    logger.info("RoboMME plays an episode with each of its arms: a minute or so")
     try:
         with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
             versions = [f"{key} {value}" for key, value in simulator.versions.items()]
@@ -239,26 +177,24 @@ def check_robomme() -> Check:
     return Check(name, True, f"{python}: {', '.join(versions)}")
 
 
-# --- the Hub -------------------------------------------------------------------------------------
+def check_hub() -> Check:
+    """Check that the Hub answers and knows the token, which is not shown."""
+    import httpx
+    from huggingface_hub import HfApi, constants, get_token
+    from huggingface_hub.utils import get_session
 
-
-def check_hub_token() -> Check:
-    """Look for a token; it is not shown."""
-    from huggingface_hub import get_token
-
-    if get_token():
-        return Check("Hub token", True, "found")
-    return Check("Hub token", None, "none; only private datasets need it", "hf auth login")
-
-
-def check_hub_cache() -> Check:
-    """Look whether the Hub's cache can be written, and how much room it has."""
-    from huggingface_hub import constants
-
-    cache = Path(constants.HF_HUB_CACHE)
-    existing = next(folder for folder in (cache, *cache.parents) if folder.exists())
-    if not (existing.is_dir() and os.access(existing, os.W_OK)):
-        fix = "export HF_HOME=FOLDER, a folder that you may write to"
-        return Check("Hub cache", None, f"{cache} cannot be written", fix)
-    free = shutil.disk_usage(existing).free / 1e9
-    return Check("Hub cache", True, f"{cache}, {free:.0f} GB free")
+    name, hub, token = "Hugging Face Hub", constants.ENDPOINT, get_token()
+    if constants.HF_HUB_OFFLINE:
+        return Check(name, None, "HF_HUB_OFFLINE is set", "unset HF_HUB_OFFLINE")
+    try:
+        if token is None:
+            get_session().head(hub, timeout=HUB_S)
+            detail = f"{hub} answers; without a token, which private datasets need"
+            return Check(name, None, detail, "hf auth login")
+        return Check(name, True, f"{hub} answers {HfApi().whoami(token)['name']}")
+    except httpx.HTTPError as error:
+        response = getattr(error, "response", None)
+        if response is not None and response.status_code == httpx.codes.UNAUTHORIZED:
+            return Check(name, False, f"{hub} does not know the token", "hf auth login --force")
+        detail = f"{hub} does not answer: {first_line(error)}"
+        return Check(name, None, detail, "check the network, and HF_ENDPOINT if it is set")

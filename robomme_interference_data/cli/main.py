@@ -6,6 +6,7 @@ Each area has its own commands file; only this one sees all of them.
 import os
 import signal
 import sys
+import traceback
 from importlib import metadata
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub_errors import check_endpoint
 
 from . import commands
-from .console import Group, log_to_stderr, say
+from .console import Group, echo, log_to_stderr, say
 from .hints import PROGRAM, error_lines, option_names
 
 
@@ -93,7 +94,7 @@ _GROUPS = {
 
 def _tell_version(asked: bool) -> None:
     if asked:
-        typer.echo(f"{PROGRAM} {metadata.version('robomme-interference-data')}")
+        echo(f"{PROGRAM} {metadata.version('robomme-interference-data')}")
         raise typer.Exit
 
 
@@ -140,9 +141,10 @@ def main() -> None:
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    except OSError as error:
-        if error.errno is None:  # not the system's word on a file
-            raise
+    except Exception as error:
+        if not isinstance(error, OSError) or error.errno is None:  # a fault of ours
+            say(traceback.format_exc())
+            sys.exit(1)
         names = [name for name in (error.filename, error.filename2) if name is not None]
         where = f"{' -> '.join(map(str, names))}: " if names else ""
         hint = "Check the path, its permissions and the space left on the disk."

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, print_json
+from robomme_interference_data.cli.console import check_output, echo, print_json
 from robomme_interference_data.cli.options import AsJson
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
@@ -118,7 +118,7 @@ def simulate(
         print_json(result)
         return
     for key, value in result.items():
-        typer.echo(f"{key.replace('_', ' ')}: {value}")
+        echo(f"{key.replace('_', ' ')}: {value}")
 
 
 def _picture(

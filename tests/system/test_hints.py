@@ -1,15 +1,19 @@
 """How the command line prints errors and messages."""
 
+import json
 import logging
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
 
+from robomme_interference_data.cli import main
+from robomme_interference_data.cli.console import echo, log_to_stderr, print_json
 from robomme_interference_data.cli.hints import error_lines, option_names
-from robomme_interference_data.cli.main import app, log_to_stderr
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, NoRendererError
 
-EVALUATE = option_names(typer.main.get_command(app), ["evaluate", "my-split", "--json"])
+EVALUATE = option_names(typer.main.get_command(main.app), ["evaluate", "my-split", "--json"])
 
 
 @pytest.mark.parametrize(
@@ -44,3 +48,30 @@ def test_what_the_package_logs_is_printed_without_obeying_it(
     logger.info("fetched %s", "\x1b[2Jname")
     logger.debug("not shown")
     assert capsys.readouterr().err == "fetched \\x1b[2Jname\n"
+
+
+HOSTILE = "\x1b[2J\x9b2J\x1b]0;title\x07"
+TO_OBEY = {"\x1b", "\x9b", "\x07"}
+
+
+@pytest.mark.parametrize(
+    "error", [InterferenceError(HOSTILE, HOSTILE), OSError(1, HOSTILE, HOSTILE), KeyError(HOSTILE)]
+)
+def test_a_terminal_obeys_no_error_and_no_traceback(
+    error: Exception, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "robomme_interference_data.cli.main.check_endpoint", Mock(side_effect=error)
+    )
+    code, out, err = run("conditions")
+    assert (code, out) == (1, "")
+    assert "[2J" in err and not TO_OBEY & {*err}
+
+
+def test_a_terminal_obeys_no_output(capsys: pytest.CaptureFixture[str]) -> None:
+    echo(f"a\n\t{HOSTILE}")
+    print_json({"key": HOSTILE})
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first == "a"
+    assert not TO_OBEY & {*"".join(rest)}
+    assert json.loads("\n".join(rest[1:])) == {"key": HOSTILE}  # JSON has escapes of its own
