@@ -16,7 +16,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
-from timing import Times, interleave, machine, positive, table
+from common import Times, interleave, machine, positive, table
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes

@@ -23,8 +23,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
+from common import Times, add_split, demo_split, machine, positive, table
 from nothing import Nothing
-from timing import Times, machine, positive, table
 
 from evaluate import seconds_a_rollout
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
@@ -104,12 +104,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rollouts", type=positive, default=100_000)
     parser.add_argument("--workers", type=positive, default=2)
-    parser.add_argument("--split", type=Path, default=Path("demo/tabletop"))
+    add_split(parser)
     parser.add_argument("--replayed", type=positive, default=48, help="rollouts of replay")
     parser.add_argument("--reset", type=float, nargs=2, default=(5.0, 27.0), help="s, least, most")
     parser.add_argument("--steps-s", type=float, nargs=2, default=(9.0, 13.0), help="the same")
     parser.add_argument("--rounds", type=positive, default=3)
     given: Any = parser.parse_args()
+    given.split = given.split or demo_split()
     print(machine("ray"))
 
     columns = ["<rollouts", ">rows/s", ">ms of the driver", ">of a core at 17 rows/s", ">MB grown"]

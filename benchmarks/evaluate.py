@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import add_split, demo_split, interleave, machine, positive, table
 from numpy.typing import NDArray
-from timing import interleave, machine, positive, table
 
 from robomme_interference_data import DecodedCache, Split, load_split
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
@@ -77,11 +77,12 @@ class Clock:
 def main() -> None:
     """Measure and print."""
     options = parse_options()
-    split = load_split(options.split, threads=1)
+    folder = options.split or demo_split()
+    split = load_split(folder, threads=1)
     print(machine("mani-skill", "av"), end="\n\n", flush=True)
     rows = []
     with tempfile.TemporaryDirectory() as kept, TabletopSimulator(cameras=CAMERAS) as simulator:
-        cached = load_split(options.split, cache=DecodedCache(Path(kept)), threads=1)
+        cached = load_split(folder, cache=DecodedCache(Path(kept)), threads=1)
         for name in options.episodes:
             episode = EpisodeId.parse(name)
             rows.append(overhead(episode, simulator, split, cached, options.rounds))
@@ -101,7 +102,7 @@ def main() -> None:
             f"`replay`, {options.rollouts} rollouts; the first of each worker, which "
             "starts its simulator, is left out. Aim ≥ 1.8.",
             ("<workers", ">s a rollout", ">ratio"),
-            workers(options.split, options.rollouts),
+            workers(folder, options.rollouts),
         )
     )
 
@@ -109,7 +110,7 @@ def main() -> None:
 def parse_options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--split", type=Path, default=Path("demo/tabletop"))
+    add_split(parser)
     parser.add_argument(
         "--episodes", nargs="+", default=["MoveCube/test/0", "PatternLock/test/0"], metavar="ID"
     )

@@ -15,8 +15,8 @@ from typing import Any
 
 import av
 import av.logging
-from load import Span, choose_buffer, demo_split, open_lerobot, spans_of
-from timing import interleave, machine, megabytes, positive, table
+from common import add_split, demo_split, interleave, machine, megabytes, positive, table
+from load import Span, choose_buffer, open_lerobot, spans_of
 
 from robomme_interference_data import Buffer, Split, load_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
@@ -33,9 +33,7 @@ from robomme_interference_data.errors import InterferenceError
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--split", type=Path, help="folder of a split; by default that of make demo"
-    )
+    add_split(parser)
     parser.add_argument("--items", type=positive, default=100, help="items read in a round")
     parser.add_argument("--rounds", type=positive, default=5, help="timed repetitions")
     options = parser.parse_args()

@@ -12,11 +12,11 @@ import sys
 from pathlib import Path
 from statistics import median
 
+from common import add_split, demo_split, machine, megabytes, positive, table
 from files import packet_bytes
-from load import choose_buffer, demo_split, spans_of
+from load import choose_buffer, spans_of
 from loopback_hub import Hub, Run, running
 from made_split import write_split
-from timing import machine, megabytes, positive, table
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
@@ -35,9 +35,7 @@ SPAN_FILES = re.compile(r"/(data|videos)/")
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--split", type=Path, help="split to load a buffer of; by default that of make demo"
-    )
+    add_split(parser)
     parser.add_argument("--queries", type=positive, default=450, help="of the made-up split")
     parser.add_argument("--units", type=positive, default=450, help="of the made-up split")
     parser.add_argument("--latency", type=positive, default=50, help="of every answer, ms")

@@ -9,7 +9,6 @@ import dataclasses
 import logging
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -20,8 +19,18 @@ from typing import Any
 
 import av
 import numpy as np
+from common import (
+    add_split,
+    demo_split,
+    in_fresh_process,
+    interleave,
+    machine,
+    megabytes,
+    peak_memory,
+    positive,
+    table,
+)
 from numpy.typing import NDArray
-from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
 from robomme_interference_data import Buffer, DecodedCache, Split, load_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
@@ -29,8 +38,6 @@ from robomme_interference_data.constants import FRONT
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.conditions import parse_condition
 
-ROOT = Path(__file__).resolve().parent.parent
-DEMO_SPLIT = ROOT / "demo" / "split"
 TIMES_LONGER = 4
 COLUMNS = ("<loading", ">s", "<against", ">s", ">ratio", ">aim")
 
@@ -62,11 +69,7 @@ def main() -> None:
 def parse_options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--split",
-        type=Path,
-        help="folder of a split; by default that of make demo, made if need be",
-    )
+    add_split(parser)
     parser.add_argument(
         "--episode", help="query episode; by default the one with the median lesson length"
     )
@@ -83,14 +86,6 @@ def parse_options() -> argparse.Namespace:
     )
     parser.add_argument("--chunk", type=positive, default=64, help="frames in a chunk of stream()")
     return parser.parse_args()
-
-
-def demo_split() -> Path:
-    """Return the split of `make demo`, made now if it is not there."""
-    if not (DEMO_SPLIT / "manifests" / "manifest.json").is_file():
-        demo = [sys.executable, str(ROOT / "scripts" / "demo.py")]
-        subprocess.run(demo, check=True, stdout=sys.stderr)
-    return DEMO_SPLIT
 
 
 def choose_buffer(split: Split, episode: str | None, condition: str | None) -> Buffer:

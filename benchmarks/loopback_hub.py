@@ -1,7 +1,6 @@
 """A Hub on the loopback interface, and processes of which it counts the requests."""
 
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -10,10 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-from timing import in_fresh_process
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from common import in_fresh_process
 from support.hub_http import Request
 from support.hub_server import HubServer, User
 

@@ -17,33 +17,27 @@ from statistics import median
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from timing import in_fresh_process, machine, megabytes, peak_memory, positive, table
+from common import in_fresh_process, machine, megabytes, peak_memory, positive, table
+from support.made_up import write_metadata
 
-from robomme_interference_data.build_dataset.identity import identity_of
 from robomme_interference_data.build_dataset.manifests import planned_buffers, write_manifests
 from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
 from robomme_interference_data.constants import (
-    CAMERA_PREFIX,
     DEMONSTRATIONS,
     DISTRACTORS,
     FAMILIES,
-    FPS,
     FRONT,
-    IDENTITY_PATH,
-    INFO_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
-    RECORDS_PATH,
     STATE,
     UNIT_FRAMES,
     WRIST,
 )
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests
-from robomme_interference_data.storage.files import write_json
 
 _SPANS = ("first", "second", "last", "query")
 SHAPES = {FRONT: (256, 256, 3), WRIST: (256, 256, 3), STATE: (8,)}
@@ -122,24 +116,7 @@ def plainly(root: Path) -> None:
 
 def write_dataset(root: Path, kind: str, count: int) -> None:
     """Write the metadata of a dataset with so many episodes."""
-    records = [made_up(kind, index) for index in range(count)]
-    features = {
-        name: {"dtype": "video" if name.startswith(CAMERA_PREFIX) else "float32", "shape": shape}
-        for name, shape in SHAPES.items()
-    }
-    info = {
-        "codebase_version": "v3.0",
-        "fps": FPS,
-        "total_episodes": count,
-        "features": features,
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-    }
-    write_json(root / INFO_PATH, info)
-    identity = identity_of(records, kind, "1.0.0", "av1-lossless", (), "0" * 64)
-    write_json(root / IDENTITY_PATH, to_dict(identity))
-    path = root / RECORDS_PATH
-    pq.write_table(to_table(records, arrow_schema(EpisodeRecord, sorted(SHAPES))), path)
+    write_metadata(root, kind, (made_up(kind, index) for index in range(count)), SHAPES)
 
 
 def made_up(kind: str, index: int) -> EpisodeRecord:

@@ -12,11 +12,10 @@ import multiprocessing
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from timing import Times, interleave, machine, megabytes, positive, table
+from common import Times, add_split, demo_split, interleave, machine, megabytes, positive, table
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -47,7 +46,7 @@ def main() -> None:
     # One frame more: the first live observation.
     images = draw.integers(0, 256, (frames + 1, 256, 256, 3), dtype=np.uint8)
     states = draw.normal(size=(frames + 1, 8)).astype(np.float32)
-    split = load_split(options.split, threads=1)
+    split = load_split(options.split or demo_split(), threads=1)
     buffer = split.load(options.episode, split.conditions[-1])
     with servers() as ports:
         times, size = measure(ports, images, states, options.rounds)
@@ -93,9 +92,7 @@ def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lesson", type=positive, default=246, help="frames of the lesson")
     parser.add_argument("--rounds", type=positive, default=7)
-    parser.add_argument(
-        "--split", type=Path, default=Path("demo/split"), help="of the buffer that is decoded"
-    )
+    add_split(parser)
     parser.add_argument("--episode", default="MoveCube/test/0", metavar="ID")
     return parser.parse_args()
 

@@ -21,9 +21,8 @@ from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
-from load import demo_split
+from common import Times, add_split, demo_split, interleave, machine, positive, table
 from manifests import write_dataset
-from timing import Times, interleave, machine, positive, table
 
 from robomme_interference_data import Dataset, load_split
 from robomme_interference_data.build_dataset.manifests import write_manifests
@@ -84,9 +83,7 @@ class MadeUp:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--split", type=Path, help="folder of a split; by default that of make demo"
-    )
+    add_split(parser)
     parser.add_argument("--model", choices=TOWERS, default="base", help="SigLIP architecture")
     parser.add_argument("--device", help="where it computes; by default a GPU if there is one")
     parser.add_argument("--rounds", type=positive, default=3, help="timed repetitions")

@@ -12,7 +12,7 @@ import statistics
 import time
 
 import numpy as np
-from timing import machine, positive, table
+from common import machine, positive, table
 
 from robomme_interference_data.simulators.base import Status
 from robomme_interference_data.simulators.robomme.simulator import ARMS, RoboMMESimulator

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from timing import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
+from common import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Settings

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from timing import in_fresh_process, machine, positive, table
+from common import in_fresh_process, machine, positive, table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.ids import EpisodeId

@@ -1,6 +1,6 @@
 """Datasets of metadata alone, and sources whose frames are made up."""
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,14 +49,19 @@ def record(
     return EpisodeRecord(**{**known, **changes})
 
 
-def write_metadata(root: Path, kind: str, records: Iterable[EpisodeRecord]) -> Dataset:
-    """Write a dataset of so many episodes without data or videos."""
+def write_metadata(
+    root: Path,
+    kind: str,
+    records: Iterable[EpisodeRecord],
+    shapes: Mapping[str, Sequence[int]] = SHAPES,
+) -> Dataset:
+    """Write a dataset of so many episodes, with features of these shapes, but no data or videos."""
     listed = [
         EpisodeRecord(**{**vars(one), "episode_index": index}) for index, one in enumerate(records)
     ]
     features = {
         name: {"dtype": "video" if name.startswith(CAMERA_PREFIX) else "float32", "shape": shape}
-        for name, shape in SHAPES.items()
+        for name, shape in shapes.items()
     }
     info = {
         "codebase_version": "v3.0",
@@ -70,7 +75,7 @@ def write_metadata(root: Path, kind: str, records: Iterable[EpisodeRecord]) -> D
     identity = identity_of(listed, kind, "1.0.0", "av1-lossless", (), "0" * 64)
     write_json(root / IDENTITY_PATH, to_dict(identity))
     path = root / RECORDS_PATH
-    pq.write_table(to_table(listed, arrow_schema(EpisodeRecord, sorted(SHAPES))), path)
+    pq.write_table(to_table(listed, arrow_schema(EpisodeRecord, sorted(shapes))), path)
     return Dataset(LocalFiles(root))
 
 

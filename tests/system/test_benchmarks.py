@@ -10,7 +10,7 @@ from support.splits import GOLDEN
 from support.tabletop import TABLETOP
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-HELPERS = {"loopback_hub", "made_split", "nothing", "timing"}
+HELPERS = {"loopback_hub", "made_split", "nothing", "common"}
 SPLIT = ("--split", GOLDEN)
 SMALLEST: dict[str, tuple[object, ...]] = {
     "build": ("--source", "sample:MoveCube", "--workers", 1),

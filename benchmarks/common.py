@@ -1,4 +1,7 @@
-"""What the benchmarks share: interleaved timing, peak memory, the machine, and a table."""
+"""What the benchmarks share: interleaved timing, peak memory, the machine, a table, a split.
+
+Imported first, it also finds the tests' helpers (`support`).
+"""
 
 import argparse
 import gc
@@ -8,6 +11,7 @@ import platform
 import re
 import resource
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +22,8 @@ from pathlib import Path
 
 __all__ = [
     "Times",
+    "add_split",
+    "demo_split",
     "in_fresh_process",
     "interleave",
     "machine",
@@ -26,6 +32,24 @@ __all__ = [
     "positive",
     "table",
 ]
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+
+def add_split(parser: argparse.ArgumentParser) -> None:
+    """Let the command line name a split."""
+    text = "folder of a split; by default that of make demo, made if need be"
+    parser.add_argument("--split", type=Path, help=text)
+
+
+def demo_split() -> Path:
+    """Return the split of `make demo`, made now if it is not there."""
+    split = ROOT / "demo" / "split"
+    if not (split / "manifests" / "manifest.json").is_file():
+        demo = [sys.executable, str(ROOT / "scripts" / "demo.py")]
+        subprocess.run(demo, check=True, stdout=sys.stderr)
+    return split
 
 
 @dataclass(frozen=True)
