@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from support.few import few
 
 from robomme_interference_data.build_dataset.sources.base import SourceEpisode
 from robomme_interference_data.build_dataset.sources.simulator import SimulatorSource
@@ -27,7 +28,7 @@ def simulator() -> Iterator[TabletopSimulator]:
         yield opened
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", few(FAMILIES))
 def test_goal_and_first_view_are_the_querys(simulator: TabletopSimulator, family: str) -> None:
     episode = EpisodeId(family, "test", 1)
     source = SimulatorSource("tabletop")

@@ -90,6 +90,7 @@ def test_what_is_not_possible_is_refused(options: dict[str, Any], possible: str)
         TabletopEnv(**options)
 
 
+@pytest.mark.slow
 def test_seeds_and_options_of_a_reset() -> None:
     env = make(render=False, control_mode="pd_joint_pos", num_envs=1, obs_mode="state")
     env.unwrapped.demonstrating = False

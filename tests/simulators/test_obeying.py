@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from support.few import few
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.schema.rollouts import Status
@@ -48,7 +49,7 @@ def obeyed(
 # --- what is obeyed ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", few(FAMILIES))
 def test_told_what_to_do_it_succeeds(blind: TabletopSimulator, family: str) -> None:
     """The hard ones have all steps: of two containers, after exchanges, of the longest path."""
     assert obeyed(blind, f"{family}/test/2")[0] is Status.SUCCESS
@@ -62,6 +63,7 @@ def test_told_what_to_do_it_always_succeeds(blind: TabletopSimulator, family: st
         assert status is Status.SUCCESS, (index, heard)
 
 
+@pytest.mark.slow
 def test_the_steps_are_told_in_order(blind: TabletopSimulator) -> None:
     # Episode 2 is hard: two colours are asked for; in VideoRepick, two times.
     put, up = "put it down", "pick up the container"
@@ -74,7 +76,7 @@ def test_the_steps_are_told_in_order(blind: TabletopSimulator) -> None:
     ]
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", few(FAMILIES))
 def test_untold_it_does_what_guess_does(blind: TabletopSimulator, family: str) -> None:
     actions = []
     for act in (lambda: blind.obey(None), lambda: blind.act("guess")):
@@ -95,6 +97,7 @@ def test_another_wording_and_points_a_little_off_will_do(blind: TabletopSimulato
     assert obeyed(blind, "VideoRepick/test/0", otherwise)[0] is Status.SUCCESS
 
 
+@pytest.mark.slow
 def test_words_alone_leave_it_to_the_seed_which_thing_is_meant(blind: TabletopSimulator) -> None:
     ends = [
         [

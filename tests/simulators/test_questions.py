@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import pytest
+from support.few import few
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
@@ -25,7 +26,7 @@ BEFORE = 0.03
 """m: a peg goes in from so far before the box's side."""
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", few(FAMILIES))
 def test_the_right_option_alone_is_marked_where_it_is(
     blind: TabletopSimulator, family: str
 ) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.few import few
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
@@ -59,6 +60,7 @@ def test_each_shift_is_seen_and_the_stronger_the_more(shifted: TabletopSimulator
     assert all(np.array_equal(again.images[name], plain.images[name]) for name in plain.images)
 
 
+@pytest.mark.slow
 def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
     shifted: TabletopSimulator,
 ) -> None:
@@ -92,7 +94,7 @@ def test_the_scene_stays_under_a_shift_while_it_is_played(shifted: TabletopSimul
         assert np.array_equal(states, played[0])
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", few(FAMILIES))
 def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, family: str) -> None:
     """No part of the hand, and nothing on the table, comes to where one of them may stand."""
     blind.reset(f"{family}/test/2", demonstration=False)
