@@ -1,9 +1,7 @@
-"""Arrays in `.npy` files, as `np.save` writes them: of a few kinds, and never pickled."""
+"""Arrays in `.npy` files, as `np.save` writes them: never pickled, and exactly as expected."""
 
-import math
-import os
-import re
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -11,21 +9,15 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError
 
-_START = b"\x93NUMPY\x01\x00"
-_LONGEST_HEADER = 1024
-"""Bytes of a header, at most: `np.save` writes 118 for what this package stores."""
-
-_HEADER = re.compile(
-    rb"\{'descr': '([<|][a-z]\d)', 'fortran_order': False, "
-    rb"'shape': \((\d{1,12}(?:, \d{1,12})*),?\), \} *\n"
-)
+_DAMAGED = (ValueError, TypeError, OverflowError, SyntaxError, TokenError)
+"""What numpy raises for a damaged header, which it reads as a Python literal of at most 10,000
+characters."""
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array as `np.save` does, in C order.
 
-    Raises:
-        OSError: As the system says it; from `np.save`, a full disk is an error without a number.
+    From `np.save` itself, a full disk is an error without a number.
     """
     with path.open("wb") as file:
         array = np.asarray(array, order="C")
@@ -36,38 +28,33 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
         file.write(array.data)
 
 
-def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Read an array that `write_array` wrote.
+def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return an array that `write_array` wrote as a read-only memory map.
 
-    Nothing is allocated before type, shape and the file's size agree. `np.load` is left aside: it
-    also opens archives, and reads a header as Python.
+    Nothing is allocated before type, shape and the file's size agree. Not by `np.load`, which also
+    opens archives.
 
     Args:
         path: The file.
         dtype: Type that it must have.
         shape: Shape that it must have; -1 for a side of any length.
-
-    Raises:
-        FormatError: It holds something else.
     """
     expected = f"{np.dtype(dtype)} of shape {shape}"
-    with path.open("rb") as file:
-        start = file.read(len(_START) + 2)
-        length = int.from_bytes(start[len(_START) :], "little")
-        if not start.startswith(_START) or length > _LONGEST_HEADER:
-            raise FormatError.damaged(path, f"no array; expected {expected}")
-        found = _HEADER.fullmatch(header := file.read(length))
-        if found is None:
-            what = f"its header is {header[:80]!r}; expected {expected}"
-            raise FormatError.damaged(path, what)
-        kind, sides = found[1].decode(), tuple(map(int, found[2].split(b", ")))
-        fits = len(sides) == len(shape) and all(
-            wanted in (-1, side) for wanted, side in zip(shape, sides, strict=True)
-        )
-        if not fits or kind != np.dtype(dtype).str:
-            raise FormatError.damaged(path, f"holds {kind} of shape {sides}; expected {expected}")
-        count, there = math.prod(sides), os.fstat(file.fileno()).st_size - file.tell()
-        if count * np.dtype(dtype).itemsize != there:
-            what = f"its header tells shape {sides}, and {there} bytes follow"
-            raise FormatError.damaged(path, what)
-        return np.fromfile(file, dtype, count).reshape(sides)
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")  # type: ignore[no-untyped-call]
+    except (*_DAMAGED, MemoryError, RecursionError) as error:
+        raise FormatError.damaged(path, f"no array: {error}; expected {expected}") from None
+    fits = array.ndim == len(shape) and all(
+        wanted in (-1, side) for wanted, side in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype != dtype or not array.flags.c_contiguous:
+        what = f"holds {array.dtype} of shape {array.shape}; expected {expected} in C order"
+        raise FormatError.damaged(path, what)
+    if array.offset + array.nbytes != path.stat().st_size:
+        raise FormatError.damaged(path, f"longer than an array of shape {array.shape}")
+    return array  # type: ignore[no-any-return]
+
+
+def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Read an array into memory; see `map_array`."""
+    return np.array(map_array(path, dtype, shape))

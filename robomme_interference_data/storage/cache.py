@@ -6,22 +6,24 @@ import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import FormatError, InvalidOptionError
 
-from .arrays import write_array
+from .arrays import map_array, write_array
 from .digest import FeatureDigests
 from .files import atomic_path
 
 _OWN = re.compile(r"[0-9a-f]{64}\.npy")
 _HEADER = 128  # bytes that numpy writes before the data of an array of four dimensions
 
-_told: set[Path] = set()
-"""Folders that could not be written to, which was said once."""
+_warned: set[Path] = set()
+"""Folders that could not be written to; one warning each."""
+
+_room: dict["DecodedCache", int] = {}
+"""Bytes that this process may still add to a cache before it looks at the folder again."""
 
 
 def default_cache_folder() -> Path:
@@ -34,10 +36,12 @@ def default_cache_folder() -> Path:
 class DecodedCache:
     """Decoded frames of sessions, one `.npy` file each, named by the SHA-256 of the frames.
 
-    Files that were not used for longest are removed when they outgrow the bound; files of other
-    names are left alone. Several
-    processes may share a folder: files appear whole, and one that vanishes is decoded again. Where
-    nothing can be written, as on a full disk, it says so once, and keeps nothing.
+    When they outgrow the bound, the files that were not used for longest are removed; files of
+    other names stay. Several processes may share a folder: files appear whole, and one that
+    vanishes is decoded again. Each counts what it adds and looks at the folder again after a
+    sixteenth of the bound at the latest, so that several may exceed it by as much each, for a
+    while. A crash of the machine may lose files, as they are not flushed to the disk. Where
+    nothing can be written, as on a full disk, there is one warning, and nothing is kept.
 
     Args:
         folder: Where the arrays lie; made when first written to.
@@ -69,26 +73,27 @@ class DecodedCache:
             return None  # a dataset may call its frames what it likes
         path = self._path(sha256)
         try:
-            frames = np.lib.format.open_memmap(path, mode="r")  # type: ignore[no-untyped-call]
-        except (OSError, ValueError, TokenError):  # what numpy raises for damaged files
+            frames = map_array(path, np.uint8, shape)
+        except (OSError, FormatError):
             return None
         with suppress(OSError):  # a folder that only others may write
             os.utime(path)
-        if frames.shape != shape or frames.dtype != np.uint8:
-            return None
         return None if verify and frames_sha256(frames) != sha256 else frames
 
     def put(self, sha256: str, frames: NDArray[np.uint8]) -> None:
         """Store frames, unless they alone exceed the bound, and remove the least used ones."""
-        if frames.nbytes + _HEADER > self.max_bytes:
+        size = frames.nbytes + _HEADER
+        if size > self.max_bytes:
             return
         try:
-            with atomic_path(self._path(sha256)) as partial:
+            with atomic_path(self._path(sha256), flush=False) as partial:
                 write_array(partial, frames)
-            self._shrink()
+            _room[self] = _room.get(self, 0) - size
+            if _room[self] < 0:
+                _room[self] = min(self._shrink(), self.max_bytes // 16)
         except OSError as error:
-            if self.folder not in _told:
-                _told.add(self.folder)
+            if self.folder not in _warned:
+                _warned.add(self.folder)
                 warnings.warn(
                     f"decoded frames are not kept in {self.folder}: {error.strerror or error}",
                     RuntimeWarning,
@@ -98,7 +103,8 @@ class DecodedCache:
     def _path(self, sha256: str) -> Path:
         return self.folder / f"{sha256}.npy"
 
-    def _shrink(self) -> None:
+    def _shrink(self) -> int:
+        """Remove what exceeds the bound; return how many bytes are left until it is reached."""
         files = []
         for path in self.folder.iterdir():
             if _OWN.fullmatch(path.name):
@@ -107,9 +113,10 @@ class DecodedCache:
         size = sum(stat.st_size for _, stat in files)
         for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
             if size <= self.max_bytes:
-                return
+                break
             path.unlink(missing_ok=True)
             size -= stat.st_size
+        return self.max_bytes - size
 
 
 def frames_sha256(frames: NDArray[np.uint8]) -> str:

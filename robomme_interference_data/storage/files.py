@@ -196,7 +196,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(data: bytes, where: object) -> dict[str, Any]:
-    """Read JSON, which holds an object and neither NaN nor infinite numbers.
+    """Read JSON: an object, in which no key occurs twice and all numbers are finite.
 
     Args:
         data: UTF-8.
@@ -227,7 +227,16 @@ def _not_finite(name: str) -> NoReturn:
     raise ValueError(f"{name} is no finite number")
 
 
-_JSON = json.JSONDecoder(parse_float=_finite, parse_constant=_not_finite)
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice[:80]!r} occurs twice")
+    return found
+
+
+_JSON = json.JSONDecoder(object_pairs_hook=_unique, parse_float=_finite, parse_constant=_not_finite)
 
 
 def _is_deep(value: Any) -> bool:
@@ -268,10 +277,14 @@ def with_filename(place: object) -> Iterator[None]:
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path, *, flush: bool = True) -> Iterator[Path]:
     """Give a temporary path beside `path` that becomes `path` if the block succeeds.
 
-    The data reaches the disk before the name does; if the block fails, nothing is left behind.
+    If the block fails, nothing is left behind.
+
+    Args:
+        path: The file to write.
+        flush: Let the data reach the disk before the name does.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
@@ -281,8 +294,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with with_filename(path):
             yield partial
             partial.chmod(0o644)
-            with partial.open("rb") as file:
-                os.fsync(file.fileno())
+            if flush:
+                with partial.open("rb") as file:
+                    os.fsync(file.fileno())
             partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

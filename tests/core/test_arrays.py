@@ -42,23 +42,32 @@ def test_what_is_written_is_read(tmp_path_factory: Any, dtype: Any, data: st.Dat
 
 
 @pytest.mark.parametrize(
-    ("array", "message"),
+    "array",
     [
-        (np.ones((2, 8), np.float32), "holds <f4 of shape \\(2, 8\\)"),
-        (np.ones((2, 7), np.float16), "of shape \\(2, 7\\)"),
-        (np.ones(8, np.float16), "of shape \\(8,\\)"),
-        (np.ones((8, 2), np.float16).T, "its header is"),
-        (np.ones((2, 8), ">f2"), "its header is"),
-        (np.zeros((2, 8), [("a", "<f2")]), "its header is"),
-        (np.float16(1), "its header is"),
-        (np.array([[None]]), "its header is"),
+        np.ones((2, 8), np.float32),
+        np.ones((2, 7), np.float16),
+        np.ones(8, np.float16),
+        np.ones((8, 2), np.float16).T,
+        np.ones((2, 8), ">f2"),
+        np.zeros((2, 8), [("a", "<f2")]),
+        np.float16(1),
+        np.array([[None]]),
     ],
 )
-def test_other_arrays_are_refused(tmp_path: Path, array: Any, message: str) -> None:
-    path = tmp_path / "a.npy"
-    np.save(path, array)
-    with pytest.raises(FormatError, match=message):
-        read_array(path, np.float16, (-1, 8))
+def test_other_arrays_are_refused(tmp_path: Path, array: Any) -> None:
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(FormatError, match=r"a\.npy: .* expected float16 of shape \(-1, 8\)"):
+        read_array(tmp_path / "a.npy", np.float16, (-1, 8))
+
+
+@pytest.mark.parametrize("text", [b"(" * 9000, b"-" * 9000, b"[" * 99, b"9" * 9000, b"\0", b"'"])
+def test_a_header_that_is_none(tmp_path: Path, text: bytes) -> None:
+    header = b"{'descr': '<f2', 'fortran_order': False, 'shape': " + text
+    (tmp_path / "a.npy").write_bytes(
+        b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(99)
+    )
+    with pytest.raises(FormatError, match="no array"):
+        read_array(tmp_path / "a.npy", np.float16, (-1, 8))
 
 
 def test_a_file_is_as_long_as_its_header_says(tmp_path: Path) -> None:
