@@ -57,14 +57,7 @@ class Part:
 
 
 def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
-    """Return what is to be fetched of each repository: its files are listed, none is fetched.
-
-    Raises:
-        InvalidOptionError: The split is a folder, or nothing is wanted.
-        UnknownNameError: The split has no such family, condition or camera.
-        MissingFileError: A repository lacks files that buffers need, or the index.
-        HubError: The Hub cannot be reached.
-    """
+    """Return what is to be fetched of each repository: its files are listed, none is fetched."""
     if not isinstance(split.files, HubFiles):
         raise InvalidOptionError(
             f"{split.location} is a folder on this machine; only a repository can be fetched",
@@ -107,11 +100,6 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
         parts: What `plan_fetch` returned.
         to: Folder to copy the files to; None leaves them in the Hub client's cache. It becomes a
             split at the very end.
-
-    Raises:
-        InvalidOptionError: `to` holds another split.
-        HubError, MissingFileError: A file cannot be fetched.
-        HashMismatchError: What came is not what the Hub has.
     """
     header = parts[0].files.path(MANIFEST_PATH)
     there = None if to is None else to / MANIFEST_PATH

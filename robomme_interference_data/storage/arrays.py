@@ -1,7 +1,8 @@
 """Arrays in `.npy` files, as `np.save` writes them: never pickled, and exactly as expected."""
 
+import math
+import re
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,16 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import FormatError
 
-_DAMAGED = (ValueError, TypeError, OverflowError, SyntaxError, TokenError)
-"""What numpy raises for a damaged header, which it reads as a Python literal of at most 10,000
-characters."""
+_FILE = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-z]\d)', 'fortran_order': False, "
+    rb"'shape': \((\d{1,12}(?:, \d{1,12})*),?\), \} *\n",
+    re.DOTALL,
+)
+"""What a file begins with. numpy reads a header as Python, and of damaged ones ends in all kinds of
+errors and warnings."""
+
+_HEADER_BYTES = 1024
+"""Bytes in which the header ends, at most: `np.save` writes 128 for what this package stores."""
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
@@ -40,19 +48,20 @@ def map_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         shape: Shape that it must have; -1 for a side of any length.
     """
     expected = f"{np.dtype(dtype)} of shape {shape}"
-    try:
-        array = np.lib.format.open_memmap(path, mode="r")  # type: ignore[no-untyped-call]
-    except (*_DAMAGED, MemoryError, RecursionError) as error:
-        raise FormatError.damaged(path, f"no array: {error}; expected {expected}") from None
-    fits = array.ndim == len(shape) and all(
-        wanted in (-1, side) for wanted, side in zip(shape, array.shape, strict=True)
+    with path.open("rb") as file:
+        header = _FILE.match(start := file.read(_HEADER_BYTES))
+    if header is None or int.from_bytes(start[8:10], "little") != header.end() - 10:
+        raise FormatError.damaged(path, f"no array: {start[:99]!r}; expected {expected}")
+    kind, sides = header[1].decode(), tuple(map(int, header[2].split(b", ")))
+    fits = len(sides) == len(shape) and all(
+        wanted in (-1, side) for wanted, side in zip(shape, sides, strict=True)
     )
-    if not fits or array.dtype != dtype or not array.flags.c_contiguous:
-        what = f"holds {array.dtype} of shape {array.shape}; expected {expected} in C order"
-        raise FormatError.damaged(path, what)
-    if array.offset + array.nbytes != path.stat().st_size:
-        raise FormatError.damaged(path, f"longer than an array of shape {array.shape}")
-    return array  # type: ignore[no-any-return]
+    if not fits or kind != np.dtype(dtype).str:
+        raise FormatError.damaged(path, f"holds {kind} of shape {sides}; expected {expected}")
+    size, whole = math.prod(sides) * np.dtype(dtype).itemsize, path.stat().st_size
+    if header.end() + size != whole:
+        raise FormatError.damaged(path, f"{whole} bytes, of an array of shape {sides}")
+    return np.memmap(path, dtype, "r", header.end(), sides)
 
 
 def read_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -88,11 +88,7 @@ CLIP = Codec(
 
 
 def get_codec(name: str) -> Codec:
-    """Return a codec by name.
-
-    Raises:
-        InvalidOptionError: There is no such codec.
-    """
+    """Return a codec by name."""
     if name not in CODECS:
         raise InvalidOptionError.one_of("codec", name, CODECS)
     return CODECS[name]
@@ -108,9 +104,6 @@ class VideoEncoder:
         height: Rows of pixels.
         width: Columns of pixels.
         container: FFmpeg's name of the container; None if the path's suffix says it.
-
-    Raises:
-        BuildError: The file cannot be written, or the frames are too small for the codec.
     """
 
     def __init__(
@@ -190,11 +183,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 
 
 def is_png(data: bytes) -> bool:
-    """Tell whether an encoded image is a PNG.
-
-    Raises:
-        FormatError: It is neither PNG nor JPEG.
-    """
+    """Tell whether an encoded image is a PNG."""
     if data.startswith(_PNG):
         return True
     if data.startswith(_JPEG):
@@ -206,11 +195,7 @@ def is_png(data: bytes) -> bool:
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB; transparency is left out.
-
-    Raises:
-        FormatError: It is neither, damaged, or has more than 8 bits a channel.
-    """
+    """Decode a PNG or JPEG image to `(H, W, 3) uint8` RGB; transparency is left out."""
     codec = av.CodecContext.create("png" if is_png(data) else "mjpeg", "r")
     codec.thread_count = 1
     # Without these, a PNG with a broken checksum is decoded as if nothing were wrong.

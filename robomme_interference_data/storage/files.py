@@ -44,12 +44,7 @@ class Files(Protocol):
     """
 
     def path(self, relative: str) -> Path:
-        """Return where the file lies on this machine, fetching it first if need be.
-
-        Raises:
-            MissingFileError: There is no such file.
-            FormatError: The path leads out of the dataset.
-        """
+        """Return where the file lies on this machine, fetching it first if need be."""
         ...
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
@@ -57,11 +52,7 @@ class Files(Protocol):
         ...
 
     def fetch(self, paths: Iterable[str]) -> None:
-        """Bring files to this machine that are about to be read, several at a time.
-
-        Raises:
-            MissingFileError: There is no such file.
-        """
+        """Bring files to this machine that are about to be read, several at a time."""
         ...
 
     def snapshot(self, *patterns: str) -> Path:
@@ -145,11 +136,7 @@ def _is_snapshot(folder: Path) -> bool:
 
 
 def check_relative(relative: str, where: str) -> str:
-    """Return a relative path that stays in its folder.
-
-    Raises:
-        FormatError: It is absolute or has a `..`, or no file can have such a name.
-    """
+    """Return a relative path that stays in its folder."""
     path = PurePosixPath(relative)
     try:
         os.fsencode(relative)
@@ -174,11 +161,7 @@ def indented_json(value: Any) -> str:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Return a file's bytes.
-
-    Raises:
-        FormatError: There are more than `most`.
-    """
+    """Return a file's bytes."""
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
@@ -187,11 +170,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Raises:
-        FormatError: The file is not JSON or holds something else, or is too large or deep.
-    """
+    """Read a JSON file that holds an object."""
     return parse_json(read_bytes(path, _MOST_JSON), path)
 
 
@@ -201,9 +180,6 @@ def parse_json(data: bytes, where: object) -> dict[str, Any]:
     Args:
         data: UTF-8.
         where: What is read, for messages.
-
-    Raises:
-        FormatError: It is not JSON or holds something else, or is too deep.
     """
     try:
         value = _JSON.decode(data.decode())
@@ -321,11 +297,7 @@ def digest_folder(folder: Path, patterns: Iterable[str]) -> str:
 
 
 def read_sums(path: Path) -> dict[str, str]:
-    """Read a file of what `format_sums` returns: SHA-256 by path.
-
-    Raises:
-        FormatError: A line is not such a one, a path leads elsewhere, or the file is too large.
-    """
+    """Read a file of what `format_sums` returns: SHA-256 by path."""
     sums = {}
     try:
         lines = read_bytes(path, _MOST_SUMS).decode().splitlines()

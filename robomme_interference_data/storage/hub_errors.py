@@ -100,13 +100,7 @@ class HubCall:
         return f"what {kept} is kept: {again}" if kept else again
 
     def run(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Call a function of the client, and nothing but the client.
-
-        Raises:
-            HubError: The Hub refuses, does not know the repository, or cannot be reached.
-            MissingFileError: The repository has no such file.
-            OSError: The system's error about a file, such as that the disk is full.
-        """
+        """Call a function of the client, and nothing but the client."""
         import httpx
         from huggingface_hub import constants, errors
 

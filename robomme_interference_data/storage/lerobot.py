@@ -53,10 +53,6 @@ class LeRobotFiles:
         files: How to reach the dataset.
         tables: Paths of its episode tables, if they are known: on the Hub, to list files takes
             longer than to fetch these.
-
-    Raises:
-        MissingFileError: `meta/info.json` is missing.
-        FormatError: It is of an unknown version, or damaged.
     """
 
     def __init__(self, files: Files, tables: Sequence[str] = ()):
@@ -92,11 +88,7 @@ class LeRobotFiles:
         return dict(self.info["features"])
 
     def shape(self, column: str) -> tuple[int, ...]:
-        """Return the shape of a column's values; of a camera `(H, W, 3)`, however it is told.
-
-        Raises:
-            FormatError: That of a camera is neither `(H, W, 3)` nor `(3, H, W)`.
-        """
+        """Return the shape of a column's values; of a camera `(H, W, 3)`, however it is told."""
         feature = self.info["features"][column]
         shape = tuple(feature["shape"])
         if feature["dtype"] in ("video", "image"):
@@ -112,12 +104,7 @@ class LeRobotFiles:
 
     @cached_property
     def table(self) -> pa.Table:
-        """The per-episode columns by episode index, without statistics.
-
-        Raises:
-            MissingFileError: A file in `meta/` is missing.
-            FormatError: A file cannot be read, or does not list the episodes from 0 on.
-        """
+        """The per-episode columns by episode index, without statistics."""
         table = self._v30_table() if self.version == "v3.0" else self._v21_table()
         where = self.files.describe()
         for name in ("episode_index", "length"):
@@ -142,11 +129,7 @@ class LeRobotFiles:
         return {text: row.get("task_index") for text, row in zip(texts, rows, strict=True)}
 
     def row(self, index: int) -> dict[str, Any]:
-        """Return the per-episode columns of an episode as plain values.
-
-        Raises:
-            UnknownNameError: There is no such episode.
-        """
+        """Return the per-episode columns of an episode as plain values."""
         if not 0 <= index < len(self):
             raise UnknownNameError(
                 f"episode {index} is not in {self.files.describe()}, which has {len(self)} episodes"
@@ -157,20 +140,11 @@ class LeRobotFiles:
         return row
 
     def place(self, index: int) -> EpisodePlace:
-        """Return where an episode lies.
-
-        Raises:
-            FormatError: The metadata does not say it as LeRobot does.
-        """
+        """Return where an episode lies."""
         return place_episode(self.info, index, self.row(index), self.files.describe())
 
     def rows(self, index: int) -> RowSpan:
-        """Return the rows of an episode in its data file.
-
-        Raises:
-            MissingFileError, FormatError: The file is missing or cannot be read.
-            TruncatedVideoError: The rows are not all there, one after the other.
-        """
+        """Return the rows of an episode in its data file."""
         place = self.place(index)
         path = self.files.path(place.data)
         whole = RowSpan(path)
@@ -191,11 +165,7 @@ class LeRobotFiles:
         return rows
 
     def vectors(self, index: int, column: str) -> NDArray[np.float32]:
-        """Read a column of vectors of an episode, `(T, D) float32`.
-
-        Raises:
-            FormatError: It has other sizes than `info.json` says; and as `rows`.
-        """
+        """Read a column of vectors of an episode, `(T, D) float32`."""
         rows = self.rows(index)
         values = rows.vectors(column)
         if values.shape[1:] != self.shape(column) or values.shape[1] > _MOST_NUMBERS:
@@ -209,22 +179,14 @@ class LeRobotFiles:
     def iter_frames(
         self, index: int, column: str, start: int, stop: int
     ) -> Iterator[NDArray[np.uint8]]:
-        """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order.
-
-        Raises:
-            MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
-        """
+        """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order."""
         relative, first = self.place(index).videos[column]
         self.check_span(index, start, stop)
         path, shape = self.files.path(relative), self.shape(column)
         return video.iter_frames(path, first + start, first + stop, self.fps, shape)
 
     def check_span(self, index: int, start: int, stop: int) -> None:
-        """Check that an episode has frames `start` to `stop` (excluded).
-
-        Raises:
-            TruncatedVideoError: It has not.
-        """
+        """Check that an episode has frames `start` to `stop` (excluded)."""
         length = self.row(index)["length"]
         if not 0 <= start <= stop <= length:
             raise TruncatedVideoError(

@@ -47,11 +47,7 @@ class EpisodePlace:
 
 
 def check_info(info: dict[str, Any], path: object) -> None:
-    """Check what is read of `info.json`: types and sizes, before anything is allocated.
-
-    Raises:
-        FormatError: Something is not as LeRobot writes it.
-    """
+    """Check what is read of `info.json`: types and sizes, before anything is allocated."""
 
     def check(holds: bool, name: str) -> None:
         if not holds:
@@ -82,11 +78,7 @@ def _is_template(value: Any) -> bool:
 
 
 def fill_template(template: str, where: object, **values: str | int) -> str:
-    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else.
-
-    Raises:
-        FormatError: The template holds anything else in braces.
-    """
+    """Fill in a path template of `info.json`: `{name}` and `{name:03d}`, nothing else."""
     refused = FormatError.damaged(where, f"the path template {template!r} cannot be filled in")
 
     def value(match: re.Match[str]) -> str:
@@ -111,9 +103,6 @@ def place_episode(
         index: Number of the episode.
         row: Its per-episode columns.
         where: The dataset in words, for messages.
-
-    Raises:
-        FormatError: The metadata does not say it as LeRobot does.
     """
 
     def whole(name: str) -> int:

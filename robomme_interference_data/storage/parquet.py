@@ -42,11 +42,7 @@ _MOST_BYTES = 2 << 30
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what pyarrow raises while the block reads a file into one clear error.
-
-    Raises:
-        FormatError: The file is damaged or not a parquet file.
-    """
+    """Turn what pyarrow raises while the block reads a file into one clear error."""
     try:
         yield
     except InterferenceError:
@@ -57,12 +53,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
-    """Open a parquet file for reading piece by piece.
-
-    Raises:
-        FormatError: It is not a parquet file, or its metadata are too large or contradict each
-            other.
-    """
+    """Open a parquet file for reading piece by piece."""
     with reading(path):
         chunks = read_chunks(path)
         file = pq.ParquetFile(
@@ -97,10 +88,6 @@ def read_table(
         path: The file's path.
         columns: Names of the columns; None for all.
         groups: Numbers of row groups; None for all.
-
-    Raises:
-        FormatError: They cannot be read, are too large, or of a type that is no text, number,
-            truth value, or list or struct of these.
     """
     chosen = range(file.num_row_groups) if groups is None else groups
     names = None if columns is None else list(columns)
@@ -177,9 +164,6 @@ class RowSpan:
         path: The file.
         start: First row.
         stop: Row after the last one; None for all that there are.
-
-    Raises:
-        FormatError: By every method: the file cannot be read as asked.
     """
 
     def __init__(self, path: Path, start: int = 0, stop: int | None = None):

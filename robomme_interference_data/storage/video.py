@@ -50,12 +50,6 @@ def iter_frames(
 
     Yields:
         Frames, `(H, W, 3) uint8` RGB. The array is the caller's.
-
-    Raises:
-        MissingFileError: There is no such file.
-        FormatError: The file is not a video, its frames are not evenly spaced at `fps`, or they
-            are of another shape.
-        TruncatedVideoError: The file ends before `stop`, or a frame is missing.
     """
     expected = start
     with closing(_indexed_frames(path, start, fps, shape)) as frames:
@@ -92,12 +86,7 @@ def _to_rgb(path: Path, frame: av.VideoFrame) -> NDArray[np.uint8]:
 
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
-    """Open a video file and its first video stream, before anything is decoded.
-
-    Raises:
-        MissingFileError: There is no such file.
-        FormatError: It is not a video, or one that declares more than is read.
-    """
+    """Open a video file and its first video stream, before anything is decoded."""
     limits = {"max_pixels": str(MOST_PIXELS)}
     allowed = {"protocol_whitelist": "file", "codec_whitelist": ",".join(_DECODERS)}
     try:

@@ -102,7 +102,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         ("sparse", "at most"),
         ("sparse sums", "at most"),
         ("sparse rows", "at most"),
-        ("a header alone", "no array"),
+        ("a header alone", "128 bytes, of an array"),
         ("an archive", "no array"),
         ("pickled", "no array"),
         ("a large image", "an image is damaged"),

@@ -82,11 +82,7 @@ class _Page:
 
 
 def read_chunks(path: Path) -> list[list[Chunk]]:
-    """Read where the columns of each row group lie, as the end of a file tells it.
-
-    Raises:
-        ValueError: It tells no such thing, or more than is read.
-    """
+    """Read where the columns of each row group lie, as the end of a file tells it."""
     with path.open("rb") as file:
         end = file.seek(0, 2)
         file.seek(max(0, end - 8))
@@ -130,9 +126,6 @@ def decoded_size(file: BinaryIO, chunk: Chunk, kind: str, length: int, most: int
         kind: Its physical type, such as `BYTE_ARRAY`.
         length: Bytes of a value of fixed length.
         most: Bytes beyond which nothing is looked into any more.
-
-    Raises:
-        ValueError: The pages are not as the metadata say, or cannot be bounded.
     """
     variable = kind == "BYTE_ARRAY"
     width = length if kind == "FIXED_LEN_BYTE_ARRAY" else _WIDTHS.get(kind, 0)

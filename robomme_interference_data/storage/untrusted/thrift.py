@@ -36,12 +36,7 @@ class Thrift:
         self.at = at
 
     def struct(self, wanted: Wanted, depth: int = 0) -> dict[int, Any]:
-        """Read a struct: the wanted fields that it has.
-
-        Raises:
-            ValueError: One is of another kind, or comes twice, or it is nested too deeply.
-            IndexError: The bytes end before it.
-        """
+        """Read a struct: the wanted fields that it has."""
         self._structs_left -= 1
         if depth > _DEEPEST or self._structs_left < 0:
             raise ValueError("its metadata are nested too deeply, or too many")

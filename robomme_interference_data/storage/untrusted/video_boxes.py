@@ -49,11 +49,7 @@ _DEEPEST = 12
 
 
 def find_container(path: Path) -> str:
-    """Return FFmpeg's name of a video file's container: `mp4`, `matroska` or `avi`.
-
-    Raises:
-        FormatError: It is none of these, or declares more than is read.
-    """
+    """Return FFmpeg's name of a video file's container: `mp4`, `matroska` or `avi`."""
     with path.open("rb") as file:
         start = file.read(12)
         if start.startswith(b"\x1a\x45\xdf\xa3"):
