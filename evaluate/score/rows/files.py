@@ -4,7 +4,7 @@ import codecs
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,16 +28,18 @@ which exported rows of other simulators have as one column more."""
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
 
 
-class RawRow(NamedTuple):
-    """A row of a file.
+class Part(NamedTuple):
+    """The rows of one file.
 
     Attributes:
-        line: The line on which it begins; in parquet its number from 1.
-        values: Column of `Rollout` to what the file has there; or why it is no row.
+        columns: Column of `Rollout` to its value in each row.
+        lines: The line on which each row begins; in parquet its number from 1.
+        malformed: Line to why it is no row.
     """
 
-    line: int
-    values: Mapping[str, Any] | str
+    columns: Mapping[str, Sequence[Any]]
+    lines: Sequence[int]
+    malformed: Mapping[int, str] = {}
 
 
 def find_sources(paths: Sequence[Path]) -> dict[Path, RunHeader | None]:
@@ -68,7 +70,7 @@ def system_of(path: Path) -> str | None:
     return found[1] if found else None
 
 
-def read_file(path: Path, names: Sequence[str], has_system: bool) -> list[RawRow]:
+def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
     """Read columns of a file's rows, as far as the file has them.
 
     Args:
@@ -85,7 +87,7 @@ def read_file(path: Path, names: Sequence[str], has_system: bool) -> list[RawRow
     if reader is None:
         raise FormatError(f"{path} is no {' or '.join(readers)} file", "Give a file of rows.")
     with reading(path):
-        return list(reader(path, names, has_system))
+        return reader(path, names, has_system)
 
 
 def _match(
@@ -118,55 +120,60 @@ def _match(
     return {name: ours[name] for name in names if name in ours}
 
 
-def _values(path: Path, table: pa.Table) -> Iterator[dict[str, Any]]:
+def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
     for column in table.columns:
         kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
         if pa.types.is_nested(kind):
             raise FormatError.damaged(path, f"a column holds {kind}; expected text and numbers")
-    columns = [column.to_pylist() for column in table.columns]
-    names = table.column_names
-    return (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
+    return {name: table[name].to_pylist() for name in table.column_names}
 
 
-def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Iterator[RawRow]:
+def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
     with open_parquet(path) as file:
         chosen = _match(path, file.schema_arrow.names, names, has_system)
         table = read_table(file, path, list(chosen.values()))
-    table = table.select(list(chosen.values())).rename_columns(list(chosen))
-    for number, row in enumerate(_values(path, table), 1):
-        yield RawRow(number, row)
+    columns = _columns(path, table)
+    found = {name: columns[existing] for name, existing in chosen.items()}
+    return Part(found, range(1, len(table) + 1))
 
 
-def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Iterator[RawRow]:
+def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
     text = read_bytes(path, MOST_BYTES).removeprefix(codecs.BOM_UTF8).decode()
     csv.field_size_limit(len(text) + 1)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: dict[int, list[str]] = {}
+    malformed: dict[int, str] = {}
     try:
         header = next(reader, [])
         chosen = _match(path, header, names, has_system)
-        places = [(name, header.index(existing)) for name, existing in chosen.items()]
         line = reader.line_num + 1
         for fields in reader:
             if len(fields) == len(header):
-                yield RawRow(line, {name: fields[place] for name, place in places})
+                rows[line] = fields
             else:
-                why = f"the line has {len(fields)} fields; expected {len(header)}"
-                yield RawRow(line, why)
+                malformed[line] = f"the line has {len(fields)} fields; expected {len(header)}"
             line = reader.line_num + 1  # quoted text may hold line breaks
     except csv.Error as error:
         raise ValueError(f"line {reader.line_num}: {error}") from None
+    places = {name: header.index(existing) for name, existing in chosen.items()}
+    columns = {name: [row[place] for row in rows.values()] for name, place in places.items()}
+    return Part(columns, list(rows), malformed)
 
 
-def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Iterator[RawRow]:
+def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
     """Read the record of a run: every finished row, and of other rollouts the last row."""
     if not (whole := whole_lines(path)):
-        return
+        return Part({}, [])
     schema = pa.schema([_SCHEMA.field(name) for name in dict.fromkeys((*names, *KEY_COLUMNS))])
     options = pa_json.ParseOptions(schema, unexpected_field_behavior="ignore")
     table = pa_json.read_json(pa.BufferReader(whole), parse_options=options)
-    rows = list(_values(path, table))
-    keys = [tuple(map(row.get, KEY_COLUMNS)) for row in rows]
+    columns = _columns(path, table)
+    keys = [*zip(*(columns[name] for name in KEY_COLUMNS), strict=True)]
     last = dict(zip(keys, range(len(keys)), strict=True))
-    for number, (row, key) in enumerate(zip(rows, keys, strict=True)):
-        if row["status"] != Status.ERROR or last[key] == number:
-            yield RawRow(number + 1, row)
+    counts = [
+        place
+        for place, (key, status) in enumerate(zip(keys, columns["status"], strict=True))
+        if status != Status.ERROR or last[key] == place
+    ]
+    found = {name: [columns[name][place] for place in counts] for name in names}
+    return Part(found, [place + 1 for place in counts])

@@ -3,7 +3,6 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -13,8 +12,9 @@ from robomme_interference_data.errors import BadRowsError, InterferenceError, In
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import NO_SHIFT
 
-from .files import RawRow, find_sources, read_file, system_of
+from .files import Part, find_sources, read_file, system_of
 from .values import DEFAULTS, Row, parse, shifted
 
 _SHOWN = 10  # so many bad rows are named; the others are counted
@@ -79,10 +79,8 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
         name = system_of(path) if system is None else system
         if name is not None:
             name_system(name)
-        default = {**dict.fromkeys(Row._fields), **DEFAULTS, "system": name}
-        parser = _Parser(default, path.parent if run is not None else None)
-        for raw in read_file(path, Row._fields, name is not None):
-            checks.add(path, raw, parser)
+        part = read_file(path, Row._fields, name is not None)
+        checks.add(path, part, name, None if run is None else path.parent)
     checks.check_together()
     refusals = checks.refusals()
     if refusals and not lenient:
@@ -110,59 +108,49 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     return Rows(rows, sources, revisions, unpinned, retrieval, shown, len(refusals))
 
 
-class _Parser:
-    """Makes rows of a file's values; the folder of its run is what videos are relative to."""
-
-    def __init__(self, default: Mapping[str, Any], run: Path | None):
-        self._default, self._run = default, run
-        # Most values occur in many rows. True and 1 are equal, and not the same.
-        self._parse = lru_cache(maxsize=1 << 16, typed=True)(self._parsed)
-
-    def row(self, values: Mapping[str, Any]) -> Row:
-        """Return the row; a ValueError or an InterferenceError tells what is wrong."""
-        given = {name: self._parse(name, values[name]) for name in Row._fields if name in values}
-        row = Row(**{**self._default, **given})
-        expected = None if row.status == Status.ERROR else row.status == Status.SUCCESS
-        if row.success is not expected:
-            shown = "(empty)" if row.success is None else row.success
-            raise ValueError(f"success {shown} contradicts status {row.status!r}")
-        return row._replace(simulator=shifted(row.simulator, row.shift))
-
-    def _parsed(self, name: str, value: Any) -> Any:
-        try:
-            parsed = parse(name, value)
-        except InterferenceError as error:
-            raise ValueError(f"{error.message}. {error.hint or ''}".strip()) from None
-        except ValueError as error:
-            shown = "(empty)" if value in (None, "") else repr(value)
-            raise ValueError(f"{name} {shown}; expected {error}") from None
-        if name == "video":
-            return self._run / parsed if parsed and self._run else None
-        return parsed
+class _Bad(str):
+    """Why a value is none."""
 
 
 class _Checks:
-    """All rows, and the reason against each bad one.
+    """All rows, and the reason against each bad one, by number of the file and line in it.
 
     Attributes:
-        sound: Number of a row, in the order of the files, to the row.
+        sound: The rows that passed every check so far.
     """
 
     def __init__(self) -> None:
-        self.sound: dict[int, Row] = {}
-        self._places: list[tuple[Path, int]] = []
-        self._reasons: dict[int, str] = {}
+        self.sound: dict[tuple[int, int], Row] = {}
+        self._paths: list[Path] = []
+        self._reasons: dict[tuple[int, int], str] = {}
 
-    def add(self, path: Path, raw: RawRow, parser: _Parser) -> None:
-        """Add a row of a file."""
-        number = len(self._places)
-        self._places.append((path, raw.line))
-        try:
-            if isinstance(raw.values, str):
-                raise ValueError(raw.values)
-            self.sound[number] = parser.row(raw.values)
-        except ValueError as error:
-            self._reasons[number] = str(error)
+    def add(self, path: Path, part: Part, system: str | None, run: Path | None) -> None:
+        """Add the rows of a file, each checked by itself.
+
+        Args:
+            path: The file.
+            part: What it holds.
+            system: The system of rows that name none.
+            run: The folder that videos are relative to, if it is known.
+        """
+        number, count = len(self._paths), len(part.lines)
+        self._paths.append(path)
+        self._reasons |= {(number, line): reason for line, reason in part.malformed.items()}
+        default = {**dict.fromkeys(Row._fields), **DEFAULTS, "system": system}
+        columns = [
+            _parsed(name, part.columns[name], run)
+            if name in part.columns
+            else [default[name]] * count
+            for name in Row._fields
+        ]
+        for line, row in zip(part.lines, map(Row._make, zip(*columns, strict=True)), strict=True):
+            if reason := _wrong(row):
+                self._reasons[number, line] = reason
+            elif row.shift == NO_SHIFT:
+                self.sound[number, line] = row
+            else:
+                simulator = shifted(row.simulator, row.shift)
+                self.sound[number, line] = row._replace(simulator=simulator)
 
     def check_together(self) -> None:
         """Check rows against others."""
@@ -173,33 +161,38 @@ class _Checks:
 
     def refusals(self) -> list[str]:
         """Return place and reason of each bad row, in the order of the files."""
-        return [f"{self._place(number)}: {why}" for number, why in sorted(self._reasons.items())]
+        return [f"{self._place(row)}: {reason}" for row, reason in sorted(self._reasons.items())]
 
-    def _place(self, number: int) -> str:
-        path, line = self._places[number]
-        return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {line}"
+    def _place(self, row: tuple[int, int]) -> str:
+        path = self._paths[row[0]]
+        return f"{path}, {'row' if path.suffix.lower() == '.parquet' else 'line'} {row[1]}"
 
-    def _refuse(self, number: int, reason: str) -> None:
-        del self.sound[number]
-        self._reasons[number] = reason
+    def _refuse(self, row: tuple[int, int], reason: str) -> None:
+        del self.sound[row]
+        self._reasons[row] = reason
 
     def _check_alike(self, name: str, of: Sequence[str], why: str) -> None:
         """Compare a value with that of the first row with the same values in other columns."""
-        key, value = attrgetter(*of), attrgetter(name)
+        rows = self.sound.values()
+        keys, values = map(attrgetter(*of), rows), map(attrgetter(name), rows)
         first: dict[Any, Any] = {}
-        for number, row in [*self.sound.items()]:
-            if (own := value(row)) is not None and own != (
-                known := first.setdefault(key(row), own)
-            ):
-                self._refuse(number, f"{name} {own!r} beside {known!r}: {why}")
+        wrong = [
+            (place, f"{name} {value!r} beside {first[key]!r}: {why}")
+            for place, key, value in zip(self.sound, keys, values, strict=True)
+            if value is not None and value != first.setdefault(key, value)
+        ]
+        for place, reason in wrong:
+            self._refuse(place, reason)
 
     def _check_repeats(self) -> None:
         """Leave one row of each rollout, and none where its rows contradict each other."""
         key: Callable[[Row], Any] = attrgetter(*_ROLLOUT)
-        groups = defaultdict[Any, list[int]](list)
-        for number, row in self.sound.items():
-            groups[key(row)].append(number)
+        groups = defaultdict[Any, list[tuple[int, int]]](list)
+        for place, row in self.sound.items():
+            groups[key(row)].append(place)
         for numbers in groups.values():
+            if len(numbers) == 1:
+                continue
             first, *others = numbers
             contradicted = len({self.sound[number].status for number in numbers}) > 1
             more = "; its rows contradict each other" * contradicted
@@ -207,3 +200,30 @@ class _Checks:
                 self._refuse(first, f"the same rollout as {self._place(others[0])}{more}")
             for number in others:
                 self._refuse(number, f"the same rollout as {self._place(first)}{more}")
+
+
+def _parsed(name: str, values: Sequence[Any], run: Path | None) -> list[Any]:
+    """Return the values of a column as rows have them; `_Bad` for what is none."""
+    known: dict[Any, Any] = {}
+    for value in set(values):  # of one type, and most occur in many rows
+        try:
+            found = parse(name, value)
+            known[value] = run and run / found if name == "video" and found else found
+        except InterferenceError as error:
+            known[value] = _Bad(f"{error.message}. {error.hint or ''}".strip())
+        except ValueError as error:
+            shown = "(empty)" if value in (None, "") else repr(value)
+            known[value] = _Bad(f"{name} {shown}; expected {error}")
+    return [known[value] for value in values]
+
+
+def _wrong(row: Row) -> str:
+    """Return what is wrong with a row by itself; nothing if it is sound."""
+    for value in row:
+        if type(value) is _Bad:
+            return value
+    expected = None if row.status == Status.ERROR else row.status == Status.SUCCESS
+    if row.success is expected:
+        return ""
+    shown = "(empty)" if row.success is None else row.success
+    return f"success {shown} contradicts status {row.status!r}"

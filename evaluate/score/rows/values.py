@@ -171,7 +171,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
 
 def shifted(simulator: str, shift: str) -> str:
     """Return the name of a simulator under a shift."""
-    return simulator if shift == NO_SHIFT else f"{simulator}{_SEPARATOR}{shift}"
+    return f"{simulator}{_SEPARATOR}{shift}"
 
 
 def unshifted(simulator: str) -> str:
