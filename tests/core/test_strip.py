@@ -135,15 +135,6 @@ def test_says_what_the_buffer_is(strip: Path, buffer: Buffer) -> None:
         assert number == 0 or f"{number}  distractor" in found
 
 
-def test_counts_the_sample_in_each_session(strip: Path) -> None:
-    found = labels(strip)
-    # Of j · 144 // 31 with j = 0 … 31, below 48: j ≤ 10; below 80: j ≤ 17; below 112: j ≤ 24;
-    # below 144: j ≤ 30. So 11, 7, 7 and 6 fall into the sessions, and one is live.
-    counts = [found[found.index(name) + 1] for name in ("0 lesson", "1", "2", "3")]
-    assert counts == ["11", "7", "7", "6"]
-    assert "+1 live" in found
-
-
 def test_shows_the_right_frames_in_order_and_the_live_one_last(strip: Path, buffer: Buffer) -> None:
     shown = [n for s in buffer.sessions for n in spread(s.start, s.stop, 3)]
     assert shown == [0, 23, 47, 48, 63, 79, 80, 95, 111, 112, 127, 143]
@@ -174,30 +165,6 @@ def test_any_number_of_sessions(tiny_split: Path, tmp_path: Path, frames: list[i
     view = ET.parse(out).getroot().attrib["viewBox"].split()
     assert float(view[2]) == pytest.approx(7.2 * 72)
     assert float(view[3]) < 16 * 72
-
-
-HEADS = ["0  LESSON", "1  distractor", "2  LESSON"]
-
-
-@pytest.mark.parametrize(
-    ("order", "facts", "heads"),
-    [
-        ([], "0 history frames", []),
-        ([1], "32 history frames = 32 distractor", ["0  distractor"]),
-        ([1, 0], "80 history frames = 32 distractor + 48 lesson", ["0  distractor", "1  LESSON"]),
-        ([0, 1, 0], "128 history frames = 96 lesson + 32 distractor", HEADS),
-    ],
-    ids=["empty", "absent", "second", "in parts"],
-)
-def test_any_condition(
-    buffer: Buffer, tiny_split: Path, tmp_path: Path, order: list[int], facts: str, heads: list[str]
-) -> None:
-    lesson, unit, *_ = buffer.manifest.sessions
-    entries = [[lesson, unit][number] for number in order]
-    draw_strip(remade(tiny_split, entries, lesson_share=0.0), tmp_path / "strip.svg")
-    found = labels(tmp_path / "strip.svg")
-    assert f"{facts};  an even 32-frame sample holds 0% lesson" in found
-    assert [text for text in found if re.match(r"\d  ", text)] == heads
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,7 @@
 """Rates worked out by hand; which cells are complete, missing or not ranked; other conditions."""
 
-from dataclasses import replace
 from pathlib import Path
 
-import pytest
 from support import scoring as made
 from support.scoring import record
 
@@ -11,28 +9,10 @@ from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.stats.intervals import wilson
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Score:
-    folder = tmp_path_factory.mktemp("rows")
-    return made.score(made.write_parquet(folder / "a.parquet", made.rows()))
 
 
 def grid_of(found: Score) -> list[tuple[str, ...]]:
     return [row for grid in found.grids for row in grid.rows]
-
-
-def test_cells_by_hand(small: Score) -> None:
-    cell = record(small, "main", system=made.BASE, condition="k1")
-    assert (cell["n"], cell["successes"], cell["fails"], cell["timeouts"]) == (12, 5, 6, 1)
-    assert cell["rate"] == 5 / 12
-    assert (cell["low"], cell["high"]) == wilson(5, 12)
-    cell = record(small, "family", system=made.BASE, condition="k0", family="InsertPeg")
-    assert (cell["n"], cell["successes"], cell["rank"]) == (6, 2, 1)
-    cell = record(small, "difficulty", system=made.BASE, condition="k0", difficulty="hard")
-    assert (cell["n"], cell["successes"]) == (4, 1)  # episodes 4 and 5 of both families: s f, f f
 
 
 def test_an_error_is_neither_and_an_incomplete_cell_is_never_ranked(small: Score) -> None:
@@ -63,15 +43,6 @@ def test_best_is_each_that_cannot_be_told_from_the_highest_rate(tmp_path: Path) 
     assert best == {"one": True, "two": True, "three": True, "four": False, "lone": False}
     bold = {row[0] for row in grid_of(found) for cell in row if cell.startswith("**")}
     assert bold == {"one", "two", "three"}
-
-
-def test_repeats_count_as_the_mean_of_their_episode(tmp_path: Path) -> None:
-    given = {(made.OWN, "k0"): "ssf"}, {(made.OWN, "k0"): "sff"}
-    path = made.write_csv(tmp_path / "a.csv", [*made.cells(given[0]), *made.cells(given[1], 4)])
-    found = made.score(path)
-    cell = record(found, "main")
-    assert (cell["n"], cell["successes"], cell["fails"], cell["rate"]) == (3, 3, 3, 1.5 / 3)
-    assert (cell["low"], cell["high"]) == wilson(1.5, 3)
 
 
 def test_a_cell_is_complete_only_if_every_seed_is(tmp_path: Path) -> None:
@@ -138,14 +109,6 @@ def test_the_benchmarks_grid_is_nine_families_of_fifty_episodes(tmp_path: Path) 
     assert record(few, "main", condition="k0")["missing"] == 450 - 12
 
 
-def test_systems_without_a_memory_are_not_ranked(tmp_path: Path) -> None:
-    given = {("oracle", "k0"): "ss", ("guess", "k0"): "ff", (made.OWN, "k0"): "sf"}
-    found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
-    ranks = {r["system"]: r["rank"] for r in made.records(found, "main")}
-    assert ranks == {"oracle": None, "guess": None, made.OWN: 1}
-    assert "Not ranked either, as they only show bounds: Oracle, Guess." in found.grids[0].note
-
-
 def test_a_condition_of_another_kind_is_a_cell_and_no_contrast(
     tmp_path: Path, filler: None
 ) -> None:
@@ -164,13 +127,3 @@ def test_a_condition_of_another_kind_is_a_cell_and_no_contrast(
     # Alone it is a score, too.
     alone = made.write_csv(tmp_path / "b.csv", made.cells({(made.OWN, "filler-k3"): "sf"}))
     assert made.score(alone, grid=Grid.BENCHMARK).tables["lift"].rows == ()
-
-
-def test_episodes_of_other_splits_are_other_episodes(tmp_path: Path) -> None:
-    rows = made.cells({(made.OWN, "k0"): "ss"})
-    rows += [
-        replace(row, episode_split="val", seed=9, status="fail", success=False) for row in rows
-    ]
-    found = made.score(made.write_csv(tmp_path / "a.csv", rows))
-    assert record(found, "main")["rate"] == 0.5
-    assert record(found, "coverage")["expected"] == 4

@@ -71,18 +71,6 @@ def test_model_seeds_are_matched(tmp_path: Path) -> None:
     assert (overall["n"], overall["pairs"], overall["gained"], overall["lost"]) == (4, 2, 1, 1)
 
 
-def test_what_only_one_run_has_is_told(tmp_path: Path) -> None:
-    a = [*own(k0="sssss", k1="sssss", k3="ss"), *cells({(BASE, "k0"): "ss"})]
-    b = own(k0="sse", k1="ss--s", k7="ss")
-    other = made.changed(b, simulator="robomme", revision="cd" * 32)
-    assert compared(tmp_path, a, [*b, *other]).notes[1:] == (
-        f"Only in a, and left out (episodes): {BASE} in tabletop, k0 (2); my-memory in tabletop, "
-        "k0 (3), k1 (2), k3 (2).",
-        "Only in b, and left out (episodes): my-memory in robomme, k0 (2), k1 (3), k7 (2); "
-        "my-memory in tabletop, k7 (2).",
-    )
-
-
 def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
     other = made.changed(own(k0="sf"), revision="cd" * 32, model_seed=9)
     found = compared(tmp_path, own(k0="ss"), other)

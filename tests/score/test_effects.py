@@ -1,6 +1,5 @@
 """Paired comparisons: which rollouts are paired, which interval they bear, what they come to."""
 
-import math
 from pathlib import Path
 
 import pytest
@@ -21,58 +20,6 @@ def scored(tmp_path: Path, *parts: list[Rollout]) -> Score:
 def own(**outcomes: str) -> list[Rollout]:
     """Rows of one's own memory; `none` is no-history."""
     return cells({(OWN, c.replace("none", NO_HISTORY)): text for c, text in outcomes.items()})
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Score:
-    return scored(tmp_path_factory.mktemp("rows"), made.rows())
-
-
-def test_lift_and_retention_by_hand(small: Score) -> None:
-    lift = record(small, "lift", system=BASE, condition="k0")
-    assert (lift["rate"], lift["no_history_rate"]) == (7 / 12, 1 / 12)
-    assert lift["lift"] == pytest.approx(6 / 12)
-    # MoveCube 1 to 4 and InsertPeg 0 and 1 are gained, none is lost: p = 2 · 1/2⁶
-    assert (lift["gained"], lift["lost"], lift["p"]) == (6, 0, 2 / 64)
-    # Fewer than ten episodes differ: Newcombe's interval, of 1 pair on both sides and 5 on neither.
-    assert (lift["interval"], lift["pairs"], lift["flips"]) == ("newcombe", 12, 6 / 12)
-    assert (lift["low"], lift["high"]) == newcombe_paired(1, 6, 0, 5)
-    assert lift["retention"] is None
-    kept = record(small, "lift", system=BASE, condition="k3")
-    assert kept["retention"] == pytest.approx((3 - 1) / (7 - 1))
-    assert kept["retention_low"] < 1 / 3 < kept["retention_high"] < 1
-    # Without history, the system with retrieval is the one without.
-    kept = record(small, "lift", system=RETRIEVAL, condition="k7")
-    assert (kept["no_history_of"], kept["retention"]) == (BASE, 1.0)
-    # Ten episodes count on both sides: 2 against 1; no sure lift, so no retention.
-    lift = record(small, "lift", system=OWN, condition="k0")
-    assert (lift["n"], lift["lift"], lift["complete"]) == (10, pytest.approx(0.1), False)
-
-
-def test_effects_by_hand(small: Score) -> None:
-    effect = record(small, "effects", system=BASE, condition="k1", against_system=BASE)
-    assert effect["difference"] == pytest.approx(-2 / 12)
-    assert (effect["gained"], effect["lost"], effect["p"]) == (0, 2, 0.5)
-    h = 2 * math.asin(math.sqrt(5 / 12)) - 2 * math.asin(math.sqrt(7 / 12))
-    assert effect["cohens_h"] == pytest.approx(h)
-    # InsertPeg 1 is lost and InsertPeg 2 gained by retrieval at k0.
-    effect = record(small, "effects", system=RETRIEVAL, condition="k0")
-    assert (effect["against_system"], effect["against_condition"]) == (BASE, "k0")
-    assert (effect["difference"], effect["gained"], effect["lost"]) == (0.0, 1, 1)
-    tests = records(small, "effects")
-    assert len(tests) == 6  # k1, k3, k7 against k0; k7 against k0; k0 and k7 against the base
-    smallest = min(tests, key=lambda one: one["p"])
-    assert smallest["p_holm"] == min(1.0, 6 * smallest["p"])
-
-
-def test_decay_by_hand(small: Score) -> None:
-    decay = record(small, "decay", system=BASE)
-    # Weights −0.3, −0.1, 0.1, 0.3 of 7, 5, 3 and 2 of 12: −2.1 − 0.5 + 0.3 + 0.6 = −1.7 of 12
-    assert decay["slope"] == pytest.approx(-1.7 / 12)
-    # Only MoveCube 1 to 4 and InsertPeg 0 and 1 change over the sessions: too few for an interval.
-    assert decay["low"] is decay["high"] is None
-    assert (decay["conditions"], decay["n"], decay["complete"]) == ("k0 k1 k3 k7", 12, True)
-    assert {one["system"] for one in records(small, "decay")} == {BASE, RETRIEVAL}
 
 
 def test_retention_has_fiellers_interval(tmp_path: Path) -> None:

@@ -1,12 +1,11 @@
 """Comparisons by family: apart, with families weighing alike, and as a sample of such families."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support import scoring as made
-from support.scoring import BASE, OWN, record, records, row
+from support.scoring import OWN, record, row
 
 from robomme_interference_data.evaluate.score.comparisons.families import over_families
 from robomme_interference_data.evaluate.score.scoring import Score
@@ -71,13 +70,6 @@ def test_whether_families_differ_by_hand() -> None:
     assert p == 1.0
 
 
-def test_missing_episodes_do_not_count_in_families() -> None:
-    values = np.array([1.0, np.nan, 0.0, 0.0, np.nan, np.nan])[:, None]
-    ((alike, *bounds, _),) = over_families(values, np.array([0, 0, 1, 1, 2, 2]), "key")
-    # The third family has no episode: the mean of 1 and 0.
-    assert alike == 0.5 and all(map(math.isnan, bounds))
-
-
 def test_families_that_never_ran_take_no_part_in_draws() -> None:
     numbers = np.random.default_rng(0)
     three = np.sign(numbers.normal([[-0.6], [0.0], [0.5]], size=(3, 50))).reshape(-1, 1)
@@ -87,10 +79,3 @@ def test_families_that_never_ran_take_no_part_in_draws() -> None:
     # Beside a comparison of all nine, too.
     both = np.concatenate([nine, np.ones((450, 1))], axis=1)
     assert over_families(both, labels, "key")[0] == over_families(three, labels[:150], "key")[0]
-
-
-def test_one_family_has_nothing_to_be_compared_with(tmp_path: Path) -> None:
-    given = {(BASE, "k0"): "sss", (BASE, "k7"): "sff"}
-    found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
-    assert "families" not in found.tables
-    assert len(records(found, "family_effects")) == 1

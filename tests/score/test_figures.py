@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support import full_grid
 from support import scoring as made
-from support.scoring import BASE, OWN, RETRIEVAL, cells
+from support.scoring import BASE, OWN, cells
 
 from robomme_interference_data.evaluate.score.plots.curves import Data, spread
-from robomme_interference_data.evaluate.score.plots.figures import FIGURES, draw_figure
+from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.plots.styles import SeriesStyle, styles_of
+from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, SYSTEMS
-from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.viz.figure import open_figure
 
@@ -92,18 +91,6 @@ def test_a_legend_explains_hollow_and_published_points(
     assert explained(figure) == expected
 
 
-def test_a_retrieval_system_stands_beside_its_published_base(tmp_path: Path, figure: Any) -> None:
-    rows = [row for row in made.rows() if row.system == RETRIEVAL]
-    shown = data(tmp_path, made.changed(rows, simulator="robomme"), paper=True)
-    assert draw_figure("retrieval", figure, shown)
-    retrieval = "Retrieval-FrameSamp-Modul"
-    assert names(figure) == [{retrieval, "FrameSamp-Modul, published"}] * 3
-    with open_figure() as other:  # the paper's own figure: family by family
-        assert draw_figure("families", other, shown)
-        assert names(other) == [{retrieval, "FrameSamp-Modul, published"}] * 2
-    assert not draw_figure("retrieval", figure, data(tmp_path, rows))  # nobody to stand beside
-
-
 def test_the_retention_figure_names_whom_it_leaves_out(tmp_path: Path, figure: Any) -> None:
     rows = [row for row in made.rows() if row.system != OWN]
     # Of the own memory no episode is lifted, and its retention is of nothing.
@@ -122,28 +109,11 @@ def test_the_retention_figure_names_whom_it_leaves_out(tmp_path: Path, figure: A
         assert explained(other) == ""
 
 
-def test_only_conditions_of_a_kind_are_joined(tmp_path: Path, figure: Any, filler: None) -> None:
-    given = {(OWN, c): "sf" for c in (NO_HISTORY, "k0", "k7", "filler-k1", "filler-k3")}
-    assert draw_figure("kinds", figure, data(tmp_path, cells(given)))
-    panels = [axes for axes in figure.axes if axes.axison]
-    for axes in panels:
-        joined = [len(line.get_xdata()) for line in axes.lines if line.get_linewidth() == 1.6]
-        assert joined == [2]
-    assert [axes.get_title() for axes in panels] == ["k<n>", "filler-k<n>"]
-    names = [text.get_text() for text in panels[-1].get_xticklabels()]
-    assert names == ["none", "k0", "k1", "k3", "k7"]
-    for kind in FIGURES:
-        with open_figure() as other:
-            draw_figure(kind, other, data(tmp_path, cells(given)))
-
-
 # --- many systems ------------------------------------------------------------------------------
 
 
-def test_twelve_systems_are_named_at_their_values_without_dodge(
-    tmp_path: Path, figure: Any
-) -> None:
-    shown = Data(made.score(full_grid.write(tmp_path / "a.parquet"), draws=50), "robomme")
+def test_twelve_systems_are_named_at_their_values_without_dodge(full: Score, figure: Any) -> None:
+    shown = Data(full, "robomme")
     everyone = {shown.styles[system].label for system in shown.systems}
     places = {shown.x(name) for name in shown.shown(shown.systems)}
     for kind, panels in (("success", 1), ("families", 9), ("difficulty", 3)):
@@ -190,6 +160,15 @@ def test_twelve_systems_are_named_at_their_values_without_dodge(
         lines = [line for line in other.axes[0].lines if len(line.get_xdata()) > 1]
         assert lines[0].get_ydata()[0] == pytest.approx(100 * 204 / 450)
         assert len(lines[0].get_xdata()) == 4
+
+
+def test_systems_of_equal_rates_keep_the_order_of_tables(tmp_path: Path, figure: Any) -> None:
+    systems = [f"system-{letter}" for letter in "abcdefg"]
+    given = {(name, "k0"): "sf" if place % 2 else "fs" for place, name in enumerate(systems)}
+    assert draw_figure("matrix", figure, data(tmp_path, cells(given)))
+    (axes,) = figure.axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == systems
+    assert {text.get_text() for text in axes.texts} == {"0"}  # and not −0
 
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=12).map(sorted), st.floats(0.1, 9))

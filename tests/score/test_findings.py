@@ -1,13 +1,11 @@
 """What a score comes to: headlines, the released and published numbers, the tables' files."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record
 
-from robomme_interference_data.evaluate.score.comparisons.compare import compare
 from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score
@@ -16,7 +14,6 @@ from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.stats.intervals import newcombe, wilson
 
-GOLDEN = made.ROOT / "tests" / "golden" / "score"
 PAPER = made.RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"
 
 
@@ -254,37 +251,3 @@ def test_the_released_rows_give_the_published_numbers() -> None:
         "behind it (k7): 0.0 points (−2.3 to +2.3; 13 episodes gained, 13 lost, McNemar p = 1). "
         "Without retrieval, FrameSamp-Modul falls from 45.3% to 19.3% (published)."
     )
-
-
-# --- files -------------------------------------------------------------------------------------
-
-
-def test_tables_are_those_of_the_golden_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)  # the note of a comparison holds the paths as they were given
-    rows = made.rows()
-    again = made.changed((row for row in rows if row.condition == "k7"), model_seed=4)
-    # In the repeat, the base system loses MoveCube/1 and gains MoveCube/2.
-    lost = {1: "fail", 2: "success"}
-    again = [
-        replace(row, status=lost[row.episode], success=row.episode == 2)
-        if (row.system, row.family) == (BASE, "MoveCube") and row.episode in lost
-        else row
-        for row in again
-    ]
-    small = made.score(made.write_parquet(Path("small.parquet"), [*rows, *again]), draws=2000)
-    robomme = made.changed(rows, simulator="robomme")
-    paper = made.score(made.write_csv(Path("all.csv"), robomme), grid=Grid.BENCHMARK, paper=True)
-    sides = [
-        made.write_csv(Path(name), [row for row in robomme if row.system == system])
-        for name, system in (("a.csv", BASE), ("b.csv", RETRIEVAL))
-    ]
-    tables = [*small.tables.values(), paper.tables["paper"], compare(*sides).table]
-    written = {f"{table.name}.csv": table.csv() for table in tables}
-    written |= {f"{table.name}.md": table.markdown() for table in tables}
-    written["main.md"] = small.grids[0].markdown()
-    golden = {path.name: path.read_text(encoding="utf-8") for path in GOLDEN.iterdir()}
-    assert written.keys() == golden.keys()
-    for name, text in golden.items():
-        assert written[name] == text, name

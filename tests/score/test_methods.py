@@ -3,13 +3,11 @@
 import re
 from pathlib import Path
 
-from support import full_grid
 from support import scoring as made
 from support.scoring import BASE, OWN
 
 from robomme_interference_data.evaluate.score.report.methods import methods
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.viz.tables import Table
 
 
@@ -21,10 +19,8 @@ def cited(found: Score) -> set[str]:
     return names
 
 
-def test_methods_are_those_of_the_rows(tmp_path: Path) -> None:
-    rows = full_grid.full_grid()
-    found = made.score(made.write_parquet(tmp_path / "a.parquet", rows), paper=True)
-    text, _ = methods(found)
+def test_methods_are_those_of_the_rows(full: Score) -> None:
+    text, _ = methods(full)
     assert text.startswith(
         "# Methods\n\nWe rolled out 12 systems (π0.5 (baseline), FrameSamp-Modul, "
     )
@@ -37,7 +33,7 @@ def test_methods_are_those_of_the_rows(tmp_path: Path) -> None:
         "robomme-interference-data ",
     ):
         assert told in text
-    names = cited(found)
+    names = cited(full)
     assert {"wilson1927", "mcnemar1947", "holm1979", "fieller1954", "newcombe1998"} <= names
     assert "davison1997" in names  # of several families
     assert not {"fisher1935", "schuirmann1987"} & names  # no repeats, no margin
@@ -61,17 +57,3 @@ def test_tables_as_latex() -> None:
         "a\\_b \\& 5\\% & 44.9\\% & $-$3.0 & \\textbf{1.0\\%}\\textdagger{} \\\\\n"
         "$\\pi$ &  &  & -- \\\\\n\\bottomrule\n\\end{tabular}\n% A note.\n"
     )
-
-
-def test_a_score_writes_them(tmp_path: Path) -> None:
-    rows = [row for row in made.rows() if row.system == BASE]
-    found = made.score(made.write_csv(tmp_path / "a.csv", rows))
-    write_score(found, tmp_path / "out")
-    out = tmp_path / "out"
-    written = ((out / "methods.md").read_text("utf-8"), (out / "methods.bib").read_text("utf-8"))
-    assert written == methods(found)
-    names = {path.stem for path in (out / "tables").glob("*.tex")}
-    assert names == {path.stem for path in (out / "tables").glob("*.csv")}
-    main = (out / "tables" / "main.tex").read_text("utf-8")
-    # The number of episodes is the same in every cell: it stands below.
-    assert "FrameSamp-Modul & 8.3\\% [1.5, 35.4] & " in main and "n = 12 in each cell" in main

@@ -11,7 +11,6 @@ from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record, records
 
 from robomme_interference_data.evaluate.score.comparisons.tables import corrected
-from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.stats.intervals import mover_interval, newcombe, newcombe_paired
 from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
 
@@ -51,21 +50,6 @@ def test_equal_rates_lead_by_the_order_of_tables(tmp_path: Path) -> None:
     assert record(found, "systems")["against_system"] == BASE
     assert {r["rank"] for r in records(found, "ranks")} == {1}
     assert {r["best"] for r in records(found, "main")} == {True}
-
-
-def test_equal_means_of_repeats_share_a_rank(tmp_path: Path) -> None:
-    # A third and four times two thirds, which as floats add up to less than three times 1.
-    own = ("fssss", "sssss", "fffff")
-    rows = [
-        row
-        for seed, letters in enumerate(own)
-        for row in cells({(OWN, "k0"): letters, (BASE, "k0"): "ffsss"}, seed)
-    ]
-    found = made.score(made.write_csv(tmp_path / "a.csv", rows))
-    assert {(r["rate"], r["rank"]) for r in records(found, "main")} == {(3 / 5, 1)}
-    assert {r["rank"] for r in records(found, "ranks")} == {1}
-    assert record(found, "systems")["against_system"] == BASE
-    assert "k0, my-memory has the same rate" in headline(found, "tabletop")
 
 
 def test_systems_of_other_histories_are_not_paired(tmp_path: Path) -> None:
@@ -128,11 +112,6 @@ def test_which_system_falls_more(tmp_path: Path) -> None:
     phi = -0.05 * 0.4 / math.sqrt(0.05 * 0.95 * 0.4 * 0.6)
     expected = mover_interval(-0.05, changes[0], -0.4, changes[1], phi, limit=2)
     assert (row["low"], row["high"]) == pytest.approx(expected)
-
-
-def test_nothing_interacts_without_k0(tmp_path: Path) -> None:
-    found = scored(tmp_path, {(BASE, "k1"): "sf", (OWN, "k1"): "ff", (OWN, "k7"): "ff"})
-    assert "interaction" not in found.tables
 
 
 @given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from("abc")), max_size=9))

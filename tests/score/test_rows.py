@@ -65,7 +65,7 @@ def test_csv_parquet_and_runs_are_read_alike(tmp_path: Path) -> None:
     assert list(by_csv.sources.values()) == [None]
 
 
-@settings(max_examples=15)
+@settings(max_examples=5)
 @given(st.randoms(use_true_random=False), st.integers(1, 3))
 def test_the_order_of_rows_and_files_makes_no_difference(
     tmp_path_factory: pytest.TempPathFactory, order: random.Random, files: int

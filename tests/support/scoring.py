@@ -47,6 +47,38 @@ GOOD = "my-memory,MoveCube,k0,0,7,easy,success,1,100"  # a line of the layout of
 STATUS = {"s": "success", "f": "fail", "t": "timeout", "e": "error"}
 
 
+REPLAY, IDEAL = "replay-framesamp", "recall-framesamp"
+KINDS = {  # of MoveCube 0 to 5
+    (REPLAY, NO_HISTORY): "sfffff",
+    (REPLAY, "k0"): "sssssf",
+    (REPLAY, "k3"): "ssffff",
+    (REPLAY, "before-k3"): "sffffs",
+    (REPLAY, "held-k3"): "ssssff",
+    (REPLAY, "held-k7"): "ssssff",
+    (REPLAY, "absent-k3"): "ffffff",
+    (REPLAY, "stale-k0"): "ssffff",
+    (REPLAY, "misled-k0"): "ffffff",
+    (IDEAL, "k0"): "ssssss",
+    (IDEAL, "k3"): "ssssff",
+}
+KEPT = {  # thirds of the evidence
+    (REPLAY, "k0"): (3, 3, 3, 3, 3, 3),
+    (REPLAY, "k3"): (3, 3, 3, 1, 2, 0),
+}
+
+# Two questions of two options, then two of four. The right guesses are of the chances
+# (1/2 + x/2)² (3/4 + x/4)² = (9 + 24 x + 22 x² + 8 x³ + x⁴) / 64.
+CHANCES = (1 / 2, 1 / 2, 1 / 4, 1 / 4)
+BLANK, RECALL = f"{OWN}-blank", "questions-recall-full"
+ANSWERS = {
+    (RECALL, "k0"): "ssss",
+    (OWN, NO_HISTORY): "ssff",
+    (OWN, "k0"): "sssf",
+    (OWN, "k7"): "ssef",
+    (BLANK, "k0"): "ffff",
+}
+
+
 def row(system: str, condition: str, family: str, episode: int, letter: str) -> Rollout:
     status = STATUS[letter]
     return Rollout(
@@ -92,6 +124,31 @@ def cells(outcomes: Mapping[tuple[str, str], str], seed: int = 0) -> list[Rollou
         for place, letter in enumerate(letters)
         if letter != "-"
     ]
+
+
+def kinds(folder: Path, outcomes: Mapping[tuple[str, str], str] = KINDS) -> Score:
+    """A score of several kinds of conditions, some with the evidence that was kept."""
+    found = [
+        replace(row, evidence_kept=KEPT[cell][row.episode] / 3)
+        if (cell := (row.system, row.condition)) in KEPT
+        else row
+        for row in cells(outcomes)
+    ]
+    return score(write_parquet(folder / "kinds.parquet", found))
+
+
+def questions(folder: Path) -> Score:
+    """A score of answers; an error has no chance."""
+    found = [
+        replace(
+            row,
+            simulator="questions",
+            steps=0,
+            chance=None if row.status == "error" else CHANCES[row.episode],
+        )
+        for row in cells(ANSWERS)
+    ]
+    return score(write_parquet(folder / "questions.parquet", found))
 
 
 def changed(given: Iterable[Rollout], **values: Any) -> list[Rollout]:
