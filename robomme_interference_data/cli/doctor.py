@@ -22,16 +22,6 @@ logger = logging.getLogger(__name__)
 
 DISTRIBUTION = "robomme-interference-data"
 
-EXTRAS = {
-    "build": "Build datasets",
-    "sim": "Simulator",
-    "evaluate": "Evaluate",
-    "vlm": "Vision-language models",
-    "cluster": "Clusters",
-    "retrieval": "Retrieval",
-    "score": "Score",
-}
-
 RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
 """The program that draws a picture: a broken driver can crash its process or never return."""
 
@@ -61,9 +51,9 @@ def checks() -> list[Check]:
     """Check everything; takes a few seconds, and a minute more where RoboMME is."""
     return [
         Check("Python", True, f"{platform.python_version()} ({sys.executable})"),
-        check_packages("Core libraries"),
+        check_packages(),
         check_video(),
-        *(check_packages(f"{name} [{extra}]", extra) for extra, name in EXTRAS.items()),
+        *map(check_packages, extras()),
         check_renderer(),
         check_robomme(),
         check_hub(),
@@ -82,8 +72,14 @@ def report(rows: Sequence[Check]) -> Table:
     return Table("doctor", "", columns, tuple(lines))
 
 
-def check_packages(name: str, extra: str = "") -> Check:
+def extras() -> list[str]:
+    """Return the names of this package's extras."""
+    return [one for one in metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") if one != "all"]
+
+
+def check_packages(extra: str = "") -> Check:
     """Check the packages of an extra; without one, those that are always needed."""
+    name = f"Extra [{extra}]" if extra else "Core libraries"
     needed = _requirements(DISTRIBUTION, extra)
     problems = [problem for requirement in needed for problem in _problems(requirement)]
     if not problems:

@@ -61,11 +61,6 @@ def test_this_environment_has_all_that_is_needed_and_nothing_heavy_is_imported()
     assert {fix for _, ok, fix in found if ok == "True"} == {"None"}  # nothing to mend
 
 
-def test_every_extra_has_a_row() -> None:
-    extras = metadata.metadata("robomme-interference-data").get_all("Provides-Extra") or ()
-    assert {*doctor.EXTRAS, "all"} == set(extras)
-
-
 OURS = [
     "numpy>=2.0",
     'colorama; sys_platform == "win33"',
@@ -101,7 +96,7 @@ def test_requirements_of_the_core_and_of_an_extra(
     versions = {"robomme-interference-data": "0.1.0", **others}
     installed({name: (text, requirements.get(name, [])) for name, text in versions.items()})
     for extra, expected in (("", core), ("build", build)):
-        row = doctor.check_packages("Name", extra)
+        row = doctor.check_packages(extra)
         fix = row.fix and row.fix.removeprefix("pip install ")
         assert (row.ok, row.detail, fix) == expected
 
