@@ -74,7 +74,9 @@ def report(rows: Sequence[Check]) -> Table:
 
 def extras() -> list[str]:
     """Return the names of this package's extras."""
-    return [one for one in metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") if one != "all"]
+    return [
+        one for one in metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") if one != "all"
+    ]
 
 
 def check_packages(extra: str = "") -> Check:

@@ -16,7 +16,9 @@ PROGRAM = "robomme-interference"
 NEXT_COMMANDS: dict[type[InterferenceError], str] = {NoRendererError: "doctor"}
 """Commands that help against errors of a type, where the error itself names none."""
 
-_SETTING = re.compile(r'(?P<tick>`?)\b(?P<name>[a-z]\w*)="(?P<value>[^"\n]*)"(?P=tick)|`(\w+)`')
+_SETTING = re.compile(
+    r"""(?P<tick>`?)\b(?P<name>[a-z]\w*)=(?P<quote>["'])(?P<value>.*?)(?P=quote)(?P=tick)|`(\w+)`"""
+)
 
 
 def option_names(root: Any, arguments: Sequence[str]) -> dict[str, str]:
@@ -39,7 +41,7 @@ def error_lines(error: InterferenceError, options: Mapping[str, str]) -> list[st
     """
 
     def typed(match: re.Match[str]) -> str:
-        option = options.get(match["name"] or match[4])
+        option = options.get(match["name"] or match[5])
         if option is None:
             return match[0]
         return option if match["name"] is None else f"{option} {shlex.quote(match['value'])}"

@@ -29,15 +29,7 @@ def test_round_trip(episode: EpisodeId) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        *(
-            "",
-            "MoveCube",
-            "MoveCube/test",
-            "MoveCube/test/1/2/3",
-            "MoveCube/test/01",
-            "MoveCube/test/1/",
-            "/test/1",
-        ),
+        *("", "MoveCube", "MoveCube/test", "MoveCube/test/1/2/3", "MoveCube/test/01", "/test/1"),
         *("MoveCube/test/-1", "MoveCube/test/1.0", "MoveCube/test/", "MoveCube/tset/1"),
         *("9Family/test/1", "Move Cube/test/1", "MoveCube/test/1 ", "MoveCube/test/٣"),
         *("MoveCube/test/1234567890123456789", "../test/1"),
@@ -49,16 +41,12 @@ def test_what_is_no_id(given: Any) -> None:
         EpisodeId.parse(given)
 
 
-@pytest.mark.parametrize("index", [-1, 10**18, True, "3", 1.0, None])
-def test_indices_are_numbers(index: object) -> None:
+@pytest.mark.parametrize("number", [-1, 10**18, True, "3", 1.0])
+def test_indices_and_answers_are_numbers(number: Any) -> None:
     with pytest.raises(InvalidIdError, match="is not an episode index"):
-        EpisodeId("MoveCube", "test", index)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("answer", [-1, 10**18, True, "3", 1.0])
-def test_answers_are_numbers(answer: object) -> None:
+        EpisodeId("MoveCube", "test", number)
     with pytest.raises(InvalidIdError, match="is not an answer"):
-        EpisodeId("MoveCube", "test", 1, answer)  # type: ignore[arg-type]
+        EpisodeId("MoveCube", "test", 1, number)
 
 
 def test_the_scene_of_another_answer() -> None:

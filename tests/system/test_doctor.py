@@ -12,38 +12,21 @@ import pytest
 from robomme_interference_data.cli import doctor
 from robomme_interference_data.cli.doctor import Check
 
-OK = Check("fine", True, "1.0")
-ABSENT = Check("optional", None, "not installed", 'pip install "robomme-interference-data[build]"')
-BROKEN = Check("needed", False, "broken", "mend it")
 
-Installed = Callable[[dict[str, tuple[str, list[str]]]], None]
-
-
-@pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> Installed:
-    """Replace what is installed: name to version and requirements."""
-
-    def replace(distributions: dict[str, tuple[str, list[str]]]) -> None:
-        def look_up(name: str) -> tuple[str, list[str]]:
-            if name not in distributions:
-                raise metadata.PackageNotFoundError(name)
-            return distributions[name]
-
-        monkeypatch.setattr(metadata, "version", lambda name: look_up(name)[0])
-        monkeypatch.setattr(metadata, "requires", lambda name: look_up(name)[1])
-
-    return replace
-
-
-def test_the_table_shows_state_name_detail_and_the_whole_fix() -> None:
-    lines = doctor.report([OK, ABSENT, BROKEN]).text().splitlines()
-    assert lines[2:] == [
+def test_the_table_shows_state_name_detail_and_the_command_that_mends(
+    run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [Check("fine", True, "1.0"), Check("optional", None, "not installed", "pip install it")]
+    monkeypatch.setattr(doctor, "checks", lambda: rows)
+    code, out, err = run("doctor")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[2:] == [
         "ok      fine      1.0",
         "absent  optional  not installed",
-        '                  to mend: pip install "robomme-interference-data[build]"',
-        "FAILS   needed    broken",
-        "                  to mend: mend it",
+        "                  to mend: pip install it",
     ]
+    rows.append(Check("needed", False, "broken"))
+    assert run("doctor")[0] == 1
 
 
 def test_this_environment_has_all_that_is_needed_and_nothing_heavy_is_imported() -> None:
@@ -61,44 +44,52 @@ def test_this_environment_has_all_that_is_needed_and_nothing_heavy_is_imported()
     assert {fix for _, ok, fix in found if ok == "True"} == {"None"}  # nothing to mend
 
 
-OURS = [
-    "numpy>=2.0",
-    'colorama; sys_platform == "win33"',
-    'lerobot[dataset]<0.7,>=0.6.1; extra == "build"',
-    'h5py>=3.10; extra == "build"',
-]
-LEROBOT = ['datasets<5,>=4.8; extra == "dataset"', 'pygame; extra == "teleop"']
+REQUIREMENTS = {
+    "robomme-interference-data": [
+        "numpy>=2.0",
+        'colorama; sys_platform == "win33"',
+        'lerobot[dataset]<0.7,>=0.6.1; extra == "build"',
+        'h5py>=3.10; extra == "build"',
+    ],
+    "lerobot": ['datasets<5,>=4.8; extra == "dataset"', 'pygame; extra == "teleop"'],
+}
+GOOD = {"numpy": "2.2.6", "lerobot": "0.6.1", "h5py": "3.16.0", "datasets": "4.8.5"}
+BAD = {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"}
 
 
 @pytest.mark.parametrize(
-    ("others", "core", "build"),
+    ("installed", "extra", "row"),
     [
+        (GOOD, "", (True, "numpy 2.2.6", None)),
+        (GOOD, "build", (True, "lerobot 0.6.1, h5py 3.16.0", None)),
         (
-            {"numpy": "2.2.6", "lerobot": "0.6.1", "h5py": "3.16.0", "datasets": "4.8.5"},
-            (True, "numpy 2.2.6", None),
-            (True, "lerobot 0.6.1, h5py 3.16.0", None),
+            BAD,
+            "",
+            (False, "numpy 1.26.4 is not >=2.0", "pip install --upgrade robomme-interference-data"),
         ),
         (
-            {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"},
-            (False, "numpy 1.26.4 is not >=2.0", "--upgrade robomme-interference-data"),
+            BAD,
+            "build",
             (
                 None,
                 "datasets 5.0.0 is not <5,>=4.8, h5py is not installed",
-                '"robomme-interference-data[build]"',
+                'pip install "robomme-interference-data[build]"',
             ),
         ),
     ],
 )
 def test_requirements_of_the_core_and_of_an_extra(
-    installed: Installed, others: dict[str, str], core: object, build: object
+    installed: dict[str, str], extra: str, row: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    requirements = {"robomme-interference-data": OURS, "lerobot": LEROBOT}
-    versions = {"robomme-interference-data": "0.1.0", **others}
-    installed({name: (text, requirements.get(name, [])) for name, text in versions.items()})
-    for extra, expected in (("", core), ("build", build)):
-        row = doctor.check_packages(extra)
-        fix = row.fix and row.fix.removeprefix("pip install ")
-        assert (row.ok, row.detail, fix) == expected
+    def version(name: str) -> str:
+        if name not in installed:
+            raise metadata.PackageNotFoundError(name)
+        return installed[name]
+
+    monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setattr(metadata, "requires", REQUIREMENTS.get)
+    found = doctor.check_packages(extra)
+    assert (found.ok, found.detail, found.fix) == row
 
 
 def test_only_a_missing_decoder_fails() -> None:
