@@ -74,9 +74,8 @@ def report(rows: Sequence[Check]) -> Table:
 
 def extras() -> list[str]:
     """Return the names of this package's extras."""
-    return [
-        one for one in metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") if one != "all"
-    ]
+    names = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or ()
+    return [name for name in names if name != "all"]
 
 
 def check_packages(extra: str = "") -> Check:
