@@ -24,6 +24,8 @@ from robomme_interference_data.runtime.progress import WorkProgress
 
 h5py = pytest.importorskip("h5py")
 
+pytestmark = pytest.mark.slow
+
 LENGTHS = {"VideoUnmaskSwap": (5000, 326, 168), "PatternLock": (15_001, 96, 48)}
 """Of a family's first training episode: seed, raw frames, and those of the demonstration."""
 
