@@ -19,7 +19,7 @@ from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.viz.tables import Table
 
 from .grade import ALL, grade
-from .select import Measured, Rule
+from .select import Rule, Similarities
 
 _DIGITS = 6
 
@@ -107,16 +107,15 @@ class Calibration:
         return "\n\n".join(parts)
 
 
-def calibrate(measured: Sequence[Measured], rule: Rule, thresholds: Sequence[float]) -> Calibration:
+def calibrate(
+    measured: Sequence[Similarities], rule: Rule, thresholds: Sequence[float]
+) -> Calibration:
     """Fit a threshold, refit it without each family, and try others.
 
     Args:
         measured: All buffers of a split that hold frames of the lesson; one or more.
         rule: The rule that the encoder goes by itself.
         thresholds: What to try, ascending.
-
-    Raises:
-        InvalidOptionError: There is no true cut, or no session with two frames.
     """
     threshold, high, low = _fit(measured)
     families = dict.fromkeys(one.episode_id.family for one in measured)
@@ -142,10 +141,10 @@ def calibrate(measured: Sequence[Measured], rule: Rule, thresholds: Sequence[flo
 
 
 def _trial(
-    measured: Sequence[Measured], cut: float, *, family: str = ALL, condition: str = ALL
+    measured: Sequence[Similarities], cut: float, *, family: str = ALL, condition: str = ALL
 ) -> Trial:
     grades = [
-        grade(one, Rule(cut=cut))
+        grade(one, Rule(boundary=cut))
         for one in measured
         if family in (ALL, one.episode_id.family) and condition in (ALL, one.condition)
     ]
@@ -153,7 +152,9 @@ def _trial(
     return Trial(cut, family, condition, float(purity), float(coverage))
 
 
-def _fit(measured: Sequence[Measured], without: str | None = None) -> tuple[float, float, float]:
+def _fit(
+    measured: Sequence[Similarities], without: str | None = None
+) -> tuple[float, float, float]:
     """Return the threshold of the released rule, and the two percentiles it lies between.
 
     `without` is a family to leave out: its queries, and every session and cut of it elsewhere.
@@ -171,7 +172,7 @@ def _fit(measured: Sequence[Measured], without: str | None = None) -> tuple[floa
 
 
 def _true_cosines(
-    measured: Iterable[Measured], without: str | None = None
+    measured: Iterable[Similarities], without: str | None = None
 ) -> tuple[list[float], list[float]]:
     """Return the cosines across true cuts, and the lowest inside each session, both ascending.
 
@@ -194,11 +195,7 @@ def _true_cosines(
 
 
 def sweep_steps(first: float, last: float) -> list[float]:
-    """Return the thresholds from `first` to `last` (included) in steps of 0.01.
-
-    Raises:
-        InvalidOptionError: They are no cosines, or in the wrong order.
-    """
+    """Return the thresholds from `first` to `last` (included) in steps of 0.01."""
     if not -1 <= first <= last <= 1:
         expected = "two cosines, the lower one first, such as 0.80 0.99"
         raise InvalidOptionError.expected("sweep", (first, last), expected)

@@ -25,7 +25,7 @@ from robomme_interference_data.runtime.executor import Serial, WorkersConfig, ma
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
 if TYPE_CHECKING:
-    from .select import Measured
+    from .select import Similarities
 
 EncoderName = Annotated[
     str,
@@ -137,7 +137,7 @@ def retrieve(
     from robomme_interference_data.data.views import live_embedding, live_frame
     from robomme_interference_data.schema.codec import to_dict
 
-    from . import drawing, encoders, reasons, select
+    from . import drawing, encoders, explain, select
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -147,7 +147,7 @@ def retrieve(
     query = live_embedding(opened, buffer, under, name, camera)
     measured = select.measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
-    found = reasons.reasons(buffer, measured, choice, parsed, name, camera)
+    found = explain.explain(buffer, measured, choice, parsed, name, camera)
     if out is not None:
         live = live_frame(opened, buffer, under, camera)
         drawing.draw_retrieval(buffer, measured, choice, found, live, out)
@@ -227,7 +227,6 @@ def calibrate(
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
     camera: Camera = "front",
-    out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit the cosine below which histories are cut, and show what others would give.
@@ -238,24 +237,20 @@ def calibrate(
     Examples:
     ```
     robomme-interference calibrate my-split
-    robomme-interference calibrate my-split --sweep 0.30 0.99 --out cuts.png
+    robomme-interference calibrate my-split --sweep 0.30 0.99
     ```
     """
     from robomme_interference_data.schema.codec import to_dict
 
     from . import calibrate as fitting
-    from . import charts, encoders, select
+    from . import encoders, select
 
-    check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
     about, measured = _measured(split, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
     found = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['split']}"
-    if out is not None:
-        charts.draw_calibration(found, title, out)
-        say(f"{out} written")
     if as_json:
         print_json(about | to_dict(found))
     else:
@@ -270,7 +265,7 @@ def _measured(
     families: Sequence[str],
     conditions: Sequence[str],
     quiet: bool,
-) -> tuple[dict[str, Any], list["Measured"]]:
+) -> tuple[dict[str, Any], list["Similarities"]]:
     """Measure all wanted buffers that hold frames of the lesson; tell what they are of."""
     from robomme_interference_data.data.loading import load_split
     from robomme_interference_data.data.views import live_embedding

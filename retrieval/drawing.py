@@ -1,4 +1,4 @@
-"""Draw why a part of a history was chosen: `robomme-interference retrieve … --out why.png`."""
+"""Draw why a part of a history was chosen."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +11,9 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.viz.figure import GREY, INK, Page, ink_on, open_page, tidy, tint
 from robomme_interference_data.viz.filmstrip import LESSON_COLOR, mark_evidence, session_colors
 
-from .reasons import Reasons, frames_text
+from .explain import Explanation, frames_text
 from .segment import Span
-from .select import MIN_FRAMES, Choice, Measured
+from .select import MIN_FRAMES, Choice, Similarities
 
 # Inches.
 _WIDTH, _HEIGHT = 7.2, 6.1
@@ -31,9 +31,9 @@ _SEGMENT = "#d9d9d9"
 
 def draw_retrieval(
     buffer: Buffer,
-    measured: Measured,
+    measured: Similarities,
     choice: Choice,
-    found: Reasons,
+    found: Explanation,
     live: NDArray[np.uint8],
     out: Path,
 ) -> None:
@@ -48,10 +48,6 @@ def draw_retrieval(
         found: Why.
         live: What the robot sees first, `(H, W, 3) uint8` RGB.
         out: File to write, `.png` or `.svg`.
-
-    Raises:
-        InvalidOptionError, MissingExtraError: See `open_page`.
-        MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
     """
     with open_page(out, _WIDTH) as page:
         page.height = _HEIGHT
@@ -74,9 +70,9 @@ class _Picture:
 
     page: Page
     buffer: Buffer
-    measured: Measured
+    measured: Similarities
     choice: Choice
-    found: Reasons
+    found: Explanation
 
     def __post_init__(self) -> None:
         self.colors = session_colors(self.buffer.sessions)

@@ -19,7 +19,7 @@ from robomme_interference_data.stats.bootstrap import bootstrap
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Table, percent
 
-from .select import Measured, Rule, choose
+from .select import Rule, Similarities, choose
 
 PASS_MARK = 0.9
 """Least mean purity and mean coverage of a good cell (released reference)."""
@@ -114,12 +114,8 @@ class Cell:
     passed: bool
 
 
-def grade(measured: Measured, rule: Rule) -> Grade:
-    """Choose by a rule, and compare with the true sessions.
-
-    Raises:
-        InvalidOptionError: See `choose`.
-    """
+def grade(measured: Similarities, rule: Rule) -> Grade:
+    """Choose by a rule, and compare with the true sessions."""
     choice = choose(measured, rule)
     frames, sessions = choice.frames, measured.sessions
     lesson = sum(b - a for a, b in measured.lesson)

@@ -106,12 +106,6 @@ def build_index(
         threads: Threads that decode and preprocess beside the encoder.
         force: Make all of it again.
         executor: Who embeds the episodes; None for this process.
-
-    Raises:
-        UnknownNameError: A dataset has no such camera.
-        BuildError: Another process makes one of the indexes, or the encoder gave something that is
-            no finite number.
-        MissingFileError, FormatError, TruncatedVideoError: A dataset cannot be read.
     """
     if threads < 1:
         raise InvalidOptionError.expected("threads", threads, "1 or more")
@@ -243,11 +237,11 @@ class _Work:
                 raise outcome.error
             if outcome.error is not None:
                 what = f"{about} cannot be embedded: {first_line(outcome.error)}"
-                raise BuildError(what, "Finished episodes are kept: mend it, and go on.")
+                raise BuildError(what, "Finished episodes are kept: fix it, and run it again.")
             if not np.isfinite(outcome.value).all():
                 raise BuildError(
                     f"encoder {self.encoder.name!r} gave values that are not finite for {about}",
-                    "Its weights may be damaged, or its precision too low: try --device cpu",
+                    'Its weights may be damaged, or its precision too low: try device="cpu".',
                 )
             with atomic_path(self.features[outcome.task]) as partial:
                 write_array(partial, outcome.value)

@@ -66,24 +66,21 @@ class Rule:
 
     Attributes:
         method: One of `METHODS`.
-        cut: Cosine of adjacent frames below which a history is cut, or `adaptive`: halfway from
-            what unrelated frames share to equality. That is ours; it has no free parameter, and
-            knows the train pool but no test episode.
-
-    Raises:
-        UnknownNameError: There is no such method.
-        InvalidOptionError: The cut is no cosine.
+        boundary: Cosine of adjacent frames below which a history is cut, or `adaptive`: halfway
+            from what unrelated frames share to equality. That is ours; it has no free parameter,
+            and knows the train pool but no test episode.
     """
 
     method: str = "max"
-    cut: float | Literal["adaptive"] = ADAPTIVE
+    boundary: float | Literal["adaptive"] = ADAPTIVE
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise UnknownNameError.none("method", self.method, METHODS)
-        if self.cut != ADAPTIVE and not (isinstance(self.cut, float | int) and -1 <= self.cut <= 1):
+        cosine = isinstance(self.boundary, float | int) and -1 <= self.boundary <= 1
+        if self.boundary != ADAPTIVE and not cosine:
             expected = f"a cosine, from −1 to 1, or {ADAPTIVE}, such as max/0.923"
-            raise InvalidOptionError.expected(f"the cut of {self.method}", self.cut, expected)
+            raise InvalidOptionError.expected(f"the cut of {self.method}", self.boundary, expected)
 
     @classmethod
     def parse(cls, text: str, published: float | None = None) -> Self:
@@ -103,12 +100,13 @@ class Rule:
 
     def threshold(self, typical: float) -> float:
         """Return the cosine below which it cuts, where unrelated frames have cosine `typical`."""
-        return (1 + typical) / 2 if self.cut == ADAPTIVE else float(self.cut)
+        return (1 + typical) / 2 if self.boundary == ADAPTIVE else float(self.boundary)
 
     def __str__(self) -> str:
         """Return what `parse` reads, with every digit of the cut."""
-        cut = ADAPTIVE if self.cut == ADAPTIVE else repr(float(self.cut)).removesuffix(".0")
-        return f"{self.method}/{cut}"
+        adaptive = self.boundary == ADAPTIVE
+        at = ADAPTIVE if adaptive else repr(float(self.boundary)).removesuffix(".0")
+        return f"{self.method}/{at}"
 
 
 def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
@@ -123,7 +121,7 @@ def parse_rules(texts: Sequence[str], published: float | None) -> list[Rule]:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Similarities:
     """A buffer whose frames are compared with each other and with a query frame.
 
     All rules and cuts share it.
@@ -160,7 +158,7 @@ def measure(
     encoder: str,
     camera: str = "front",
     query: NDArray[np.floating] | None = None,
-) -> Measured:
+) -> Similarities:
     """Look up the embeddings of a buffer and compare them.
 
     Args:
@@ -169,12 +167,9 @@ def measure(
         camera: Name of the camera.
         query: Embedding of the query frame, `(D,)`, of length 1; None for the stored first live
             observation.
-
-    Raises:
-        MissingIndexError, StaleIndexError, FormatError: See `Buffer.embeddings`.
     """
     embeddings = buffer.embeddings(encoder, camera)
-    return Measured(
+    return Similarities(
         buffer.episode_id,
         buffer.condition,
         buffer.sessions,
@@ -209,15 +204,12 @@ class Choice:
         return runs(self.frames.tolist())
 
 
-def choose(measured: Measured, rule: Rule) -> Choice:
+def choose(measured: Similarities, rule: Rule) -> Choice:
     """Choose the part of a history that goes with the query frame.
 
     Args:
         measured: The buffer; only `oracle` looks at its sessions.
         rule: How to choose.
-
-    Raises:
-        InvalidOptionError: The history is empty, or there is no lesson for `oracle`.
     """
     about = f"{measured.episode_id} under {measured.condition}"
     if not len(measured.alike):
@@ -253,7 +245,7 @@ def choose(measured: Measured, rule: Rule) -> Choice:
     return Choice(threshold, np.arange(*chosen), spans, scores)
 
 
-def _joined(measured: Measured, first: Span, candidates: Sequence[Span]) -> NDArray[np.int64]:
+def _joined(measured: Similarities, first: Span, candidates: Sequence[Span]) -> NDArray[np.int64]:
     """Return the frames of a segment, and of those that hold a frame like one of its own."""
     following = measured.adjacent[first[0] : first[1] - 1]
     if not len(following):  # a single frame tells nothing of what frames that follow are like

@@ -31,11 +31,6 @@ class Selector:
         rule: How to choose, as `Rule.parse` reads it.
         camera: Camera whose frames it compares.
         device: Where to compute; None for a GPU if there is one.
-
-    Raises:
-        UnknownNameError: There is no such encoder or method.
-        InvalidOptionError: The cut is no cosine.
-        MissingExtraError, HubError, FormatError: See `make_encoder`.
     """
 
     def __init__(
@@ -65,10 +60,7 @@ class Selector:
 
         Returns:
             `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the features;
-            `camera`; `method`; `cut`; and `threshold`, the cosine that the cut comes to.
-
-        Raises:
-            MissingIndexError, StaleIndexError, FormatError: As for `select`.
+            `camera`; `method`; `boundary`; and `threshold`, the cosine that it comes to.
         """
         index = self._index(buffer)
         return {
@@ -76,7 +68,7 @@ class Selector:
             "fingerprint": index.encoder.sha256,
             "camera": self.camera,
             "method": self.rule.method,
-            "cut": self.rule.cut,
+            "boundary": self.rule.boundary,
             "threshold": self.rule.threshold(index.typical_cosine),
         }
 
@@ -89,12 +81,6 @@ class Selector:
 
         Returns:
             Their indices in the buffer, ascending, `(n,) int64`, n at least 1.
-
-        Raises:
-            MissingIndexError: The data has no embeddings of this encoder.
-            StaleIndexError: They were made of other data, or with another version of the encoder.
-            InvalidOptionError: The buffer is empty, or holds no lesson for `oracle`, or the image
-                has another shape.
         """
         index = self._index(buffer)
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:

@@ -60,9 +60,6 @@ def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: str) -> Non
         recorded: What their index records.
         encoder: The encoder.
         remedy: How they are made again.
-
-    Raises:
-        StaleIndexError: They were not.
     """
     if recorded.sha256 != encoder_digest(encoder):
         raise StaleIndexError(
@@ -78,10 +75,6 @@ def encoder_name(name: str) -> str:
     Args:
         name: `thumbnail`, `siglip` (the paper's model), or `siglip:` and the id or folder of a
             SigLIP or SigLIP 2 model, such as `siglip:google/siglip2-base-patch16-224`.
-
-    Raises:
-        UnknownNameError: There is no such encoder.
-        InvalidOptionError: It takes no model, or names none.
     """
     kind, colon, model = name.partition(":")
     if kind not in _KINDS:
@@ -107,11 +100,6 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
         name: As `encoder_name` reads it.
         device: Where to compute, such as `cpu`; None for a GPU if there is one.
         batch: Images at a time; None for what suits the encoder.
-
-    Raises:
-        UnknownNameError: There is no such encoder.
-        InvalidOptionError: An option is out of range, or the encoder takes no model.
-        MissingExtraError, HubError, FormatError: See `siglip.Siglip`.
     """
     kind, _, model = encoder_name(name).partition(":")
     if batch is not None and batch < 1:

@@ -39,12 +39,6 @@ class Siglip:
         model: Id on the Hub, with `@revision` if it is not the main branch, or a folder.
         device: Where to compute, such as `cpu` or `cuda`; None for a GPU if there is one.
         batch: Images at a time; None for 32 on a GPU and 8 on a CPU.
-
-    Raises:
-        MissingExtraError: torch, transformers or Pillow is not installed.
-        HubError: The model is neither on this machine nor can it be downloaded.
-        FormatError: It is no SigLIP model, or not a whole one.
-        InvalidOptionError: There is no such device or folder.
     """
 
     centred = False
@@ -70,7 +64,7 @@ class Siglip:
             torch.empty(0, device=self._device)
         except (RuntimeError, AssertionError) as error:
             what = f"device {device!r} cannot be used: {first_line(error)}"
-            raise InvalidOptionError(what, "Try: --device cpu") from None
+            raise InvalidOptionError(what, 'Try device="cpu".') from None
         self.batch = batch or (32 if self._device.type == "cuda" else 8)
         with _quiet(transformers):
             self._vision, self._processor = _load(transformers, model, folder)
@@ -141,7 +135,7 @@ def _load(transformers: Any, model: str, folder: Path) -> tuple[Any, Any]:
         if tower is None:
             raise FormatError(
                 f"{model} is a model of type {kind!r}; expected SigLIP or SigLIP 2",
-                f"For example: --encoder siglip:{PAPER_ENCODER}",
+                f'For example: encoder="siglip:{PAPER_ENCODER}"',
             )
         vision, loading = tower.from_pretrained(
             folder, dtype="float32", local_files_only=True, output_loading_info=True

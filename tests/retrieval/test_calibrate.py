@@ -6,14 +6,14 @@ from support.retrieval import made
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval.calibrate import Calibration, calibrate, sweep_steps
 from robomme_interference_data.retrieval.grade import ALL
-from robomme_interference_data.retrieval.select import Measured, Rule
+from robomme_interference_data.retrieval.select import Rule, Similarities
 
 
-def found_in(*measured: Measured, sweep: tuple[float, ...] = (0.5,)) -> Calibration:
+def found_in(*measured: Similarities, sweep: tuple[float, ...] = (0.5,)) -> Calibration:
     return calibrate(measured, Rule(), sweep)
 
 
-def three() -> list[Measured]:
+def three() -> list[Similarities]:
     """Cuts of 0, 0.4 and 0.2 (each family's own), lessons with 0.9, 0.7 and 0.8 at lowest.
 
     Units of one frame: nothing is inside them.

@@ -13,7 +13,7 @@ from support.retrieval import FRAMES, change_header, remade
 from support.splits import QUERIES
 
 from robomme_interference_data import load_split
-from robomme_interference_data.retrieval import drawing, reasons, select
+from robomme_interference_data.retrieval import drawing, explain, select
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -159,7 +159,6 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         ("retrieve VideoRepick/test/9 k1 --split {split}", "VideoRepick/test/9"),
         (f"retrieve {EPISODE} k1 --split {{split}} --out why.gif", "ends in"),
         ("calibrate {split} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
-        ("calibrate {split} --out cuts.pdf", "ends in"),
     ],
 )
 def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_split: Path) -> None:
@@ -223,7 +222,7 @@ def test_why_wherever_the_lesson_lies(
     rule = select.Rule("max", -1.0)
     measured = select.measure(buffer, "thumbnail")
     choice = select.choose(measured, rule)
-    found = reasons.reasons(buffer, measured, choice, rule, "thumbnail", "front")
+    found = explain.explain(buffer, measured, choice, rule, "thumbnail", "front")
     assert found.text().endswith(said)
     live = buffer.query.frame()
     drawing.draw_retrieval(buffer, measured, choice, found, live, tmp_path / "why.svg")
@@ -243,10 +242,9 @@ def test_what_was_chosen_may_be_in_several_parts(run: Run, indexed: Path, tmp_pa
 # --- calibrate ---------------------------------------------------------------------------------
 
 
-def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
-    figure = tmp_path / "cuts.svg"
-    code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2", "--out", figure)
-    assert code == 0 and f"{figure} written" in err and figure.read_text().startswith("<?xml")
+def test_calibration(run: Run, indexed: Path) -> None:
+    code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2")
+    assert code == 0
     assert "Fitted by the released rule: " in out and "in use (max/adaptive): " in out
     assert all(f"\n{family} " in out for family in FAMILIES)
     lines = out.splitlines()

@@ -30,11 +30,11 @@ def test_what_identifies_a_selector(indexed: Path) -> None:
             "fingerprint": index.encoder.sha256,
             "camera": "front",
             "method": "max",
-            "cut": "adaptive",
+            "boundary": "adaptive",
             "threshold": (1 + index.typical_cosine) / 2,
         }
     fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
-    assert (fixed["method"], fixed["cut"], fixed["threshold"]) == ("mean", 0.5, 0.5)
+    assert (fixed["method"], fixed["boundary"], fixed["threshold"]) == ("mean", 0.5, 0.5)
 
 
 def test_what_it_cannot_choose_from(indexed: Path, tiny_split: Path) -> None:

@@ -21,7 +21,7 @@ from robomme_interference_data.retrieval.segment import (
     closest_cosines,
     cosines,
 )
-from robomme_interference_data.retrieval.select import Measured
+from robomme_interference_data.retrieval.select import Similarities
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.codec import read_header, to_dict
 from robomme_interference_data.schema.manifest import place_sessions
@@ -120,7 +120,7 @@ def made(
     spans: tuple[Span, ...] = ((0, 6), (6, 11), (11, 15)),
     lessons: Sequence[int] = (0,),
     units: tuple[str, ...] = (),
-) -> Measured:
+) -> Similarities:
     """A buffer whose adjacent cosines are 1 but before `cuts`, and 0 with the query but at `high`.
 
     Args:
@@ -143,14 +143,14 @@ def made(
     names = [episode if n in lessons else next(others) for n in range(len(spans))]
     sessions: tuple[Session, ...] = sessions_of(names, spans, lessons)
     query = EpisodeId.parse(episode)
-    return Measured(query, condition, sessions, adjacent, alike, 0.0, lambda span: alike)
+    return Similarities(query, condition, sessions, adjacent, alike, 0.0, lambda span: alike)
 
 
-def embedded(history: np.ndarray, query: np.ndarray, lesson: Span = (0, 0)) -> Measured:
+def embedded(history: np.ndarray, query: np.ndarray, lesson: Span = (0, 0)) -> Similarities:
     """A buffer of these embeddings: a lesson and what is around it."""
     spans = list(pairwise(sorted({0, *lesson, len(history)})))
     lessons = [spans.index(lesson)] if lesson in spans else []
     sessions = sessions_of(["MoveCube/test/0"] * len(spans), spans, lessons)
     episode, alike = EpisodeId.parse("MoveCube/test/0"), cosines(history, query)
     near = partial(closest_cosines, history)
-    return Measured(episode, "k2", sessions, adjacent_cosines(history), alike, 0.0, near)
+    return Similarities(episode, "k2", sessions, adjacent_cosines(history), alike, 0.0, near)

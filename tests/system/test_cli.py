@@ -156,7 +156,6 @@ def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_spl
         "simulate --family MoveCube --video S/distractors/meta/look.mp4",
         f"retrieve {EPISODE} k3 --split S --out S/manifests/why.png",
         "retrieval-score S --out S/distractors",
-        "calibrate S --out S/distractors/new/cuts.png",
         "evaluate --policy hold --split S --out S/demonstrations/run",
         "merge a b --out S/manifests/run",
         "score a --out S/distractors/score",

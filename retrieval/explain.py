@@ -10,11 +10,11 @@ from robomme_interference_data.viz.tables import percent
 
 from .grade import Grade, grade
 from .segment import Span
-from .select import METHODS, Choice, Measured, Rule
+from .select import METHODS, Choice, Rule, Similarities
 
 
 @dataclass(frozen=True)
-class Reasons:
+class Explanation:
     """Why a part of a history was chosen.
 
     Attributes:
@@ -80,9 +80,9 @@ def frames_text(spans: Sequence[Span]) -> str:
     return " and ".join(parts) + f" and {len(spans) - 3} more parts" * (len(spans) > 3)
 
 
-def reasons(
-    buffer: Buffer, measured: Measured, choice: Choice, rule: Rule, encoder: str, camera: str
-) -> Reasons:
+def explain(
+    buffer: Buffer, measured: Similarities, choice: Choice, rule: Rule, encoder: str, camera: str
+) -> Explanation:
     """Collect why frames were chosen."""
     alike, frames = measured.alike, choice.frames
     closest = int(frames[np.argmax(alike[frames])])
@@ -90,7 +90,7 @@ def reasons(
     other = int(outside[np.argmax(alike[outside])]) if len(outside) else None
     touched = [buffer.sessions[n] for n in np.unique(buffer.session_index[frames])]
     scores = [score for span, score in choice.scores.items() if span[0] in frames]
-    return Reasons(
+    return Explanation(
         encoder,
         camera,
         grade(measured, rule),
