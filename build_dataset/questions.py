@@ -16,9 +16,7 @@ from robomme_interference_data.errors import BuildError
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.codec import arrow_schema, to_table
 from robomme_interference_data.schema.subgoal import Pixel
-from robomme_interference_data.simulators.tabletop.camera import SIZE, to_pixels
-from robomme_interference_data.simulators.tabletop.episodes import turn_of
-from robomme_interference_data.simulators.tabletop.families import recorded_scene
+from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import png
 from robomme_interference_data.storage.parquet import writing
 
@@ -42,11 +40,12 @@ def make_questions(split: Split) -> Iterator[Question]:
     picture = load_extra(module, "picture", "build questions", "retrieval")
     for question, marks in planned_questions(split):
         view = split.query(question.episode_id).frame()
-        if view.shape != (SIZE, SIZE, 3):
+        side = recorded_scene(split.query(question.episode_id)).side
+        if view.shape != (side, side, 3):
             raise BuildError(
                 f"the first live view of {question.episode_id} has {view.shape[1]}×{view.shape[0]} "
-                f"pixels; where things are is known in {SIZE}×{SIZE}",
-                "Build the demonstrations from --source tabletop.",
+                f"pixels; where things are is known in {side}×{side}",
+                "Build the demonstrations with the simulator itself.",
             )
         yield dataclasses.replace(question, picture=png(picture(view, marks)))
 
@@ -81,12 +80,12 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
         raise BuildError(
             f"{name} is of the simulator {query.simulator!r}, of whose episodes the possible "
             "answers are not known",
-            "Only splits whose demonstrations are of tabletop have questions.",
+            "Questions need demonstrations of a simulator that knows them, such as tabletop.",
         )
     numbers: dict[Any, int] = {}  # choice to the first answer that stands for it
     for number, answer in enumerate(scene.answers):
         numbers.setdefault(scene.choice(answer), number)
-    right = scene.choice(scene.answers[turn_of(seed, len(scene.answers))])
+    right = scene.choice(scene.own_answer(seed))
     others = sorted((one for one in numbers if one != right), key=lambda one: _lot(name, "of", one))
     if len(others) >= _MOST:
         others = others[: _DRAWN - 1]
@@ -101,7 +100,7 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
         chosen.index(right),
         picture=b"",
     )
-    return question, [to_pixels(one.marks) for one in options]
+    return question, [scene.pixels(one.marks) for one in options]
 
 
 def _lot(*parts: Any) -> bytes:

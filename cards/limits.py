@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.outcomes import TEST_EPISODES
 from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 
 def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:
@@ -15,12 +16,8 @@ def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:
 
 def simulated(simulators: Sequence[str]) -> str:
     """Return where episodes come from, in a sentence."""
-    told = {
-        "robomme": "the official simulator, RoboMME",
-        "tabletop": "tabletop, the simulator embedded in this project, which is not RoboMME: its "
-        "results stand beside each other, not beside the paper's",
-        "sample": "sample, made-up pictures without content, for trying the tools out",
-    }
+    told = {name: simulator_class(name).about for name in SIMULATORS}
+    told["sample"] = "sample, made-up pictures without content, for trying the tools out"
     named = [told.get(name, f"the simulator {name}") for name in simulators]
     if not named:
         return "The recordings name no simulator."

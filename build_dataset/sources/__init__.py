@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from robomme_interference_data.errors import InvalidOptionError, nearest
+from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 from .base import (
     Frame,
@@ -17,8 +18,7 @@ KINDS = {
     "robomme-h5": "robomme-h5:FOLDER",
     "lerobot": "lerobot:FOLDER or lerobot:NAMESPACE/NAME[@REVISION]",
     "frames": "frames:FOLDER",
-    "tabletop": "tabletop",
-    "robomme": "robomme",
+    **{name: name for name in SIMULATORS},
     "sample": "sample[:FAMILY,…]",
 }
 """Kind of source to how it is written."""
@@ -55,10 +55,11 @@ def open_source(
             f"--source {specification!r} is not one of {', '.join(KINDS.values())}",
             nearest(kind, KINDS, more=""),
         )
-    if shifted and kind != "tabletop":
+    if shifted and not (kind in SIMULATORS and simulator_class(kind).shifts):
+        able = [one for one in SIMULATORS if simulator_class(one).shifts]
         raise InvalidOptionError(
-            f"--source {specification}: only tabletop can show its episodes under shifts",
-            "Give --source tabletop, for demonstrations that were built from it.",
+            f"the source {specification} cannot show its episodes under shifts",
+            f"Take {' or '.join(able)}, for demonstrations that were built from it.",
         )
     # Each in a module of its own, which brings libraries that the others do not need.
     if kind == "robomme-h5":
@@ -79,7 +80,8 @@ def open_source(
         return SampleSource(tuple(location.split(","))) if location else SampleSource()
     from . import simulator
 
-    return simulator.ShiftedSource() if shifted else simulator.SimulatorSource(kind, robomme_python)
+    source = simulator.ShiftedSource if shifted else simulator.SimulatorSource
+    return source(kind, robomme_python)
 
 
 def _folder(location: str) -> Path:

@@ -18,6 +18,7 @@ from robomme_interference_data.errors import InterferenceError, MissingExtraErro
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.simulators.base import choose_cameras
+from robomme_interference_data.simulators.registry import OFFICIAL
 
 from .base import (
     Frame,
@@ -129,7 +130,7 @@ class H5Source(Source):
                 goals=tuple(_text(goal) for goal in np.atleast_1d(setup["task_goal"][()])),
                 seed=_seed(group),
                 difficulty=_text(setup["difficulty"][()]) if "difficulty" in setup else None,
-                simulator="robomme",
+                simulator=OFFICIAL,
                 exact=True,
                 frames=_frames(path, number, steps, lesson, chosen),
                 evidence=spans_of_texts(texts),

@@ -18,6 +18,7 @@ from robomme_interference_data.schema.codec import from_dict
 from robomme_interference_data.schema.evidence import spans_of_texts
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators.base import CAMERAS, choose_cameras
+from robomme_interference_data.simulators.registry import OFFICIAL
 from robomme_interference_data.storage.encode import is_png
 from robomme_interference_data.storage.hub import HubFiles, locate
 from robomme_interference_data.storage.lerobot import LeRobotFiles
@@ -124,7 +125,7 @@ class LeRobotSource(Source):
                         self._where, f"episode {index}: unknown task {task!r}"
                     )
             played = simulator or told.simulator
-            if played in (None, "robomme"):
+            if played in (None, OFFICIAL):
                 self._check_goals(index, name, told.wordings)
             found.append(SourceEpisode(name, (index, played, self._state(index, columns))))
         return sorted(found, key=lambda episode: episode.id)
@@ -192,7 +193,7 @@ class LeRobotSource(Source):
     def _ids(self, rows: list[dict[str, Any]]) -> tuple[dict[int, EpisodeId], str | None]:
         """Return the episodes' ids, and the simulator where the dataset need not say it."""
         hub = isinstance(self._files, HubFiles) and self._files.repo_id in _ROBOMME_REPOS
-        simulator = "robomme" if hub else None
+        simulator = OFFICIAL if hub else None
         if self._families_file is not None:
             return ids_by_file(self._families_file, len(rows)), simulator
         named = ids_by_columns(rows, self._where)
@@ -200,7 +201,7 @@ class LeRobotSource(Source):
             return named, simulator
         blocks = ids_by_block()
         if len(rows) == len(blocks):
-            return blocks, "robomme"
+            return blocks, OFFICIAL
         raise SourceError(
             f"{self._where} does not say of what family its {len(rows)} episodes are: it has no "
             "per-episode column episode_id or family, and is not one of RoboMME's with "

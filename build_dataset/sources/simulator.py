@@ -1,4 +1,4 @@
-"""Sources `tabletop` and `robomme`: a simulator plays the episodes while they are read."""
+"""Sources that are simulators: they play the episodes while these are read."""
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
@@ -14,9 +14,7 @@ from robomme_interference_data.simulators.base import (
     Simulator,
     choose_cameras,
 )
-from robomme_interference_data.simulators.registry import make_simulator
-from robomme_interference_data.simulators.tabletop import SUITE_VERSION
-from robomme_interference_data.simulators.tabletop.episodes import episode_ids
+from robomme_interference_data.simulators.registry import make_simulator, simulator_class
 
 from .base import (
     Frame,
@@ -29,24 +27,24 @@ from .base import (
 class SimulatorSource(Source):
     """The episodes of the nine families that have demonstrations.
 
-    An episode is the demonstration, the first live observation and, on the tabletop, what the
-    oracle does until the episode ends. RoboMME tells no actions of its demonstrations, and has no
-    oracle: its episodes end with the first live observation.
+    An episode is the demonstration, the first live observation and, where the simulator can play
+    it out, what the oracle does until the episode ends. RoboMME tells no actions of its
+    demonstrations, and has no oracle: its episodes end with the first live observation.
 
     Args:
-        name: `tabletop` or `robomme`.
-        python: RoboMME's interpreter, for `robomme`.
+        name: Name of the simulator.
+        python: Its own interpreter, if it has one.
     """
 
     def __init__(self, name: str, python: str | None = None):
         self.name = name
-        self.whole = name == "tabletop"
-        # An episode takes the tabletop seconds, and RoboMME minutes.
-        self.time_limit = 300.0 if name == "tabletop" else 1800.0
+        self._class = simulator_class(name)
+        self.whole = self._class.scripted
+        self.time_limit = self._class.episode_s
         # The same episode of another version of the suite is another one.
-        version = {"suite_version": SUITE_VERSION} if name == "tabletop" else {}
-        self.provenance = {"kind": name, **version}
-        self._options = {"python": python} if name == "robomme" else {}
+        version = self._class.suite_version
+        self.provenance = {"kind": name, **({} if version is None else {"suite_version": version})}
+        self._options = {"python": python} if "python" in self._class.settings else {}
         self._simulator: Simulator | None = None
         self._cameras: tuple[str, ...] = ()
 
@@ -54,16 +52,15 @@ class SimulatorSource(Source):
         return {**self.__dict__, "_simulator": None}
 
     def episodes(self) -> list[SourceEpisode]:
-        """List all episodes: RoboMME's numbers are those of the tabletop suite."""
-        return [SourceEpisode(one, self.provenance) for one in sorted(episode_ids())]
+        """List all episodes."""
+        return [SourceEpisode(one, self.provenance) for one in sorted(self._class.episodes())]
 
     def contradict(self, episode: SourceEpisode) -> SourceEpisode:
         """Return an episode in the same scene with another answer; see `Source.contradict`."""
-        if self.name != "tabletop":
+        other = self._class.other_answer(episode.id)
+        if other is None:
             return super().contradict(episode)
-        from robomme_interference_data.simulators.tabletop.families import other_answer
-
-        return SourceEpisode(replace(episode.id, answer=other_answer(episode.id)), episode.key)
+        return SourceEpisode(replace(episode.id, answer=other), episode.key)
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Begin to play an episode; see `Source.read`."""
@@ -90,14 +87,11 @@ class SimulatorSource(Source):
 
 
 class ShiftedSource(SimulatorSource):
-    """The first live views of the tabletop's episodes under each shift, instead of its frames."""
-
-    def __init__(self) -> None:
-        super().__init__("tabletop")
+    """The first live views of a simulator's episodes under each shift, instead of its frames."""
 
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         """Begin to look at an episode; see `Source.read`."""
-        simulator: Any = self._open(choose_cameras(cameras))
+        simulator = self._open(choose_cameras(cameras))
         _, _, info = simulator.reset(str(episode.id), demonstration=False)
         frames = (Frame(seen.images, seen.state, None, False) for seen in simulator.views(SHIFTS))
         return Recording(info.goals, info.seed, info.difficulty, info.simulator, True, frames)

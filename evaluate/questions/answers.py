@@ -17,7 +17,7 @@ from robomme_interference_data.evaluate.models.model import ChatModel, Video
 from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.models.registry import make_model
 from robomme_interference_data.evaluate.run.config import AskConfig
-from robomme_interference_data.simulators.tabletop.families import recorded_scene
+from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.encode import decode_image
 
 from .prompt import load_prompt, read_letter
@@ -115,13 +115,13 @@ class Recaller(Answerer):
         """Draw from the options that cannot be ruled out; from all, if all can be.
 
         Raises:
-            FormatError: The question's options are not answers of `tabletop`.
+            FormatError: The question's options are not answers that its scene allows.
         """
         question, scene = asked.question, recorded_scene(asked.query)
         if scene is None or max(question.answers) >= len(scene.answers):
             raise FormatError(
-                f"the options of {question.episode_id} are no answers of tabletop's",
-                "recall answers questions that were made of tabletop's scenes alone.",
+                f"the options of {question.episode_id} are no answers that its scene allows",
+                "recall needs a simulator whose possible answers are known, such as tabletop.",
             )
         left = {scene.choice(answer) for answer in scene.agreeing(asked.known or {})}
         choices = [scene.choice(scene.answers[number]) for number in question.answers]

@@ -26,7 +26,7 @@ from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import Executor, end_if_starting, make_executor
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORIES
-from robomme_interference_data.simulators.tabletop.families import recorded_scene
+from robomme_interference_data.simulators.registry import recorded_scene
 
 from .answers import (
     CONTROLS,
@@ -144,7 +144,7 @@ def _check_known(split: Split, plan: Plan) -> None:
     for episode in {item.episode for item in plan.items()}:
         if recorded_scene(split.query(episode)) is None:
             raise InvalidOptionError(
-                f"recall knows what may have been the answer in tabletop alone, not in {episode}",
+                f"recall does not know what may have been the answer in {episode}",
                 "Ask a model, or guess.",
             )
 

@@ -27,7 +27,11 @@ from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.simulators.base import CAMERAS, Simulator
-from robomme_interference_data.simulators.registry import make_simulator, simulator_versions
+from robomme_interference_data.simulators.registry import (
+    make_simulator,
+    simulator_class,
+    simulator_versions,
+)
 
 from .clips import Clip
 from .rollout import run_rollout
@@ -199,11 +203,12 @@ def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, An
     if config.videos or config.check_lesson:
         wanted |= {*CAMERAS}
     cameras = tuple(name for name in CAMERAS if name in wanted)
-    if config.simulator == "robomme":
-        # Its own limit ends a little before the worker's: its error shows what RoboMME printed.
-        limit = 0.9 * config.simulator_timeout
-        options = {"python": config.robomme_python, "cameras": cameras, "answer_s": limit}
-        return options | {"subgoals": config.subgoals == ORACLE}
-    if config.simulator == "tabletop":
-        return {"cameras": cameras, "shift": config.shift}
-    return {}
+    settings = {
+        "cameras": cameras,
+        "shift": config.shift,
+        "python": config.robomme_python,
+        "subgoals": config.subgoals == ORACLE,
+        # Its own limit ends a little before the worker's: its error shows what it printed.
+        "answer_s": 0.9 * config.simulator_timeout,
+    }
+    return {name: settings[name] for name in simulator_class(config.simulator).settings}

@@ -38,6 +38,7 @@ from robomme_interference_data.simulators.registry import (
     check_shift,
     find_simulator,
     make_simulator,
+    simulator_class,
 )
 
 from .config import RunConfig, WorkConfig, unusual_retrieval
@@ -104,10 +105,11 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
     check_positive(config)
     if config.episode_split not in SPLITS:
         raise InvalidOptionError.one_of("--episode-split", config.episode_split, SPLITS)
-    if policy.privileged and config.simulator == "robomme":
+    if policy.privileged and not simulator_class(config.simulator).scripted:
         raise InvalidOptionError(
-            f"the policy {config.policy} asks the simulator for actions, and robomme gives none",
-            "Run it on --simulator tabletop, or take another policy.",
+            f"the policy {config.policy} asks the simulator for actions, and {config.simulator} "
+            "gives none",
+            "Run it on another simulator, such as tabletop, or take another policy.",
         )
     Rule.parse(config.retrieval_rule)
     unusual_retrieval(config)

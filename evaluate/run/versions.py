@@ -3,6 +3,8 @@
 import platform
 from importlib import metadata
 
+from robomme_interference_data.simulators.registry import simulator_class
+
 from .config import AskConfig, RunConfig
 
 
@@ -16,8 +18,8 @@ def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
         names.append("lerobot")
     if config.retrieval is not None:
         names.append("transformers")
-    if config.simulator == "tabletop":
-        names += ["mani-skill", "sapien"]
+    if isinstance(config, RunConfig):
+        names += simulator_class(config.simulator).packages
     found = {"python": platform.python_version()}
     for name in names:
         try:

@@ -166,7 +166,8 @@ def check_robomme() -> Check:
     logger.info("RoboMME plays an episode with each of its arms: a minute or so")
     try:
         with RoboMMESimulator(python, answer_s=ROBOMME_S) as simulator:
-            versions = [f"{key} {value}" for key, value in simulator.versions.items()]
+            versions = [f"{key} {value}" for key, value in simulator.versions(python).items()]
+            versions += [f"patched: {one}" for one in simulator.patches]
             for family in ARMS:
                 simulator.reset(f"{family}/test/0")
     except InterferenceError as error:

@@ -1,9 +1,9 @@
 """What every simulator serves, whatever engine is behind it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Subgoal
 
 CAMERAS = ("front", "wrist")
@@ -102,15 +103,68 @@ class Simulator(ABC):
     steps has timed out. A backend begins and executes in `_begin` and `_execute`; an object with
     the same `reset`, `step`, `act` and `close` will do as well.
 
+    What a simulator supports are attributes and methods of its class, known before one is made. A
+    function that makes one, and is no class, has those of this class.
+
     Attributes:
+        name: Name under which it is registered.
+        about: What its episodes are, for cards: `the official simulator, RoboMME`.
         remote: Whether it runs in another process: then `evaluate` decodes the history while it
             begins the episode.
+        settings: Which settings of a run are arguments of its constructor: `cameras` (those that
+            somebody looks at), `shift`, `python` (another interpreter's path), `subgoals` (whether
+            `subgoal` will be asked), `answer_s` (seconds that a call may take).
+        scripted: Whether `act` can play an episode out.
+        shifts: Whether it can show its live scene under shifts.
+        suite_version: Version of its episodes; None where they have none of their own.
+        packages: Distributions of this environment that it uses.
+        episode_s: Seconds that an episode may take when it is recorded.
     """
 
-    remote = False
+    name: ClassVar[str] = ""
+    about: ClassVar[str] = ""
+    remote: ClassVar[bool] = False
+    settings: ClassVar[tuple[str, ...]] = ()
+    scripted: ClassVar[bool] = True
+    shifts: ClassVar[bool] = False
+    suite_version: ClassVar[int | None] = None
+    packages: ClassVar[tuple[str, ...]] = ()
+    episode_s: ClassVar[float] = 300.0
     _episode: EpisodeId | None = None
     _steps = 0
     _closed = False
+
+    @classmethod
+    def versions(cls, python: str | None = None) -> dict[str, str]:
+        """Return the versions on which its results depend, by name, without starting it.
+
+        Args:
+            python: Path of its own interpreter, if it has one.
+        """
+        return {} if cls.suite_version is None else {cls.name: str(cls.suite_version)}
+
+    @classmethod
+    def episodes(cls) -> list[EpisodeId]:
+        """List its episodes that have demonstrations."""
+        return []
+
+    @classmethod
+    def other_answer(cls, episode: EpisodeId) -> int | None:
+        """Return the number of another answer that an episode's scene allows; None if unknown."""
+        return None
+
+    @classmethod
+    def scene(cls, family: str, seed: int, difficulty: str) -> Any:
+        """Return the scene of a recorded episode, to be looked at and not played.
+
+        That is an object with the methods of `tabletop.family.Family` that concern answers; None
+        where the possible answers are not known.
+        """
+        return None
+
+    def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
+        """Yield what is seen now as under each of several shifts; the scene stays unchanged."""
+        raise UnknownNameError(f"the simulator {type(self).__name__} has no shifts")
 
     def reset(self, episode_id: str, demonstration: bool = True) -> Begun:
         """Start an episode: play its demonstration, then set the scene for execution.
@@ -183,9 +237,7 @@ class Simulator(ABC):
             UnknownNameError: The simulator does not tell.
             SimulatorCrashError: There is no episode, or the simulator is closed.
         """
-        raise UnknownNameError(
-            f"the simulator {type(self).__name__} tells no subgoals", "Use tabletop or robomme."
-        )
+        raise UnknownNameError(f"the simulator {type(self).__name__} has no subgoals of its own")
 
     def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
         """Return the next action, `(8,) float32`, of a script that does what a subgoal says.
@@ -199,7 +251,7 @@ class Simulator(ABC):
             SimulatorCrashError: There is no episode to act in, or the simulator is closed.
         """
         raise UnknownNameError(
-            f"the simulator {type(self).__name__} has no script that obeys", "Use tabletop."
+            f"the simulator {type(self).__name__} has no script that follows subgoals"
         )
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 POLICIES = ("oracle", "guess", "none")
-"""Built-in policies; `none` plays the demonstration only, which is all that robomme can do."""
+"""Built-in policies; `none` plays the demonstration only, which is all that some can do."""
 
 LESSON, LIVE = (40, 90, 200), (230, 130, 20)
 """Colours of the bar above the pictures."""
@@ -30,7 +30,7 @@ def simulate(
         str | None,
         typer.Option(
             help="oracle: knows the answer; guess: draws one; none: only the demonstration. "
-            "By default oracle, or none on robomme, which has no other.",
+            "By default oracle, or none on a simulator that has no other, as robomme.",
         ),
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Write a video here, .mp4.")] = None,
@@ -60,29 +60,27 @@ def simulate(
     from robomme_interference_data.storage.encode import CLIP, VideoEncoder
     from robomme_interference_data.storage.files import atomic_path
 
-    from .registry import check_shift, make_simulator
+    from .registry import check_shift, make_simulator, simulator_class
 
     check_shift(simulator, shift)
-    policies = POLICIES if simulator != "robomme" else POLICIES[2:]
+    able = simulator_class(simulator)
+    policies = POLICIES if able.scripted else POLICIES[2:]
     policy = policy or policies[0]
     if policy not in policies:
-        raise InvalidOptionError.one_of(f"--policy on {simulator}", policy, policies)
+        raise InvalidOptionError.one_of(f"policy on {simulator}", policy, policies)
     if video is not None and (video.suffix != ".mp4" or video.is_dir()):
         raise InvalidOptionError.expected("--video", str(video), "the path of an .mp4 file")
     check_output(video)
     name = EpisodeId(family, split, episode)
-    options: dict[str, dict[str, Any]] = {
-        "tabletop": {"shift": shift},
-        "robomme": {"python": robomme_python},
-    }
-    own = options.get(simulator, {})
-    if own and video is None:
-        own["cameras"] = ()
+    settings: dict[str, Any] = {"shift": shift, "python": robomme_python}
+    if video is None:
+        settings["cameras"] = ()
+    options = {one: settings[one] for one in able.settings if one in settings}
     clip: VideoEncoder | None = None
     with ExitStack() as stack:
         # First: minutes are spent on what is to be in it.
         path = None if video is None else stack.enter_context(atomic_path(video))
-        running = stack.enter_context(closing(make_simulator(simulator, **own)))
+        running = stack.enter_context(closing(make_simulator(simulator, **options)))
         lesson, seen, info = running.reset(str(name))
         if path is not None:
             first = _picture(seen.images, LIVE)

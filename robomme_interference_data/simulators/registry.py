@@ -1,36 +1,28 @@
 """Simulators by name; the libraries behind them are imported when one is made."""
 
+import inspect
 from collections.abc import Callable
-from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    MissingExtraError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.runtime.specs import import_factory
 from robomme_interference_data.schema.shifts import parse_shift
 
 from .base import Simulator
 
+if TYPE_CHECKING:
+    from robomme_interference_data.data.query import Query
 
-def _tabletop(**options: Any) -> Simulator:
-    try:
-        from .tabletop.simulator import TabletopSimulator
-    except ImportError as error:
-        library = error.name or "a library"
-        raise MissingExtraError.needs("the tabletop simulator", library, "sim") from error
-    return TabletopSimulator(**options)
+OFFICIAL = "robomme"
+"""The benchmark's own simulator, from which published recordings and results are."""
 
+SIMULATORS: dict[str, str | Callable[..., Simulator]] = {
+    "tabletop": f"{__package__}.tabletop.simulator:TabletopSimulator",
+    "robomme": f"{__package__}.robomme.simulator:RoboMMESimulator",
+}
+"""Name to what makes the simulator, or where that is, `module:name`; others add themselves here."""
 
-def _robomme(**options: Any) -> Simulator:
-    from .robomme.simulator import RoboMMESimulator
-
-    return RoboMMESimulator(**options)
-
-
-SIMULATORS: dict[str, Callable[..., Simulator]] = {"tabletop": _tabletop, "robomme": _robomme}
-"""Name to a function that makes the simulator; another backend adds itself here."""
+_SEEDS = 1 << 32
 
 
 def make_simulator(name: str, **options: Any) -> Simulator:
@@ -46,60 +38,44 @@ def make_simulator(name: str, **options: Any) -> Simulator:
         InvalidOptionError: An option is not what it may be.
         NoRendererError: This machine cannot draw its cameras' pictures.
     """
-    return find_simulator(name)(**options)
+    made: Simulator = find_simulator(name)(**options)
+    return made
 
 
 def find_simulator(name: str) -> Callable[..., Simulator]:
-    """Return the function that makes a simulator, without calling it.
-
-    Raises:
-        UnknownNameError: There is no such simulator.
-    """
-    if name in SIMULATORS:
-        return SIMULATORS[name]
-    module, _, function = name.partition(":")
-    if not function:
+    """Return what makes a simulator, without calling it."""
+    if name not in SIMULATORS and ":" not in name:
         raise UnknownNameError.none("simulator", name, SIMULATORS)
-    try:
-        found: Callable[..., Simulator] = getattr(import_module(module), function)
-    except (ModuleNotFoundError, AttributeError) as error:
-        raise UnknownNameError(
-            f"there is no simulator {name!r}: {error}",
-            "Expected <module>:<function>, which can be imported and returns a simulator.",
-        ) from error
-    return found
+    found = SIMULATORS.get(name, name)
+    return import_factory("simulator", found) if isinstance(found, str) else found
 
 
-def check_shift(simulator: str, shift: str) -> None:
-    """Check that a simulator can change its live scene as a shift says.
+def simulator_class(name: str) -> type[Simulator]:
+    """Return the class of a simulator, for what it supports; `Simulator` for a bare function."""
+    found = find_simulator(name)
+    known = inspect.isclass(found) and issubclass(found, Simulator)
+    return found if known else Simulator  # type: ignore[return-value]
 
-    Raises:
-        InvalidOptionError: It is no shift, or the simulator has none.
-    """
-    if parse_shift(shift) is not None and simulator != "tabletop":
+
+def check_shift(name: str, shift: str) -> None:
+    """Check that a simulator can show its live scene as a shift says."""
+    if parse_shift(shift) is not None and not simulator_class(name).shifts:
+        able = [one for one in SIMULATORS if simulator_class(one).shifts]
         raise InvalidOptionError(
-            f"--shift {shift} on {simulator}: only tabletop can light and furnish its scenes "
-            "otherwise after the demonstration",
-            "Run it on --simulator tabletop, or leave --shift out.",
+            f"the shift {shift} on {name}: it cannot light and furnish its scenes otherwise after "
+            "the demonstration",
+            f"Take the simulator {' or '.join(able)}, or leave the shift out.",
         )
 
 
+def recorded_scene(query: "Query") -> Any:
+    """Return the scene of a recorded query, see `Simulator.scene`; None where it is not known."""
+    name, seed, difficulty = query.simulator, query.seed, query.difficulty
+    if name not in SIMULATORS or seed is None or difficulty is None or not 0 <= seed < _SEEDS:
+        return None
+    return simulator_class(name).scene(query.episode_id.family, seed, difficulty)
+
+
 def simulator_versions(name: str, python: str | None = None) -> dict[str, str]:
-    """Return what is known of a simulator's versions.
-
-    Under its own name that of its episodes, if known: `SUITE_VERSION` of `tabletop`, that of the
-    installed package of `robomme`, whose interpreter is `python`; see `RoboMMESimulator.versions`.
-
-    Raises:
-        InvalidOptionError, MissingExtraError, SimulatorCrashError: As `RoboMMESimulator`.
-    """
-    if name == "tabletop":
-        from .tabletop import SUITE_VERSION
-
-        return {"tabletop": str(SUITE_VERSION)}
-    if name != "robomme":
-        return {}
-    from .robomme.simulator import RoboMMESimulator
-
-    with RoboMMESimulator(python) as simulator:
-        return simulator.versions
+    """Return the versions on which a simulator's results depend; see `Simulator.versions`."""
+    return simulator_class(name).versions(python)

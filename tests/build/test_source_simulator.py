@@ -1,18 +1,16 @@
 """A simulator is a source like any other: its episodes are played while they are read."""
 
 import pickle
-from functools import partial
 from typing import Any
 
 import pytest
 from support.simulator_doubles import Double
 
 from robomme_interference_data.build_dataset.cut import cut_demonstration
-from robomme_interference_data.build_dataset.sources import Recording, open_source
+from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.simulators.registry import SIMULATORS
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
 
@@ -25,8 +23,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Double]:
         found.append(Double(name=name, told=name == "tabletop", **options))
         return found[-1]
 
-    for name in ("tabletop", "robomme"):
-        monkeypatch.setitem(SIMULATORS, name, partial(make, name))
+    monkeypatch.setattr(simulator, "make_simulator", make)
     return found
 
 
@@ -78,7 +75,7 @@ def test_the_tabletop_under_shifts(made: list[Double]) -> None:
         (False, None, *[10.0] * 8)
     }
     for other in ("robomme", "sample"):
-        with pytest.raises(InvalidOptionError, match=f"{other}: only tabletop"):
+        with pytest.raises(InvalidOptionError, match=f"{other} cannot show"):
             open_source(other, shifted=True)
 
 

@@ -34,15 +34,15 @@ def test_a_simulator_is_made_by_its_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "error", "message"),
     [
-        ("tabeltop", "Did you mean 'tabletop'"),
-        ("no_such_module:make", "no_such_module"),
-        ("support.simulator_doubles:nothing", "Expected <module>:<function>"),
+        ("tabeltop", UnknownNameError, "Did you mean 'tabletop'"),
+        ("no_such_module:make", InvalidOptionError, "no_such_module"),
+        ("support.simulator_doubles:nothing", UnknownNameError, "function 'nothing' is not in"),
     ],
 )
-def test_an_unknown_simulator_is_named(name: str, told: str) -> None:
-    with pytest.raises(UnknownNameError, match=told):
+def test_an_unknown_simulator_is_named(name: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
         make_simulator(name)
 
 
@@ -176,7 +176,7 @@ def test_simulate_can_play_the_demonstration_only(run: Run) -> None:
         ("--policy orakel", "oracle, guess, none"),
         ("--simulator robomme --policy oracle", "is none of none"),
         ("--shift fog:1", "such as light:2"),
-        ("--shift light:2", "only tabletop"),
+        ("--shift light:2 --simulator robomme", "it cannot light"),
         ("--video {}/out.mp4", "no such episode"),
     ],
 )

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.few import few
+from support.families import families
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.schema.rollouts import Status
@@ -20,12 +20,6 @@ from robomme_interference_data.simulators.tabletop.camera import (
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
-
-
-@pytest.fixture(scope="module")
-def blind() -> TabletopSimulator:
-    """Without pictures: several times as fast."""
-    return TabletopSimulator(cameras=())
 
 
 def obeyed(
@@ -49,7 +43,7 @@ def obeyed(
 # --- what is obeyed ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("family", few(FAMILIES))
+@pytest.mark.parametrize("family", families("VideoUnmaskSwap", "InsertPeg"))
 def test_told_what_to_do_it_succeeds(blind: TabletopSimulator, family: str) -> None:
     """The hard ones have all steps: of two containers, after exchanges, of the longest path."""
     assert obeyed(blind, f"{family}/test/2")[0] is Status.SUCCESS
@@ -63,20 +57,13 @@ def test_told_what_to_do_it_always_succeeds(blind: TabletopSimulator, family: st
         assert status is Status.SUCCESS, (index, heard)
 
 
-@pytest.mark.slow
 def test_the_steps_are_told_in_order(blind: TabletopSimulator) -> None:
-    # Episode 2 is hard: two colours are asked for; in VideoRepick, two times.
-    put, up = "put it down", "pick up the container"
-    assert obeyed(blind, "VideoUnmask/test/2")[1] == [up, put, up]
-    cube = "pick up the cube"
+    # Episode 2 is hard: the cube is asked for two times.
+    put, cube = "put it down", "pick up the cube"
     assert obeyed(blind, "VideoRepick/test/2")[1] == [cube, put, cube, put, "press the button"]
-    assert obeyed(blind, "InsertPeg/test/2")[1] == [
-        "pick up the peg by its head",
-        "insert it into the box from the left",
-    ]
 
 
-@pytest.mark.parametrize("family", few(FAMILIES))
+@pytest.mark.parametrize("family", families("MoveCube"))
 def test_untold_it_does_what_guess_does(blind: TabletopSimulator, family: str) -> None:
     actions = []
     for act in (lambda: blind.obey(None), lambda: blind.act("guess")):

@@ -4,9 +4,8 @@ import math
 from typing import Any
 
 import pytest
-from support.few import few
+from support.families import families
 
-from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 PLACES: dict[str, list[tuple[int, int, int]]] = {
@@ -26,7 +25,7 @@ BEFORE = 0.03
 """m: a peg goes in from so far before the box's side."""
 
 
-@pytest.mark.parametrize("family", few(FAMILIES))
+@pytest.mark.parametrize("family", families("VideoUnmaskSwap", "InsertPeg"))
 def test_the_right_option_alone_is_marked_where_it_is(
     blind: TabletopSimulator, family: str
 ) -> None:

@@ -26,7 +26,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators import Status, make_simulator
 from robomme_interference_data.simulators.registry import simulator_versions
-from robomme_interference_data.simulators.robomme.process import find_python
+from robomme_interference_data.simulators.robomme.process import find_python, installed_versions
 from robomme_interference_data.simulators.robomme.simulator import EPISODES, RoboMMESimulator
 from robomme_interference_data.simulators.tabletop import SUITE_VERSION
 
@@ -301,7 +301,7 @@ def test_an_interpreter_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_an_interpreter_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(InvalidOptionError, match="none is given") as caught:
         make_simulator("robomme")
-    assert "--robomme-python PATH" in str(caught.value)
+    assert "robomme_python=PATH" in str(caught.value)
     (tmp_path / "notes.txt").write_text("not a program")
     for path in (tmp_path / "nowhere" / "python", tmp_path, tmp_path / "notes.txt"):
         with pytest.raises(InvalidOptionError, match=f"{path.name} is not an executable file"):
@@ -332,7 +332,7 @@ def test_an_interpreter_that_will_not_do(
 # --- another ManiSkill than RoboMME's fork of it ----------------------------------------------
 
 
-def test_what_differs_from_the_fork_is_mended(
+def test_what_differs_from_the_fork_is_patched(
     robomme_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -343,10 +343,10 @@ def test_what_differs_from_the_fork_is_mended(
             results.append(
                 [told(simulator, f"{name}/test/3") for name in ("MoveCube", "RouteStick")]
             )
-            mended = simulator.versions["robomme_mended"]
-            assert (mended == "nothing") == (kind == "fork")
+            patches = simulator.patches
+            assert (patches == ()) == (kind == "fork")
     assert results[1] == results[2] == results[0]
-    assert len(mended.split("; ")) == 4
+    assert len(patches) == 4
     # The description of the arm is written once: the stick's own, and of the camera what hangs on
     # it, but for its colour, which the fork leaves out too.
     [folder] = (tmp_path / "robomme-interference" / "robomme").iterdir()
@@ -359,7 +359,7 @@ def test_what_differs_from_the_fork_is_mended(
     assert (folder / "meshes" / "camera.stl").read_text() == "solid\n"
 
 
-def test_what_cannot_be_mended_is_refused(
+def test_what_cannot_be_patched_is_refused(
     robomme_python: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_MANI_SKILL", "strange")
@@ -382,12 +382,12 @@ def test_versions_are_told(
     (installed / "direct_url.json").write_text(json.dumps(origin))
     found = simulator_versions("robomme", str(robomme_python))
     # What is only on the path, not installed, has no version.
-    assert found.keys() == {"robomme_python", "robomme_numpy", "robomme_mended"}
+    assert found.keys() == {"robomme_python", "robomme_numpy"}
     assert found["robomme_python"] == platform.python_version()
-    assert found["robomme_mended"] == "nothing"
     assert found["robomme_numpy"].startswith("1.")
     monkeypatch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}:{tmp_path}")
+    installed_versions.cache_clear()
     installed_too = simulator_versions("robomme", str(robomme_python))
     assert installed_too == {**found, "robomme": "0.2+ab12"}
     assert simulator_versions("tabletop") == {"tabletop": str(SUITE_VERSION)}
-    assert simulator_versions("my.module:make") == {}
+    assert simulator_versions("support.worlds:World") == {}

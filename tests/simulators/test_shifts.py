@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.few import few
+from support.families import families
 
-from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
     InvalidOptionError,
     SimulatorCrashError,
@@ -60,7 +59,6 @@ def test_each_shift_is_seen_and_the_stronger_the_more(shifted: TabletopSimulator
     assert all(np.array_equal(again.images[name], plain.images[name]) for name in plain.images)
 
 
-@pytest.mark.slow
 def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
     shifted: TabletopSimulator,
 ) -> None:
@@ -80,9 +78,14 @@ def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
     assert apart(begin(shifted, EPISODE, None), plain[1], "front") == 0
 
 
-def test_the_scene_stays_under_a_shift_while_it_is_played(shifted: TabletopSimulator) -> None:
+@pytest.mark.parametrize(
+    "kinds", [("clutter",), pytest.param(("light", "camera"), marks=pytest.mark.slow)]
+)
+def test_the_scene_stays_under_a_shift_while_it_is_played(
+    shifted: TabletopSimulator, kinds: tuple[str, ...]
+) -> None:
     played: list[list[NDArray[np.float32]]] = []
-    for shift in (None, *(Shift(kind, 3) for kind in KINDS)):
+    for shift in (None, *(Shift(kind, 3) for kind in kinds)):
         begin(shifted, EPISODE, shift)
         states, status = [], Status.ONGOING
         while status is Status.ONGOING:
@@ -94,7 +97,7 @@ def test_the_scene_stays_under_a_shift_while_it_is_played(shifted: TabletopSimul
         assert np.array_equal(states, played[0])
 
 
-@pytest.mark.parametrize("family", few(FAMILIES))
+@pytest.mark.parametrize("family", families("VideoPlaceOrder"))
 def test_things_that_take_no_part_are_in_nobodys_way(blind: TabletopSimulator, family: str) -> None:
     """No part of the hand, and nothing on the table, comes to where one of them may stand."""
     blind.reset(f"{family}/test/2", demonstration=False)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.few import few
+from support.families import families
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import (
@@ -98,7 +98,6 @@ def test_another_process_gives_the_same_bits() -> None:
     assert one.stdout == other.stdout != b""
 
 
-@pytest.mark.slow
 def test_the_same_actions_have_the_same_outcome_whatever_is_drawn(
     tabletop: TabletopSimulator,
 ) -> None:
@@ -142,7 +141,7 @@ def test_pictures_are_lit_by_the_scenes_own_lights(scene: TabletopEnv) -> None:
 
 
 @pytest.mark.parametrize("index", [0, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("family", few(FAMILIES))
+@pytest.mark.parametrize("family", families("VideoRepick", "VideoUnmask", "PatternLock"))
 def test_an_answer_solves_its_scene_and_no_other_which_looks_the_same(
     blind: TabletopSimulator, family: str, index: int
 ) -> None:

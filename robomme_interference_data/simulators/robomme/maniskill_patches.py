@@ -1,4 +1,4 @@
-"""Mend, at run time, a ManiSkill that is not the fork which RoboMME asks for.
+"""Patch, at run time, a ManiSkill that is not the fork which RoboMME requires.
 
 Runs in RoboMME's own interpreter, as `worker.py` does: nothing of ours is imported, and
 nothing of that installation is changed. What is missing is taken from what the installation holds.
@@ -23,18 +23,15 @@ BODY = "camera's body on the stick"
 WRIST, STICK = "wrist camera's size", "wrist camera on the stick"
 
 
-class CannotMend(Exception):
+class CannotPatch(Exception):
     """RoboMME cannot play here as it does on its fork of ManiSkill; says why."""
 
 
-def mend(folder: Path) -> list[str]:
-    """Mend what differs from RoboMME's fork of ManiSkill; return what was, in words.
+def apply_patches(folder: Path) -> list[str]:
+    """Patch what differs from RoboMME's fork of ManiSkill; return what was, in words.
 
     Args:
         folder: Where the description of an arm may be written, once for all processes.
-
-    Raises:
-        CannotMend: It differs in another way.
     """
     try:
         from mani_skill.agents.robots.panda import PandaStick, PandaWristCam
@@ -48,11 +45,11 @@ def mend(folder: Path) -> list[str]:
             *_camera(PandaStick, PandaWristCam, STICK),
             *_camera(PandaWristCam, PandaWristCam, WRIST),
         ]
-    except CannotMend:
+    except CannotPatch:
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
-        raise CannotMend(f"its ManiSkill is none that is known: {what}") from error
+        raise CannotPatch(f"its ManiSkill is none that is known: {what}") from error
 
 
 def _planner(solver: Any) -> list[str]:
@@ -61,7 +58,7 @@ def _planner(solver: Any) -> list[str]:
     signature, taken = (inspect.signature(one.__init__) for one in (solver, base))
     for name in ("visualize_target_grasp_pose", "joint_vel_limits"):
         if name not in signature.parameters:
-            raise CannotMend(f"its ManiSkill's {solver.__name__} takes no {name}")
+            raise CannotPatch(f"its ManiSkill's {solver.__name__} takes no {name}")
 
     def trial(*args: Any, **named: Any) -> None:
         taken.bind(*args, **named)
@@ -116,7 +113,7 @@ def _camera(arm: Any, wrist: Any, what: str) -> list[str]:
     if sizes == [(SIDE, SIDE)]:
         return []
     if not hand(sensors(nowhere)):
-        raise CannotMend(f"its ManiSkill has no {CAMERA} on {wrist.__name__}")
+        raise CannotPatch(f"its ManiSkill has no {CAMERA} on {wrist.__name__}")
     arm._sensor_configs = property(sensors)
     return [what]
 
@@ -138,16 +135,13 @@ class _Description:
         """Take a link from another arm, and all between it and the first link that this one has.
 
         What its material is, is not taken: on RoboMME's fork the body on the stick is white, too.
-
-        Raises:
-            CannotMend: The other one has no such link, or it hangs on none that this one has.
         """
         there = other.links
         joints = {_end(one, "child"): one for one in other._urdf.iter("joint")}
         new: list[str] = []
         while link not in self.links:
             if link not in there or link not in joints:
-                raise CannotMend(f"{other._path} has no {LINK} that {self._path} can take")
+                raise CannotPatch(f"{other._path} has no {LINK} that {self._path} can take")
             new.append(link)
             self._urdf.append(copy.deepcopy(joints[link]))
             self._urdf.append(copy.deepcopy(there[link]))

@@ -1,11 +1,13 @@
 """RoboMME's process: its own interpreter, which answers on a pipe."""
 
+import json
 import os
 import shutil
 import subprocess
 import threading
 from collections import deque
 from contextlib import suppress
+from functools import cache
 from multiprocessing.connection import Pipe
 from typing import Any
 
@@ -34,7 +36,7 @@ _ENVIRONMENT = {
 
 _INSTALL = (
     "Install RoboMME (https://github.com/RoboMME/robomme_benchmark) into an environment of its own "
-    f"and give its Python: --robomme-python PATH, or export {PYTHON_VARIABLE}=PATH."
+    f"and give its Python: robomme_python=PATH, or export {PYTHON_VARIABLE}=PATH."
 )
 
 Arrays = dict[str, NDArray[Any]]
@@ -52,11 +54,11 @@ class Process:
         self._python, self._answer_s = python, answer_s
         self._log: deque[bytes] = deque(maxlen=PRINTED_LINES)
         self._channel, theirs = Pipe()
-        mends = default_cache_folder().parent / "robomme"
+        patched = default_cache_folder().parent / "robomme"
         try:
             with theirs:
                 self._process = subprocess.Popen(
-                    [python, robomme_worker.__file__, str(theirs.fileno()), str(mends)],
+                    [python, robomme_worker.__file__, str(theirs.fileno()), str(patched)],
                     pass_fds=[theirs.fileno()],
                     env={**os.environ, **_ENVIRONMENT},
                     stdin=subprocess.DEVNULL,
@@ -77,15 +79,10 @@ class Process:
             self.end()
             raise MissingExtraError(f"{python} cannot run RoboMME: {hello['problem']}", _INSTALL)
         self.families: tuple[str, ...] = tuple(hello["families"])
-        self.versions: dict[str, str] = hello["versions"]
+        self.patches: tuple[str, ...] = tuple(hello["patches"])
 
     def call(self, call: str, **arguments: Any) -> tuple[dict[str, Any], Arrays]:
-        """Call one of the worker's functions, `reset` or `step`.
-
-        Raises:
-            UnknownNameError: RoboMME has no such episode.
-            SimulatorCrashError: The call failed, the process died, or it took too long.
-        """
+        """Call one of the worker's functions, `reset` or `step`."""
         with suppress(OSError):  # it died: the answer will say so
             robomme_worker.send(self._channel, {"call": call, **arguments})
         answer, found = self._answer(call)
@@ -137,14 +134,31 @@ class Process:
             self._log.extend(lines)
 
 
+@cache
+def installed_versions(python: str) -> dict[str, str]:
+    """Return the versions in an interpreter that `find_python` returned; RoboMME is not started."""
+    try:
+        done = subprocess.run(
+            [python, robomme_worker.__file__, "versions"],
+            env={**os.environ, **_ENVIRONMENT},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            check=True,
+            timeout=60,
+        )
+        found: dict[str, str] = json.loads(done.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        raise InvalidOptionError(
+            f"{python} cannot be run as RoboMME's Python: {error}", _INSTALL
+        ) from error
+    return found
+
+
 def find_python(python: str | os.PathLike[str] | None) -> str:
     """Return the absolute path of the interpreter that is given, or that the environment names.
 
     Args:
         python: A path; or text, which may also be the name of a program, as in a shell.
-
-    Raises:
-        InvalidOptionError: None is given, or there is none at that path.
     """
     given = os.fspath(python) if python is not None else os.environ.get(PYTHON_VARIABLE, "")
     if not given:

@@ -24,8 +24,9 @@ from robomme_interference_data.simulators.base import (
     Simulator,
     choose_cameras,
 )
+from robomme_interference_data.simulators.tabletop.episodes import episode_ids
 
-from .process import Arrays, Process, find_python
+from .process import Arrays, Process, find_python, installed_versions
 
 ARMS = ("VideoUnmask", "PatternLock")
 """A family of each arm: with a gripper, with a stick. Their demonstrations are the shortest."""
@@ -62,16 +63,14 @@ class RoboMMESimulator(Simulator):
             front view is then drawn at every step.
         answer_s: Seconds that it may take to start, and for each answer. Seen on machines with too
             much to do: 300 to start, 190 for a reset, 120 for a step.
-
-    Raises:
-        InvalidOptionError: No interpreter is given, none is at that path, or no such camera.
-        MissingExtraError: That interpreter has no RoboMME, cannot import it, has numpy 2, or a
-            ManiSkill on which RoboMME does not play as it does on its own fork of it.
-        SimulatorCrashError: It died, or took too long to start.
     """
 
     name = "robomme"
+    about = "the official simulator, RoboMME"
     remote = True
+    settings = ("cameras", "python", "subgoals", "answer_s")
+    scripted = False
+    episode_s = 1800.0
 
     def __init__(
         self,
@@ -86,19 +85,29 @@ class RoboMMESimulator(Simulator):
         self._subgoal: str | None = None
 
     @property
-    def versions(self) -> dict[str, str]:
-        """What is installed in its interpreter: `robomme`, `robomme_python`, `robomme_mani_skill`.
+    def patches(self) -> tuple[str, ...]:
+        """In what its ManiSkill was patched, in words: RoboMME requires a fork of that."""
+        return self._process.patches
 
-        And so for sapien, torch and numpy, where known; with the commit, if it was installed from
-        one. `robomme_mended` says in what the ManiSkill was mended: RoboMME asks for a fork.
+    @classmethod
+    def versions(cls, python: str | None = None) -> dict[str, str]:
+        """Return what is installed in its interpreter: `robomme`, `robomme_mani_skill`, and so on.
+
+        And so for Python, sapien, torch and numpy, where known; with the commit, if it was
+        installed from one. Read from the metadata of installed packages: RoboMME is not started.
         """
-        return self._process.versions
+        return installed_versions(find_python(python))
+
+    @classmethod
+    def episodes(cls) -> list[EpisodeId]:
+        """List its episodes: their numbers are those of the embedded suite."""
+        return episode_ids()
 
     def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
         """Refuse with `UnknownNameError`: RoboMME has no built-in policy."""
         raise UnknownNameError(
             f"the robomme simulator has no built-in policy {policy!r}",
-            "oracle, guess and recall play on the embedded suite only: --simulator tabletop.",
+            "oracle, guess and recall play on the embedded suite, tabletop, only.",
         )
 
     def subgoal(self) -> Subgoal:
@@ -111,7 +120,7 @@ class RoboMMESimulator(Simulator):
         if not (self._subgoal or "").strip():
             raise UnknownNameError(
                 f"RoboMME in {self._python} tells no subgoal now",
-                "Run without --subgoals oracle, or with a newer RoboMME.",
+                "Run without its subgoals, or with a newer RoboMME.",
             )
         return read_grounded(str(self._subgoal))
 

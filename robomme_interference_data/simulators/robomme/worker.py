@@ -35,7 +35,7 @@ def _neighbour(name: str) -> Any:
     return module
 
 
-_mends, _drawing = _neighbour("maniskill_patches"), _neighbour("render_on_demand")
+_patches, _drawing = _neighbour("maniskill_patches"), _neighbour("render_on_demand")
 
 
 def send(
@@ -64,11 +64,7 @@ def send(
 
 
 def receive(channel: Connection) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the head and the arrays, by name, of the next message.
-
-    Raises:
-        EOFError: The other side closed the pipe.
-    """
+    """Return the head and the arrays, by name, of the next message."""
     head = json.loads(channel.recv_bytes())
     arrays: dict[str, Any] = {}
     for name, dtype, shape in head.pop("arrays"):
@@ -81,12 +77,12 @@ def receive(channel: Connection) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def probe(folder: Path) -> dict[str, Any]:
-    """Mend what differs in this installation; return its versions and RoboMME's families.
+    """Patch what differs in this installation; return RoboMME's families and what was patched.
 
-    Or what it lacks, or what cannot be mended, as `problem`.
+    Or what it lacks, or what cannot be patched, as `problem`.
 
     Args:
-        folder: See `maniskill_patches.mend`.
+        folder: See `maniskill_patches.apply_patches`.
     """
     if importlib.util.find_spec("robomme") is None:
         return {"problem": "robomme is not installed there"}
@@ -95,17 +91,15 @@ def probe(folder: Path) -> dict[str, Any]:
         if int(numpy.partition(".")[0]) >= 2:
             return {"problem": f"numpy is {numpy}; RoboMME needs numpy < 2"}
         families = list(_builder().get_task_list())
-        mended = _mends.mend(folder)
-        versions = _versions() | {"robomme_mended": "; ".join(mended) or "nothing"}
-        return {"families": families, "versions": versions}
-    except _mends.CannotMend as error:
+        return {"families": families, "patches": _patches.apply_patches(folder)}
+    except _patches.CannotPatch as error:
         return {"problem": str(error)}
     except Exception as error:
         traceback.print_exc()
         return {"problem": f"robomme cannot be imported: {_text(error)}"}
 
 
-def _versions() -> dict[str, str]:
+def installed_versions() -> dict[str, str]:
     """Return the versions in this interpreter, each with its commit if that is known."""
     found = {"robomme_python": platform.python_version()}
     for name in ("robomme", "mani_skill", "sapien", "torch", "numpy"):
@@ -292,7 +286,13 @@ def _text(error: BaseException) -> str:
 
 
 def main() -> None:
-    """Serve on the pipe whose descriptor is the first argument; the second is a folder of ours."""
+    """Serve on the pipe whose descriptor is the first argument; the second is a folder of ours.
+
+    With `versions` alone, print what is installed.
+    """
+    if sys.argv[1:] == ["versions"]:
+        sys.stdout.write(json.dumps(installed_versions()))
+        return
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the other side's to handle
     os.set_inheritable(int(sys.argv[1]), False)
     serve(Connection(int(sys.argv[1])), Path(sys.argv[2]))

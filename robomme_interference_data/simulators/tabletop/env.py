@@ -64,10 +64,6 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         **options: As for any ManiSkill environment, but one environment on the processor, joint
             targets as actions, `obs_mode` `rgb`, `state`, `state_dict` or `none`, `render_mode`
             `rgb_array` (the front view) or `sensors` (both cameras), a sparse reward or none.
-
-    Raises:
-        InvalidOptionError: An option is none of these.
-        NoRendererError: No Vulkan device of this machine can render.
     """
 
     SUPPORTED_ROBOTS = [PANDA]  # noqa: RUF012, ManiSkill's name and type
@@ -137,12 +133,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of a seed: play its demonstration, then set the live scene.
-
-        Raises:
-            InvalidOptionError: Seed, difficulty or answer is outside what it may be.
-            UnknownNameError: There is no such family.
-        """
+        """Start the episode of a seed: play its demonstration, then set the live scene."""
         options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
         if seed is None:
             seed = int(self._main_rng.randint(2**31))

@@ -15,11 +15,7 @@ _SPLIT_START = {"train": 0, "val": _SPLIT_SPAN, "test": 2 * _SPLIT_SPAN}
 
 
 def seed_of(episode: EpisodeId) -> int:
-    """Return the seed of an episode; no two episodes share one.
-
-    Raises:
-        UnknownNameError: The suite has no such family or episode.
-    """
+    """Return the seed of an episode; no two episodes share one."""
     if episode.family not in FAMILIES:
         raise UnknownNameError.among("family", episode.family, "tabletop", FAMILIES)
     if episode.index >= EPISODES[episode.split]:

@@ -10,7 +10,10 @@ from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.subgoal import Pixel
 
+from .camera import SIZE, to_pixels
+from .episodes import turn_of
 from .kit import Colour, Kit
 from .motion import Arm, Point, Script
 
@@ -65,6 +68,9 @@ class Family(ABC):
 
     table: ClassVar[Colour]
     floor: ClassVar[Colour] = (0.55, 0.57, 0.60)
+    side: ClassVar[int] = SIZE
+    """Pixels of the front image, down and across."""
+
     stick: ClassVar[float] = 0.0
     """Length in m of the stick that the gripper holds; 0 for none."""
 
@@ -105,6 +111,14 @@ class Family(ABC):
     @abstractmethod
     def option(self, choice: Any) -> Option:
         """How such a choice is told in the live scene."""
+
+    def pixels(self, marks: Sequence[Point]) -> tuple[Pixel, ...]:
+        """Where points are in the front image of the live scene, which is `side` pixels wide."""
+        return to_pixels(marks)
+
+    def own_answer(self, seed: int) -> Any:
+        """The answer of the episode of a seed."""
+        return self.answers[turn_of(seed, len(self.answers))]
 
     def parts(self, answer: Any) -> tuple[str, ...]:
         """All that must be seen of a demonstration to know the answer, in words, in order."""

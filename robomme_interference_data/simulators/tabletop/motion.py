@@ -101,11 +101,7 @@ class Arm:
             yield
 
     def move(self, to: Point, yaw: float | None = None, speed: float = SPEED) -> Script:
-        """Move in a straight line, slower at both ends, `speed` in m/s at the middle.
-
-        Raises:
-            MotionError: The arm cannot reach a point of the line.
-        """
+        """Move in a straight line, slower at both ends, `speed` in m/s at the middle."""
         start, turn = self._goal, 0.0 if yaw is None else yaw - self._yaw
         way = np.asarray(to, dtype=np.float64) - start
         first_yaw = self._yaw

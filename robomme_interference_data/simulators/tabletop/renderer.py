@@ -16,11 +16,7 @@ SHADERS = Path(__file__).parent / "shaders"
 
 
 def make_renderer() -> sapien.render.RenderSystem:
-    """Return sapien's renderer.
-
-    Raises:
-        NoRendererError: No Vulkan device of this machine can render.
-    """
+    """Return sapien's renderer."""
     try:
         return sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError as error:

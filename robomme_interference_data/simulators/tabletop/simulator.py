@@ -1,12 +1,14 @@
 """The embedded suite as a simulator: nine families in one environment, an episode at a time."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.schema.subgoal import Subgoal
@@ -19,8 +21,10 @@ from robomme_interference_data.simulators.base import (
     choose_cameras,
 )
 
-from .env import TabletopEnv
-from .episodes import seed_of
+from . import SUITE_VERSION
+from .episodes import episode_ids, seed_of
+from .families import known_scene, other_answer
+from .family import Family
 
 POLICIES = ("oracle", "guess", "recall")
 
@@ -34,21 +38,41 @@ class TabletopSimulator(Simulator):
         shift: How the live scene differs from that of the demonstration: `none`, or such as
             `light:2`. It is only seen: states, judgements and built-in policies stay what they
             are.
-
-    Raises:
-        InvalidOptionError: There is no such camera, or no such shift.
-        NoRendererError: No Vulkan device of this machine can render.
     """
 
     name = "tabletop"
+    about = (
+        "tabletop, the simulator embedded in this project, which is not RoboMME: its results stand "
+        "beside each other, not beside the paper's"
+    )
+    settings = ("cameras", "shift")
+    shifts = True
+    suite_version = SUITE_VERSION
+    packages = ("mani-skill", "sapien")
 
     def __init__(self, cameras: Sequence[str] = CAMERAS, shift: str = NO_SHIFT):
         self._cameras = choose_cameras(cameras)
         wanted = parse_shift(shift)
+        make: Any = load_extra(f"{__package__}.env", "TabletopEnv", "the tabletop simulator", "sim")
         # Pictures come straight from the cameras, so ManiSkill need not make observations too.
-        self.env = TabletopEnv(render=bool(cameras), obs_mode="none")
+        self.env = make(render=bool(cameras), obs_mode="none")
         self.env.shift = wanted
         self.env.observe(self._cameras)  # the first picture is slow: shaders are compiled
+
+    @classmethod
+    def episodes(cls) -> list[EpisodeId]:
+        """List the suite's episodes."""
+        return episode_ids()
+
+    @classmethod
+    def other_answer(cls, episode: EpisodeId) -> int:
+        """Return the number of another answer than an episode's own; they take turns."""
+        return other_answer(episode)
+
+    @classmethod
+    def scene(cls, family: str, seed: int, difficulty: str) -> Family | None:
+        """Return the scene of a seed, to be looked at and not played."""
+        return known_scene(family, seed, difficulty)
 
     def act(self, policy: str, known: Mapping[int, str] | None = None) -> NDArray[np.float32]:
         """Return the next action of `oracle`, `guess` or `recall`; see `Simulator.act`."""
@@ -68,11 +92,7 @@ class TabletopSimulator(Simulator):
         return self.env.obey(subgoal)
 
     def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
-        """Yield what is seen now as under each of several shifts; the scene stays what it is.
-
-        Raises:
-            SimulatorCrashError: There is no episode to look at, or the simulator is closed.
-        """
+        """Yield what is seen now as under each of several shifts; see `Simulator.views`."""
         self._running()
         for shift in shifts:
             self.env.show(shift)

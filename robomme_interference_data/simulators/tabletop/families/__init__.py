@@ -5,7 +5,6 @@ from functools import lru_cache
 from numpy.random import RandomState
 
 from robomme_interference_data.constants import DIFFICULTIES
-from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import UnknownNameError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of, turn_of
@@ -38,30 +37,17 @@ _FAMILIES: dict[str, type[Family]] = {
     )
 }
 
-_SEEDS = 1 << 32
-"""Seeds that `RandomState` takes."""
-
 
 def draw_episode(family: str, seed: int, difficulty: str) -> Family:
-    """Return the episode of a seed, its hidden answer apart; nothing is simulated.
-
-    Raises:
-        UnknownNameError: There is no such family.
-    """
+    """Return the episode of a seed, its hidden answer apart; nothing is simulated."""
     return family_class(family)(difficulty, RandomState(seed))
 
 
-def recorded_scene(query: Query) -> Family | None:
-    """Return the scene of a recorded query, to be looked at and not played.
-
-    Returns:
-        The scene; None if the query is not known to be of `tabletop`.
-    """
-    family, seed, difficulty = query.episode_id.family, query.seed, query.difficulty
-    known = query.simulator == "tabletop" and family in _FAMILIES and difficulty in DIFFICULTIES
-    if not known or seed is None or not 0 <= seed < _SEEDS:
+def known_scene(family: str, seed: int, difficulty: str) -> Family | None:
+    """Return the episode of a seed as `draw_episode` does; None if the suite has none such."""
+    if family not in _FAMILIES or difficulty not in DIFFICULTIES:
         return None
-    return _drawn(family, seed, str(difficulty))
+    return _drawn(family, seed, difficulty)
 
 
 @lru_cache(256)
@@ -70,11 +56,7 @@ def _drawn(family: str, seed: int, difficulty: str) -> Family:
 
 
 def family_class(name: str) -> type[Family]:
-    """Return the class of a task family.
-
-    Raises:
-        UnknownNameError: There is no such family.
-    """
+    """Return the class of a task family."""
     if name not in _FAMILIES:
         raise UnknownNameError.among("family", name, "tabletop", _FAMILIES)
     return _FAMILIES[name]
@@ -84,9 +66,6 @@ def other_answer(episode: EpisodeId) -> int:
     """Return the number of an answer that an episode's scene allows and that is not its own.
 
     Over episodes they take turns, as own answers do.
-
-    Raises:
-        UnknownNameError: There is no such episode.
     """
     seed = seed_of(episode)
     count = len(draw_episode(episode.family, seed, difficulty_of(seed)).answers)
