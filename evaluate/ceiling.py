@@ -20,7 +20,7 @@ from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.schema.evidence import known_parts
 from robomme_interference_data.schema.sampling import MEMORIES, check_memory, evidence_kept
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
-from robomme_interference_data.simulators.tabletop.families import recorded_scene
+from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.viz.tables import Table
 
 from .run.config import CeilingConfig, unusual_retrieval
@@ -36,7 +36,7 @@ class Left:
         evidence_kept: Share of the lesson's evidence spans of which it keeps a frame; None without
             a lesson, and where evidence is unknown.
         success: Chance that the ideal observer succeeds; None where the answers that agree with
-            what is known cannot be told: only those of `tabletop` can.
+            what is known are not known themselves.
     """
 
     family: str
@@ -63,31 +63,23 @@ class Ceiling:
 
 
 def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
-    """Return the ceiling of a memory on a split, by family and condition, and of all families.
-
-    Raises:
-        UnknownNameError: There is no such memory, condition, encoder, method or camera.
-        InvalidOptionError: No lesson of the split has evidence, a setting of a retrieval step is
-            given without one, or one is to choose under `no-history`.
-        MissingFileError: The split has no views under the shift.
-        MissingIndexError, StaleIndexError: See `measure`.
-    """
+    """Return the ceiling of a memory on a split, by family and condition, and of all families."""
     check_memory(config.memory, "ceiling")
     unusual_retrieval(config)
     if config.shift != NO_SHIFT and config.retrieval is None:
         raise InvalidOptionError(
-            f"--shift {config.shift} says nothing without a retrieval step: memories do not look",
-            "Add --retrieval ENCODER, such as --retrieval thumbnail, or leave it out.",
+            f"the shift {config.shift} says nothing without a retrieval step: memories do not look",
+            "Add one, such as retrieval='thumbnail', or leave it out.",
         )
     if config.retrieval is not None and NO_HISTORY in config.conditions:
         raise InvalidOptionError(
             f"a retrieval step has nothing to retrieve from under {NO_HISTORY}",
-            f"Leave {NO_HISTORY} out: the ceiling there is that of the memory without --retrieval.",
+            f"Leave {NO_HISTORY} out: the ceiling there is that of the memory without retrieval.",
         )
     if all(split.query(one).record.evidence is None for one in split.episode_ids):
         raise InvalidOptionError(
             f"it is unknown which frames of {split.location} show the answer",
-            "Build it from tabletop, or from recordings with subgoals: see docs/sources.md.",
+            "Build it from a source with evidence: see docs/sources.md.",
         )
     names = [one.name for one in in_order(config.conditions or split.conditions)]
     found = [

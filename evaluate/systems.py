@@ -8,7 +8,6 @@ your own.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from difflib import SequenceMatcher
 from typing import Any
 
 from robomme_interference_data.constants import MAX_STEPS, POSITION_LIMIT
@@ -16,7 +15,6 @@ from robomme_interference_data.errors import HistoryTooLongError, InvalidIdError
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 _FREE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_TOO_ALIKE = 0.9  # of difflib's ratio: one letter in ten
 _OF_QUESTIONS = "questions-"  # so begin the names of controls that are asked
 
 
@@ -164,16 +162,9 @@ def known_system(name: str) -> System | None:
 def name_system(name: str) -> System:
     """Return a system that is known, or one with a name of your own.
 
-    A name of your own is free of conditions and limits. It may not read like one of the table:
-    what differs from one in case, separators or one letter in ten is refused, so that neither a
-    slip nor a variant passes for a published system. Nor may it begin as those of the controls
-    that are asked questions.
-
-    Raises:
-        InvalidIdError: The name has other than 1 to 64 letters, digits, `.`, `_` and `-`, or
-            does not begin with a letter or digit.
-        UnknownNameError: It reads like a system of the table, or like a control that is asked
-            questions, without being one.
+    A name of your own is free of conditions and limits. What differs from a name of the table only
+    in case and separators is an error, so that a slip does not pass for a system of its own; so is
+    one that begins as those of the controls that are asked questions.
     """
     if not _FREE_NAME.fullmatch(name):
         raise InvalidIdError(
@@ -182,13 +173,14 @@ def name_system(name: str) -> System:
         )
     if (known := known_system(name)) is not None:
         return known
-    for system in SYSTEMS.values():
-        if any(_alike(name, known) for known in (system.name, system.display)):
-            raise UnknownNameError(
-                f"{name!r} reads like the system {system.name!r}, which it is not",
-                f"Write {system.name!r} if that is what runs, or take a name that cannot be "
-                "mistaken for it.",
-            )
+    folded = {
+        _folded(text): one.name for one in SYSTEMS.values() for text in (one.name, one.display)
+    }
+    if (meant := folded.get(_folded(name))) is not None:
+        raise UnknownNameError(
+            f"{name!r} reads like the system {meant!r}, which it is not",
+            f"Write {meant!r} if that is what runs, or take another name.",
+        )
     if name.lower().removeprefix("retrieval-").startswith(_OF_QUESTIONS):
         raise UnknownNameError(
             f"{name!r} reads like a control that is asked questions, which it is not",
@@ -197,10 +189,8 @@ def name_system(name: str) -> System:
     return System(name, name, "own")
 
 
-def _alike(name: str, known: str) -> bool:
-    folded, other = (re.sub(r"[^a-z0-9]", "", text.lower()) for text in (name, known))
-    # Short names such as `hold` are alike only when they are equal.
-    return folded == other or SequenceMatcher(None, folded, other).ratio() >= _TOO_ALIKE
+def _folded(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def display_name(name: str) -> str:
@@ -228,9 +218,6 @@ def check_history(system: System, frames: Mapping[str, int]) -> None:
     """Refuse histories that, with a whole rollout after them, exceed the system's positions.
 
     `frames` has the longest history of each condition.
-
-    Raises:
-        HistoryTooLongError: With 1300 steps, some are more than `position_limit`; names them all.
     """
     limit = system.position_limit
     over = [

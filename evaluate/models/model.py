@@ -63,20 +63,11 @@ class ChatModel(ABC):
 
     @abstractmethod
     def reply(self, messages: Sequence[Message]) -> Reply:
-        """Answer a conversation whose last message is the user's.
-
-        Raises:
-            ModelError: It cannot be reached, is not what is served, or gives no answer that can
-                be read, after the repetitions that its settings allow.
-        """
+        """Answer a conversation whose last message is the user's."""
 
     @abstractmethod
     def metadata(self) -> dict[str, Any]:
-        """Return plain values that say which model this is, for the record of the run.
-
-        Raises:
-            ModelError: It cannot be reached, or is not there.
-        """
+        """Return plain values that say which model this is, for the record of the run."""
 
     def close(self) -> None:
         """Release everything."""

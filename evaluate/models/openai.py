@@ -49,9 +49,6 @@ class OpenAIModel(ChatModel):
         repeats: Further times that a question is asked.
         connect_s: Most seconds until there is a connection.
         response_s: Most seconds until the whole answer is there, which has 16 MiB at most.
-
-    Raises:
-        InvalidOptionError: A number, `video` or the key is not what it may be.
     """
 
     def __init__(
@@ -84,12 +81,13 @@ class OpenAIModel(ChatModel):
         self._settings: dict[str, Any] = {"max_tokens": max_tokens, "temperature": temperature}
         self.images = None if video == "mp4" else images
         self._repeats = repeats
+        client: Any = BoundedClient(connect_s + response_s)
         self._client = OpenAI(
             base_url=url,
             api_key=_key(),
             timeout=openai.Timeout(response_s, connect=connect_s),
             max_retries=repeats,
-            http_client=BoundedClient(connect_s + response_s),
+            http_client=client,
         )
 
     def reply(self, messages: Sequence[Message]) -> Reply:

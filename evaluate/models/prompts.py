@@ -43,9 +43,6 @@ def check_places(name: str, text: str, places: Sequence[str]) -> None:
     """Refuse what looks like a place and is none: it would be shown to the model as it stands.
 
     Only what is near a place is refused: a model has special words of its own, such as `<think>`.
-
-    Raises:
-        ValueError: There is such a thing in the text; quotes it.
     """
     for found in re.findall(r"<\w+>|\{\w+\}", text):
         if found not in places and (hint := nearest(found, places, more="")):
@@ -87,10 +84,6 @@ def read_prompt[T](
 
     Returns:
         The prompt, and the SHA-256 of its file.
-
-    Raises:
-        UnknownNameError: There is no such prompt, nor such a file.
-        FormatError: The file is no prompt; says why.
     """
     path: Any = Path(name)
     if name in names:

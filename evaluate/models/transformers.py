@@ -1,7 +1,10 @@
 """Models in this process, through transformers: the only file here that imports it."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +19,7 @@ from robomme_interference_data.errors import (
     ModelError,
     first_line,
 )
-from robomme_interference_data.storage.files import digest_folder
+from robomme_interference_data.evaluate.weights import digest_weights
 from robomme_interference_data.storage.hub import HubFiles, locate
 
 from .images import within
@@ -37,12 +40,6 @@ class TransformersModel(ChatModel):
         device: `cpu`, `cuda` or `cuda:1`; None for the first GPU, if there is one.
         max_tokens: Tokens of an answer at most.
         images: Images in a question at most; videos are thinned out.
-
-    Raises:
-        MissingExtraError: peft is not installed, and there is an adapter.
-        InvalidOptionError: There is no such folder or device, or a number is below 1.
-        HubError: The Hub does not know the model, or cannot be reached.
-        ModelError: It cannot be loaded.
     """
 
     def __init__(
@@ -66,37 +63,48 @@ class TransformersModel(ChatModel):
             what = f"device {device!r} cannot be used: {first_line(error)}"
             raise InvalidOptionError(what, "Give device=cpu.") from None
         files = locate(path, "model")
-        folder = files.snapshot(*_FILES)
-        self._said: dict[str, Any] = {"sha256": digest_folder(folder, _FILES)}
+        self._path, self._folder = path, files.snapshot(*_FILES)
+        self._metadata: dict[str, Any] = {"sha256": digest_weights(self._folder, _FILES)}
         if isinstance(files, HubFiles):
-            self._said |= {"model": files.repo_id, "revision": files.commit}
-        try:
+            self._metadata |= {"model": files.repo_id, "revision": files.commit}
+        self._adapter: Path | None = None
+        if adapter is not None:
+            if find_spec("peft") is None:
+                raise MissingExtraError.needs("an adapter", "peft", "vlm")
+            self._adapter = locate(adapter, "model").snapshot(*_FILES)
+            self._metadata["adapter_sha256"] = digest_weights(self._adapter, _FILES)
+        with self._explained():
             processors: Any = transformers.AutoProcessor
-            self._processor = processors.from_pretrained(folder)
-            model: Any = transformers.AutoModelForImageTextToText.from_pretrained(
-                folder, dtype="auto"
-            )
-            if adapter is not None:
-                model = self._adapted(model, adapter)
+            self._processor = processors.from_pretrained(self._folder)
+            transformers.AutoConfig.from_pretrained(self._folder)
+        self._model: Any = None
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
         except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
             raise ModelError(
-                f"transformers cannot load the model {path}: {first_line(error)}",
+                f"transformers cannot load the model {self._path}: {first_line(error)}",
                 "Expected an image-text-to-text model with its processor, as save_pretrained "
                 "leaves both.",
             ) from error
-        self._model = model.to(self._device).eval()
 
-    def _adapted(self, model: Any, adapter: str) -> Any:
-        try:
-            from peft import PeftModel
-        except ImportError as error:
-            raise MissingExtraError.needs("an adapter", "peft", "vlm") from error
-        folder = locate(adapter, "model").snapshot(*_FILES)
-        self._said["adapter_sha256"] = digest_folder(folder, _FILES)
-        return PeftModel.from_pretrained(model, folder)
+    def _load(self) -> Any:
+        """Load the weights, when they are first needed: a driver needs only their digest."""
+        with self._explained():
+            models: Any = transformers.AutoModelForImageTextToText
+            model = models.from_pretrained(self._folder, dtype="auto")
+            if self._adapter is not None:
+                from peft import PeftModel
+
+                model = PeftModel.from_pretrained(model, self._adapter)
+            return model.to(self._device).eval()
 
     def reply(self, messages: Sequence[Message]) -> Reply:
         """Answer; see `ChatModel.reply`."""
+        if self._model is None:
+            self._model = self._load()
         began = time.perf_counter()
         asked = [
             {
@@ -133,4 +141,4 @@ class TransformersModel(ChatModel):
 
     def metadata(self) -> dict[str, Any]:
         """Return the SHA-256 over its files, and those of its adapter; on the Hub its commit."""
-        return dict(self._said)
+        return dict(self._metadata)

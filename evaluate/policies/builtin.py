@@ -39,9 +39,6 @@ class ReplayPolicy(Policy):
         go_on: Where the last frames that it was given are not among those that it keeps, go on for
             as many steps as they were, as it moved last. Off by default: its rows are another
             system's.
-
-    Raises:
-        UnknownNameError: There is no such memory rule.
     """
 
     cameras = ("front",)
@@ -177,11 +174,7 @@ class Privileged(Policy):
         self._simulator = info.simulator
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
-        """Return the script's next action, `(1, 8) float32`: a script is asked step by step.
-
-        Raises:
-            PolicyError: It was given no simulator.
-        """
+        """Return the script's next action, `(1, 8) float32`: a script is asked step by step."""
         return self._asked().act(self.name)[None]
 
     def metadata(self) -> dict[str, Any]:
@@ -219,9 +212,6 @@ class Recall(Privileged):
 
     Args:
         memory: `full`, `framesamp` or `window`.
-
-    Raises:
-        UnknownNameError: There is no such memory rule.
     """
 
     def __init__(self, memory: str = "full"):
@@ -230,11 +220,7 @@ class Recall(Privileged):
         self.memory = memory
 
     def reset(self, info: RolloutInfo) -> None:
-        """See what the memory keeps.
-
-        Raises:
-            PolicyError: It is unknown what the frames show.
-        """
+        """See what the memory keeps."""
         super().reset(info)
         if info.evidence is None:
             raise PolicyError(

@@ -1,6 +1,7 @@
 """One connection to a policy server: connecting with patience, and questions with a time limit."""
 
 import http.client
+import logging
 import os
 import socket
 import threading
@@ -12,7 +13,6 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from robomme_interference_data.cli.console import say
 from robomme_interference_data.errors import (
     PolicyServerError,
     ServerKeepaliveError,
@@ -20,6 +20,8 @@ from robomme_interference_data.errors import (
 )
 
 from .wire import pack, unpack
+
+logger = logging.getLogger(__name__)
 
 API_KEY_VARIABLE = "ROBOMME_POLICY_API_KEY"
 """Environment variable with the key that servers behind a gate ask for."""
@@ -99,17 +101,13 @@ class ServerConnection:
         return self._connection is not None
 
     def open(self) -> None:
-        """Connect anew, again and again while nobody answers.
-
-        Raises:
-            PolicyServerError: The server cannot be reached, refuses, or is no policy server.
-        """
+        """Connect anew, again and again while nobody answers."""
         self.close()
-        told = (
+        message = (
             f"Waiting until policy server {self.name} answers (http://{self.name}/healthz), for "
             f"{self._connect_s:g} s at most …"
         )
-        with _after(_QUIET_S, lambda: say(told)):
+        with _after(_QUIET_S, lambda: logger.warning(message)):
             self._connect()
 
     def _connect(self) -> None:
@@ -150,11 +148,6 @@ class ServerConnection:
         """Send a message and return its answer, a map with `expected` in it, and that not false.
 
         After an error the connection is gone: what the server still remembers is not known.
-
-        Raises:
-            WireError: The message cannot be sent.
-            PolicyServerError: The server reports an error, is gone, is too slow, or gives another
-                answer.
         """
         # Kept until the next one is packed: given back each time, the memory of messages of
         # megabytes goes back to the system, and getting it anew took as long as all the rest.

@@ -1,18 +1,24 @@
-"""What a policy says of itself, and what of it can change a result."""
+"""What a policy and its servers report of themselves, and what of it can change a result."""
 
 import json
+import logging
 import math
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import closing, redirect_stdout, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, redirect_stdout, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from robomme_interference_data.cli.console import say
-from robomme_interference_data.errors import InterferenceError, PolicyError, PolicyServerError
+from robomme_interference_data.errors import (
+    InterferenceError,
+    InvalidOptionError,
+    PolicyError,
+    PolicyServerError,
+)
 from robomme_interference_data.evaluate.systems import System
 from robomme_interference_data.runtime.executor import Executor, Worker
 from robomme_interference_data.schema.conditions import NO_HISTORY
@@ -20,19 +26,29 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from .policy import Policy
 from .registry import (
     BUILTINS,
+    POLICIES,
     check_workers,
     make_policy,
     parse_policy,
     policy_options,
 )
-from .servers import check_keeps, check_metadata
+from .server_lock import lock_server
 
-_WITHOUT_EFFECT = {
-    "websocket": ("server", "connect_s", "response_s"),
-    "lerobot": ("source", "device"),
-}
-"""Options, and what policies say of themselves, that no result depends on, by kind of policy:
-where they run, or lie, and how long they are waited for."""
+logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def hold_servers(text: str, out: Path) -> Iterator[None]:
+    """Keep other runs from a policy's servers until the block ends; see `lock_server`.
+
+    Args:
+        text: The policy as it is written; one without servers needs no lock.
+        out: The run's folder, for whoever is refused.
+    """
+    with ExitStack() as stack:
+        for host, port in parse_policy(text).servers:
+            stack.enter_context(lock_server(host, port, f"the run in {out.resolve()}"))
+        yield
 
 
 def describe_policy(
@@ -41,13 +57,8 @@ def describe_policy(
     """Make a policy once, ask what it is, and release it; of several servers ask each.
 
     Returns:
-        The policy, closed, for its attributes; and what it says of itself, as plain values:
-        nothing, of a server that workers start, see `describe_served`.
-
-    Raises:
-        InterferenceError: It cannot be made, a server cannot be reached, servers say different
-            things of themselves, nobody says which checkpoint they serve, or it does not say what
-            it is.
+        The policy, closed, for its attributes; and its metadata, as plain values: empty for a
+        server that workers start, see `describe_served`.
     """
     spec = parse_policy(text)
     check_workers(spec, workers)
@@ -58,17 +69,19 @@ def describe_policy(
         policies = [
             make_policy(text, options, worker=worker) for worker in range(len(spec.servers) or 1)
         ]
-        said = [_metadata(text, policy) for policy in policies]
-    policy, metadata = policies[0], dict(said[0])
+        every = [_metadata(text, policy) for policy in policies]
+    policy, metadata = policies[0], dict(every[0])
     if spec.kind == "websocket":
-        check_metadata(said, policy_options(text, options)["checkpoint"])
-        metadata["server"] = ", ".join(one["server"] for one in said)
+        _check_metadata(every, policy_options(text, options)["checkpoint"])
+        metadata["server"] = ", ".join(one["server"] for one in every)
     if policy.privileged:
         metadata["privileged"] = True
         if spec.kind not in BUILTINS:
-            say(
-                f"The policy {text} is privileged: it gets the simulator itself, under every "
-                f"condition, {NO_HISTORY} too; run.json says so."
+            logger.warning(
+                "The policy %s is privileged: it gets the simulator itself, under every "
+                "condition, %s too; run.json says so.",
+                text,
+                NO_HISTORY,
             )
     return policy, metadata
 
@@ -76,29 +89,24 @@ def describe_policy(
 def describe_served(
     text: str, options: Sequence[str], system: System, executor: Executor
 ) -> dict[str, Any]:
-    """Have a worker start the policy's server, and return what that says of itself.
-
-    Raises:
-        PolicyServerError: It ends, cannot be reached, or is not what the system's is.
-        InvalidOptionError: It cannot be started, or nobody says which checkpoint it serves.
-    """
+    """Have a worker start the policy's server, and return its checked metadata."""
     ask = partial(_ask_served, text, tuple(options))
     (outcome,) = executor.run(ask, [system.keeps_frames is not None], attempts=1)
     if isinstance(outcome.error, InterferenceError):
         raise outcome.error
     if outcome.error is not None:
         raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
-    said, keeps = outcome.value
-    check_metadata([said], policy_options(text, options)["checkpoint"])
+    metadata, keeps = outcome.value
+    _check_metadata([metadata], policy_options(text, options)["checkpoint"])
     if keeps is not None:
-        check_keeps(keeps, said["server"], system)
-    return dict(said)
+        _check_keeps(keeps, metadata["server"], system)
+    return dict(metadata)
 
 
 def _ask_served(
     text: str, options: Sequence[str], kind: bool, worker: Worker
 ) -> tuple[dict[str, Any], bool | None]:
-    """Return what a server says of itself, and whether it keeps frames, if that is asked."""
+    """Return a server's metadata, and whether it keeps frames, if that is asked."""
     with closing(make_policy(text, options)) as policy:
         keeps = cast("Any", policy).keeps_frames() if kind else None
         return _metadata(text, policy), keeps
@@ -106,13 +114,13 @@ def _ask_served(
 
 def _metadata(text: str, policy: Policy) -> dict[str, Any]:
     try:
-        said = policy.metadata()
+        metadata = policy.metadata()
     finally:
         policy.close()
     try:
-        if isinstance(said, Mapping):
-            return dict(plain(said))
-        why = f"returned a {type(said).__name__}"
+        if isinstance(metadata, Mapping):
+            return dict(plain(metadata))
+        why = f"returned a {type(metadata).__name__}"
     except ValueError as error:
         why = f"holds {error}, a number that JSON, and so run.json, does not have"
     raise PolicyError(
@@ -121,32 +129,87 @@ def _metadata(text: str, policy: Policy) -> dict[str, Any]:
     )
 
 
-def policy_identity(text: str, options: Sequence[str], said: Mapping[str, Any]) -> dict[str, Any]:
+def _check_metadata(every: Sequence[Mapping[str, Any]], checkpoint: str | None) -> None:
+    """Check that servers report the same, and the checkpoint that the user names, if any."""
+    first = every[0]
+    for other in every:
+        if other["server_metadata"] != first["server_metadata"]:
+            raise PolicyServerError(
+                f"the policy servers {first['server']} and {other['server']} serve different "
+                f"models: one says {first['server_metadata']}, the other "
+                f"{other['server_metadata']}",
+                "Start all of them with the same checkpoint and seed.",
+            )
+    named = first["server_metadata"].get("checkpoint")
+    if named is None and checkpoint is None:
+        raise InvalidOptionError(
+            f"the policy server {first['server']} does not say which checkpoint it serves: its "
+            f"metadata is {first['server_metadata']}",
+            "Name it, so that this run is never continued on another one: the policy's option "
+            "checkpoint=TEXT, such as checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999.",
+        )
+    if None not in (named, checkpoint) and named != checkpoint:
+        raise PolicyServerError(
+            f"the policy server {first['server']} serves the checkpoint {named!r}, not "
+            f"{checkpoint!r}",
+            f"Start it with that one, or leave out the policy's option checkpoint={checkpoint}.",
+        )
+
+
+def check_kind(text: str, options: Sequence[str], system: System) -> None:
+    """Check that each server keeps frames if the system's does, and keeps none otherwise.
+
+    It is asked for actions right after a reset; those that keep frames refuse them. What servers of
+    a system with a name of one's own do is not known, so they are not asked.
+    """
+    if system.keeps_frames is None:
+        return
+    for worker, (host, port) in enumerate(parse_policy(text).servers):
+        policy: Any = make_policy(text, options, worker=worker)
+        with closing(policy):
+            _check_keeps(policy.keeps_frames(), f"{host}:{port}", system)
+
+
+def _check_keeps(keeps: bool, server: str, system: System) -> None:
+    if keeps == system.keeps_frames:
+        return
+    found, expected = "acts without any frame", "refuses to"
+    if keeps:
+        found, expected = "refuses to act without frames", "acts"
+    raise PolicyServerError(
+        f"the policy server {server} {found}, and that of {system.name} {expected}: it serves "
+        "another kind of model",
+        f"Start it with the checkpoint of {system.name} (docs/systems.md has a table), beside "
+        "which history_config.txt lies, or give the system a name of your own.",
+    )
+
+
+def policy_identity(
+    text: str, options: Sequence[str], metadata: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return what of a policy can change a result, as plain values.
 
-    Where a server listens or a checkpoint lies is no part of it, nor is the device: what a
-    server says of itself, and the digest of a checkpoint's files, are. Nor are objects of the
-    policy's own among its options' defaults.
+    Where a server listens or a checkpoint lies is no part of it, nor is the device: a server's
+    metadata, and the digest of a checkpoint's files, are. Nor are objects of the policy's own
+    among its options' defaults.
     """
-    kind = parse_policy(text).kind
-    without = _WITHOUT_EFFECT.get(kind, ())
-    taken = {}
-    for name, value in sorted(policy_options(text, options).items()):
+    spec = parse_policy(text)
+    values = {}
+    for name, value in policy_options(text, options).items():
         with suppress(TypeError, ValueError):
             json.dumps(value)
-            taken[name] = plain(value)
+            values[name] = plain(value)
     return {
-        "policy": kind if without else text,
-        "policy_options": {name: value for name, value in taken.items() if name not in without},
-        "policy_metadata": {name: value for name, value in said.items() if name not in without},
+        "policy": spec.kind if POLICIES.kinds[spec.kind].no_effect else text,
+        "policy_options": POLICIES.identity(spec, values),
+        "policy_metadata": POLICIES.identity(spec, metadata),
     }
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: long arrays become a word on their shape.
+    """Return a value as JSON can hold it; `ValueError` for NaN or an infinity in it.
 
-    Raises:
-        ValueError: It holds NaN or an infinity.
+    Long arrays become a word on their shape.
     """
     if isinstance(value, Mapping):
         return {plain(str(key)): plain(entry) for key, entry in value.items()}

@@ -31,8 +31,8 @@ from robomme_interference_data.errors import (
     MissingFileError,
     PolicyError,
 )
+from robomme_interference_data.evaluate.weights import digest_weights
 from robomme_interference_data.simulators.base import ACTION_SIZE, Observation
-from robomme_interference_data.storage.files import digest_folder
 from robomme_interference_data.storage.hub import locate
 
 from .policy import Frames, Policy, RolloutInfo
@@ -60,13 +60,6 @@ class LeRobotPolicy(Policy):
         path: Folder that `save_pretrained` wrote, or a model on the Hub, `namespace/name` or
             `namespace/name@revision`.
         device: `cpu`, `cuda` or `cuda:1`; by default the first GPU, if there is one.
-
-    Raises:
-        InvalidOptionError: The device is not there.
-        MissingFileError: There is no such folder, or a file is missing in it.
-        HubError: The Hub does not know the model, or cannot be reached.
-        MissingExtraError: Its kind of policy needs more libraries.
-        PolicyError: It wants what the simulators do not give, or gives other actions.
     """
 
     def __init__(self, path: str, *, device: str | None = None):
@@ -93,12 +86,7 @@ class LeRobotPolicy(Policy):
         self._seed = self._asked = 0
 
     def reset(self, info: RolloutInfo) -> None:
-        """Empty the policy's queues, loading its weights first if need be.
-
-        Raises:
-            MissingExtraError: Its kind of policy needs more libraries.
-            PolicyError: The weights cannot be loaded.
-        """
+        """Empty the policy's queues, loading its weights first if need be."""
         if self._model is None:
             with _explained(str(self._folder)):
                 kind = get_policy_class(self._config.type)
@@ -171,14 +159,11 @@ class LeRobotPolicy(Policy):
             yield
 
     def metadata(self) -> dict[str, Any]:
-        """Return what is loaded, with the SHA-256 of its files, and the device.
-
-        All files are read for it, which takes seconds for a large model.
-        """
+        """Return what is loaded, with the SHA-256 of its files, and the device."""
         return {
             "policy": "lerobot",
             "source": self._source,
-            "sha256": digest_folder(self._folder, _FILES),
+            "sha256": digest_weights(self._folder, _FILES),
             "type": self._config.type,
             "n_obs_steps": self._steps,
             "device": self._device,
@@ -199,13 +184,7 @@ def _choose_device(device: str | None) -> str:
 
 
 def find_policy(path: str) -> tuple[Path, str]:
-    """Return the folder with a policy's files, and what names it: with its commit, on the Hub.
-
-    Raises:
-        InvalidOptionError: It is neither.
-        MissingFileError: A file is missing in it.
-        HubError: The Hub does not know the model, or cannot be reached.
-    """
+    """Return the folder with a policy's files, and what names it: with its commit, on the Hub."""
     files = locate(path, "model")
     folder, name = files.snapshot(*_FILES), files.describe()
     missing = [one for one in _NEEDED if not (folder / one).is_file()]

@@ -1,21 +1,20 @@
-"""Policies by what is written on the command line; each is imported when it is made."""
+"""Policies by their text; each is imported when it is made."""
 
 import inspect
-import re
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from importlib import import_module
+from collections.abc import Sequence
 from typing import Any, get_type_hints
 
-from robomme_interference_data.errors import (
-    InvalidOptionError,
-    PolicyError,
-    UnknownNameError,
-    nearest,
+from robomme_interference_data.errors import InvalidOptionError, PolicyError
+from robomme_interference_data.runtime.specs import (
+    Factory,
+    Kind,
+    Registry,
+    Spec,
+    bind_options,
+    import_factory,
+    signature_of,
 )
-from robomme_interference_data.evaluate.specs import bind_options, signature_of
-from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.simulators.base import CAMERAS
 
 from .policy import Policy
@@ -24,35 +23,56 @@ BUILTINS = ("replay", "recall", "oracle", "guess", "obey", "hold")
 """Policies without learned weights."""
 
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
-_KINDS = {
-    **{name: ("", name) for name in BUILTINS},
-    **{
-        name: (r"[a-z]+", f"{name}, {name}:framesamp or {name}:window")
-        for name in ("replay", "recall")
+_MEMORY = r"(?P<memory>[a-z]+)"
+
+
+def _kind(form: str, factory: str, target: str = "", extra: str = "evaluate", **more: Any) -> Kind:
+    return Kind(form, f"{__package__}.{factory}", target, extra=extra, **more)
+
+
+POLICIES = Registry(
+    "policy",
+    {
+        **{
+            name: _kind(
+                f"{name}, {name}:framesamp or {name}:window",
+                f"builtin:{factory}",
+                _MEMORY,
+                default="full",
+            )
+            for name, factory in (("replay", "ReplayPolicy"), ("recall", "Recall"))
+        },
+        **{
+            name: _kind(name, "builtin:Privileged", given={"name": name})
+            for name in ("oracle", "guess")
+        },
+        "obey": _kind("obey", "builtin:Obey"),
+        "hold": _kind("hold", "builtin:Hold"),
+        "websocket": _kind(
+            "websocket://host:port, with commas between several servers, each once, or websocket "
+            'with serve="COMMAND with {port}"',
+            "websocket:WebsocketPolicy",
+            rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
+            no_effect=("server", "connect_s", "response_s"),
+        ),
+        "lerobot": _kind(
+            "lerobot:namespace/name[@revision] or lerobot:folder",
+            "lerobot:LeRobotPolicy",
+            r"(?P<path>.+)",
+            "build",
+            no_effect=("source", "device"),
+        ),
+        "python": Kind("python:module:factory", "", r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"),
     },
-    "websocket": (
-        rf"//{_SERVER}(?:,{_SERVER})*|(?!//).*\{{port\}}.*",
-        "websocket://host:port, with commas between several servers, each once, or websocket with "
-        "--serve 'COMMAND with {port}'",
-    ),
-    "lerobot": (r".+", "lerobot:namespace/name[@revision] or lerobot:folder"),
-    "python": (r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", "python:module:factory"),
-}
-"""What follows each kind, and how that is told."""
+)
 
 
-@dataclass(frozen=True)
-class PolicySpec:
-    """A policy as it is written.
+class PolicySpec(Spec):
+    """A policy that was read.
 
-    Attributes:
-        kind: `websocket`, `lerobot`, `python`, or a built-in's name.
-        target: What follows it; of `replay` and `recall` the memory rule, of other built-ins
-            nothing; of `websocket` servers, or the command that starts one.
+    Its target is, of `replay` and `recall`, the memory rule; of `websocket`, servers, or the
+    command that starts one; of other built-ins, empty.
     """
-
-    kind: str
-    target: str = ""
 
     @property
     def servers(self) -> tuple[tuple[str, int], ...]:
@@ -67,32 +87,14 @@ class PolicySpec:
         """Whether each worker starts a server, with the command that the target is."""
         return self.kind == "websocket" and not self.target.startswith("//")
 
-    def __str__(self) -> str:
-        return f"{self.kind}:{self.target}" if self.target else self.kind
-
 
 def parse_policy(text: str) -> PolicySpec:
-    """Read a policy as it is written; `replay` alone stands for `replay:full`, and so on.
-
-    Raises:
-        UnknownNameError: There is no such policy.
-        InvalidOptionError: What follows the kind is not as it should be.
-    """
-    kind, colon, target = text.partition(":")
-    if kind not in _KINDS:
-        forms = ", ".join(form for _, form in _KINDS.values())
-        raise UnknownNameError(
-            f"there is no policy {text!r}; expected {forms}", nearest(kind, _KINDS, more="")
-        )
-    if text in ("replay", "recall"):
-        target = "full"
-    pattern, form = _KINDS[kind]
-    spec = PolicySpec(kind, target)
-    if not re.fullmatch(pattern, target, re.DOTALL) or bool(colon) > bool(target):
-        raise InvalidOptionError.expected("policy", text, form)
+    """Read a policy; `replay` alone stands for `replay:full`, and so on."""
+    read = POLICIES.parse(text)
+    spec = PolicySpec(read.kind, read.target, read.given)
     servers = spec.servers
     if len(set(servers)) < len(servers) or not all(0 < port < 65536 for _, port in servers):
-        raise InvalidOptionError.expected("policy", text, form)
+        raise InvalidOptionError.expected("policy", text, POLICIES.kinds["websocket"].form)
     return spec
 
 
@@ -101,8 +103,8 @@ def check_workers(spec: PolicySpec, workers: int) -> None:
     if spec.kind == "websocket" and not spec.serves and len(spec.servers) < workers:
         raise InvalidOptionError(
             f"{workers} workers need {workers} policy servers; {spec} names {len(spec.servers)}",
-            f"Take --workers {len(spec.servers)}, start more, or have each worker start its own: "
-            "--serve.",
+            f"Take workers={len(spec.servers)}, start more servers, or have each worker start its "
+            "own (serve).",
         )
 
 
@@ -115,24 +117,17 @@ def make_policy(text: str, options: Sequence[str] = (), *, worker: int = 0) -> P
             factory takes what it takes.
         worker: Number of this worker, from 0: with several servers, the one that it uses. A
             `python:` factory that takes `worker` is given it.
-
-    Raises:
-        UnknownNameError: There is no such policy or factory.
-        InvalidOptionError: The policy is not written as it should be, or does not take an option.
-        MissingExtraError: Its libraries are not installed.
-        PolicyError: A module cannot be imported, what a factory returned is no policy, or a model
-            does not fit the simulators.
     """
-    factory, fixed = _factory(text, worker)
-    policy = factory(**fixed, **bind_options(text, factory, fixed, options))
+    factory, given = _factory(text, worker)
+    policy = factory(**given, **bind_options(f"policy {text!r}", factory, given, options))
     _check_members(text, policy)
-    return policy
+    return policy  # type: ignore[no-any-return]
 
 
 def policy_options(text: str, options: Sequence[str] = ()) -> dict[str, Any]:
     """Return all options that a policy is made with, defaults included; see `make_policy`."""
-    factory, fixed = _factory(text, 0)
-    return bind_options(text, factory, fixed, options)
+    factory, given = _factory(text, 0)
+    return bind_options(f"policy {text!r}", factory, given, options)
 
 
 def served_policy(text: str, serve: str | None) -> str:
@@ -141,18 +136,15 @@ def served_policy(text: str, serve: str | None) -> str:
     Args:
         text: The policy as it is written.
         serve: The command with which each worker starts its server, `{port}` in it.
-
-    Raises:
-        InvalidOptionError: There is no place for the port, or the policy has no server to start.
     """
     if serve is None:
         if parse_policy(text).serves:
-            raise InvalidOptionError.expected("policy", text, _KINDS["websocket"][1])
+            raise InvalidOptionError.expected("policy", text, POLICIES.kinds["websocket"].form)
         return text
     if text != "websocket":
         raise InvalidOptionError(
-            f"--serve starts the server of a policy, and {text} has none to start",
-            "Give --policy websocket with it, or leave it out.",
+            f"serve starts the server of a policy, and {text} has none to start",
+            'Give policy="websocket" with it, or leave it out.',
         )
     try:
         whole = shlex.split(serve)
@@ -160,7 +152,7 @@ def served_policy(text: str, serve: str | None) -> str:
         whole = []
     if not any("{port}" in word for word in whole):
         raise InvalidOptionError.expected(
-            "--serve", serve, "a command with {port}, the port that it is to listen at"
+            "serve", serve, "a command with {port}, the port that it is to listen at"
         )
     return f"websocket:{serve}"
 
@@ -169,73 +161,31 @@ def pin_policy(text: str) -> str:
     """Return the one text of a policy: a model on the Hub has its commit.
 
     Asked once, before any worker starts: a branch may move while a run goes on.
-
-    Raises:
-        UnknownNameError, InvalidOptionError: The policy is not written as it should be.
-        HubError: The Hub does not know the model, or cannot be reached.
     """
     spec = parse_policy(text)
     if spec.kind != "lerobot":
         return str(spec)
-    return f"lerobot:{_load('lerobot', 'find_policy', 'build')(spec.target)[1]}"
+    return f"lerobot:{POLICIES.factory(spec, 'find_policy')(spec.target)[1]}"
 
 
-def _factory(text: str, worker: int) -> tuple[Callable[..., Policy], dict[str, Any]]:
+def _factory(text: str, worker: int) -> tuple[Factory, dict[str, Any]]:
     """Return what makes a policy, and the arguments that its text gives."""
     spec = parse_policy(text)
     if spec.kind == "python":
-        factory = _own_factory(spec.target)
+        factory = import_factory("policy", spec.target)
         takes = "worker" in signature_of(factory).parameters
         return factory, {"worker": worker} if takes else {}
-    if spec.kind == "lerobot":
-        return _load("lerobot", "LeRobotPolicy", "build"), {"path": spec.target}
-    if spec.kind == "websocket":
-        return _server(spec, worker)
-    if spec.kind in ("replay", "recall"):
-        name = {"replay": "ReplayPolicy", "recall": "Recall"}[spec.kind]
-        return _load("builtin", name), {"memory": spec.target}
-    if spec.kind in ("hold", "obey"):
-        return _load("builtin", spec.kind.capitalize()), {}
-    return _load("builtin", "Privileged"), {"name": spec.kind}
-
-
-def _server(spec: PolicySpec, worker: int) -> tuple[Callable[..., Policy], dict[str, Any]]:
     if spec.serves:
-        return _load("served", "ServedPolicy"), {"command": spec.target}
-    check_workers(spec, worker + 1)
-    host, port = spec.servers[worker]
-    return _load("websocket", "WebsocketPolicy"), {"host": host, "port": port}
-
-
-def _load(module: str, name: str, extra: str = "evaluate") -> Callable[..., Any]:
-    return load_extra(f"{__package__}.{module}", name, "this policy", extra)
-
-
-def _own_factory(target: str) -> Callable[..., Policy]:
-    module, _, name = target.partition(":")
-    if module == "__main__":
-        raise InvalidOptionError(
-            f"policy 'python:{target}': worker processes run another program, and find no such "
-            "function in it",
-            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
-            "write python:MODULE:FUNCTION.",
-        )
-    try:
-        loaded = import_module(module)
-    except Exception as error:
-        raise PolicyError(
-            f"importing {module} failed: {type(error).__name__}: {error}",
-            "Install it, or run with PYTHONPATH set to the folder that it is in.",
-        ) from error
-    factory: Any = getattr(loaded, name, None)
-    if not callable(factory):
-        known = [key for key, value in vars(loaded).items() if callable(value)]
-        raise UnknownNameError.among("function", name, f"module {module!r}", known)
-    return factory  # type: ignore[no-any-return]
+        return POLICIES.factory(spec, "ServedPolicy"), {"command": spec.target}
+    if spec.kind == "websocket":
+        check_workers(spec, worker + 1)
+        host, port = spec.servers[worker]
+        return POLICIES.factory(spec), {"host": host, "port": port}
+    return POLICIES.factory(spec), dict(spec.given)
 
 
 def _check_members(text: str, policy: Any) -> None:
-    """Refuse what is no `Policy`, so that a slip is told before the first episode."""
+    """Refuse what is no `Policy`, so that a slip shows before the first episode."""
     wrong = []
     for name, kind in get_type_hints(Policy).items():
         value = getattr(policy, name, None)

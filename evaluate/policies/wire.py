@@ -30,9 +30,6 @@ def pack(message: Any) -> bytes:
 
     It may hold maps, lists, texts, bytes, numbers, None, and NumPy arrays and scalars of booleans,
     integers, floats of at most 8 bytes, or texts.
-
-    Raises:
-        WireError: It holds something else, such as an array of objects.
     """
     try:
         return msgpack.packb(message, default=_pack_numpy)
@@ -46,9 +43,6 @@ def unpack(data: bytes) -> Any:
     """Read a message; the inverse of `pack`, with lists for tuples.
 
     Arrays are read-only views of `data`.
-
-    Raises:
-        WireError: The bytes are not one whole message, or an array in it is not what it says.
     """
     try:
         return msgpack.unpackb(data, object_hook=_unpack_numpy, ext_hook=_refuse_extension)

@@ -15,12 +15,13 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
 )
 from robomme_interference_data.evaluate.policies.identity import (
+    check_kind,
     describe_policy,
     describe_served,
+    hold_servers,
     plain,
 )
 from robomme_interference_data.evaluate.policies.registry import pin_policy, served_policy
-from robomme_interference_data.evaluate.policies.servers import check_kind, hold_servers
 from robomme_interference_data.evaluate.rollout.worker import RolloutTask
 from robomme_interference_data.evaluate.subgoals.registry import describe_subgoals, pin_subgoals
 from robomme_interference_data.evaluate.systems import name_system

@@ -38,13 +38,7 @@ class ModelWriter(SubgoalWriter):
         recent: Live frames that it is shown, where the prompt does.
         stride: From one of them to the next.
         near: Frames at most so far apart are near each other.
-
-    Raises:
-        InvalidOptionError: A number is below 1.
-        UnknownNameError, FormatError: See `load_prompt`.
     """
-
-    looks = True
 
     def __init__(
         self,
@@ -59,7 +53,9 @@ class ModelWriter(SubgoalWriter):
         super().__init__()
         for name, value in (("frames", frames), ("recent", recent), ("stride", stride)):
             if value < 1:
-                raise InvalidOptionError.expected(f"--subgoal-option {name}", value, "1 or more")
+                raise InvalidOptionError.expected(
+                    f"the option {name} of subgoals", value, "1 or more"
+                )
         self._model, self._frames, self._near = model, frames, near
         self.prompt, self._sha256 = load_prompt(prompt)
         self.every_frame = self.prompt.watches

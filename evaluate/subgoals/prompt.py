@@ -123,9 +123,6 @@ class Prompt:
             text: What the model wrote.
             size: Height and width of the front image in pixels.
             shown: How many recent frames it was shown.
-
-        Raises:
-            InvalidOptionError: It says no subgoal, or points or frames that there are not.
         """
         keyframes: tuple[int, ...] = ()
         if self.answer == "json":
@@ -221,9 +218,5 @@ def load_prompt(name: str) -> tuple[Prompt, str]:
 
     Returns:
         The prompt, and the SHA-256 of its file.
-
-    Raises:
-        UnknownNameError: There is no such prompt, nor such a file.
-        FormatError: The file is no prompt; says why.
     """
     return read_prompt(Prompt, __package__, PROMPTS, name, "docs/subgoals.md")

@@ -1,4 +1,4 @@
-"""Writers of subgoals by what is written on the command line."""
+"""Writers of subgoals by their text: `oracle`, or a model."""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -11,35 +11,24 @@ from robomme_interference_data.evaluate.models.registry import (
     pin_model,
 )
 from robomme_interference_data.evaluate.run.config import RunConfig
-from robomme_interference_data.evaluate.specs import bind_options
 from robomme_interference_data.evaluate.systems import System
+from robomme_interference_data.runtime.specs import bind_options
 
 from .model_writer import ModelWriter
 from .writer import ORACLE, OracleWriter, SubgoalWriter
 
-_WHAT = "subgoal"  # has options: --subgoal-option
-
 
 def pin_subgoals(text: str | None) -> str | None:
-    """Return the one text of a writer: a model on the Hub has its commit; None stays None.
-
-    Raises:
-        UnknownNameError, InvalidOptionError, HubError: See `pin_model`.
-    """
+    """Return the one text of a writer: a model on the Hub has its commit; None stays None."""
     return text if text in (None, ORACLE) else pin_model(str(text))
 
 
 def make_writer(config: RunConfig) -> SubgoalWriter | None:
-    """Make what writes the subgoals of a run, in this process; None if nothing does.
-
-    Raises:
-        UnknownNameError, InvalidOptionError, MissingExtraError, FormatError, HubError: It is not
-            written as it should be, or cannot be made: see `make_model` and `load_prompt`.
-    """
+    """Make what writes the subgoals of a run, in this process; None if nothing does."""
     if config.subgoals in (None, ORACLE):
         return None if config.subgoals is None else OracleWriter()
     own, others = _parted(config.subgoal_options)
-    model = make_model(str(config.subgoals), others, _WHAT, _own_names())
+    model = make_model(str(config.subgoals), others, _own_names())
     return ModelWriter(model, str(config.subgoal_prompt), **_bound(config.subgoals, own))
 
 
@@ -47,10 +36,7 @@ def describe_subgoals(config: RunConfig, system: System) -> tuple[RunConfig, dic
     """Make what writes subgoals once, ask what it is, and release it.
 
     Returns:
-        The settings, the prompt among them; and what it says of itself, empty if nothing does.
-
-    Raises:
-        InterferenceError: It cannot be made, or its model cannot be reached, or is not there.
+        The settings, the prompt among them; and its metadata, empty if nothing writes.
     """
     if config.subgoals not in (None, ORACLE):
         config = replace(config, subgoal_prompt=config.subgoal_prompt or system.prompt)
@@ -63,19 +49,19 @@ def describe_subgoals(config: RunConfig, system: System) -> tuple[RunConfig, dic
         writer.close()
 
 
-def subgoals_identity(config: RunConfig, said: Mapping[str, Any]) -> Any:
+def subgoals_identity(config: RunConfig, metadata: Mapping[str, Any]) -> Any:
     """Return what of the subgoals can change a result, as plain values; None without any.
 
     Args:
         config: The settings.
-        said: What their writer says of itself: see `describe_subgoals`.
+        metadata: Of their writer: see `describe_subgoals`.
     """
     if config.subgoals in (None, ORACLE):
         return config.subgoals
     own, others = _parted(config.subgoal_options)
-    told = said["subgoals"]
-    model = model_identity(str(config.subgoals), others, told["model"], _WHAT)
-    prompt = {"prompt_sha256": told["prompt_sha256"]}
+    writer = metadata["subgoals"]
+    model = model_identity(str(config.subgoals), others, writer["model"])
+    prompt = {"prompt_sha256": writer["prompt_sha256"]}
     return model | prompt | _bound(config.subgoals, own)
 
 
@@ -92,5 +78,4 @@ def _own_names() -> list[str]:
 
 
 def _bound(text: Any, options: Sequence[str]) -> dict[str, Any]:
-    fixed = {"model": None, "prompt": ""}
-    return bind_options(str(text), ModelWriter, fixed, options, _WHAT)
+    return bind_options(f"model {text!r}", ModelWriter, {"model": None, "prompt": ""}, options)

@@ -81,13 +81,11 @@ class SubgoalWriter(ABC):
     16 actions are executed; `watch` with what was seen after them; `next`; and so on.
 
     Attributes:
-        looks: Whether it wants the front camera's images.
         every_frame: Whether `watch` is to get what is seen after each action; if not, only what
             the policy acts on next.
         turns: What it has written in this rollout.
     """
 
-    looks: bool = False
     every_frame: bool = False
 
     def __init__(self) -> None:
@@ -107,9 +105,6 @@ class SubgoalWriter(ABC):
         Args:
             observation: What is seen now; `watch` has had it.
             step: Actions that were executed.
-
-        Raises:
-            ModelError: The model cannot be reached, or is not there.
         """
 
     @abstractmethod

@@ -62,7 +62,7 @@ def test_retrieval_by_what_is_seen_under_a_shift(tmp_path: Path) -> None:
     options: dict[str, Any] = {"memory": "full", "retrieval": "thumbnail", "conditions": ("k7",)}
     plain, same, black = (kept(split, shift=s, **options) for s in ("none", "light:1", "clutter:3"))
     assert plain == same != black  # light:1 looks as always, clutter:3 is black
-    with pytest.raises(InvalidOptionError, match="--shift light:1 says nothing"):
+    with pytest.raises(InvalidOptionError, match="the shift light:1 says nothing"):
         ceiling(load_split(split), CeilingConfig(shift="light:1"))
 
 

@@ -99,19 +99,18 @@ def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
             serve("one", first, shard="1/2")
 
 
-def test_a_privileged_policy_is_on_record(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_privileged_policy_is_on_record(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     insider = {"policy_options": ("name=privileged", "value=true")}
     run_one(tmp_path / "run", policy="python:support.own_policies:changed", **insider)
     said = header(tmp_path / "run")["starts"][0]["policy"]
     assert said == {"policy": "still", "privileged": True}
-    assert "own_policies:changed is privileged: it gets the simulator" in capsys.readouterr().err
+    assert "own_policies:changed is privileged: it gets the simulator" in caplog.text
+    caplog.clear()
     says = "python:support.own_policies:says"
     run_one(tmp_path / "other", policy=says, policy_options=("what=array",))
     said = header(tmp_path / "other")["starts"][0]["policy"]
     assert said == {"policy": "still", "sizes": [0, 1, 2], "4": 5.0}
-    assert "privileged" not in capsys.readouterr().err
+    assert "privileged" not in caplog.text
 
 
 def test_what_of_a_policy_can_change_a_result() -> None:

@@ -18,8 +18,9 @@ from robomme_interference_data.errors import (
     ServerDiedError,
     WorkerRetiredError,
 )
+from robomme_interference_data.evaluate.policies import websocket
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.policies.servers import hold_port
+from robomme_interference_data.evaluate.policies.server_lock import reserve_port
 
 pytestmark = pytest.mark.usefixtures("world")
 
@@ -84,9 +85,9 @@ def test_one_that_does_not_listen_is_told_with_its_last_words(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"policy": "websocket"}, "websocket with --serve"),
+        ({"policy": "websocket"}, "websocket with serve="),
         ({"policy": "replay", "serve": "serve {port}"}, "has none to start"),
-        ({"policy": "websocket:serve {port}"}, "websocket with --serve"),
+        ({"policy": "websocket:serve {port}"}, "websocket with serve="),
         ({"policy": "websocket", "serve": "serve 8000"}, "a command with {port}"),
         ({"policy": "websocket", "serve": "serve '{port}"}, "a command with {port}"),
         ({"policy": "websocket", "serve": "no-such-program {port}"}, "cannot be run"),
@@ -105,10 +106,8 @@ def test_what_cannot_be_served_is_refused(
 def test_it_has_to_say_what_it_serves(tmp_path: Path) -> None:
     with pytest.raises(InvalidOptionError, match="does not say which checkpoint"):
         serve(tmp_path / "run", "--metadata", "{}")
-    said = {"policy_options": ("checkpoint=mine",)}
-    assert serve(tmp_path / "run", "--metadata", "{}", **said).counts["fail"] == 4
     with pytest.raises(PolicyServerError, match="serves the checkpoint 'tiny/1', not 'mine'"):
-        serve(tmp_path / "other", **said)
+        serve(tmp_path / "other", policy_options=("checkpoint=mine",))
 
 
 def test_a_server_of_another_kind_than_the_systems_is_refused(tmp_path: Path) -> None:
@@ -123,12 +122,12 @@ def test_a_worker_whose_server_says_something_else_does_no_rollout(tmp_path: Pat
 
 
 def test_two_servers_of_one_machine_have_two_ports() -> None:
-    with hold_port() as first, hold_port() as second:
+    with reserve_port() as first, reserve_port() as second:
         assert first != second
     policy = make_policy(f"websocket:{command()}")
-    with hold_port() as other:
+    with reserve_port() as other:
         policy.close()
-        with hold_port() as again:
+        with reserve_port() as again:
             assert len({other, again}) == 2
 
 
@@ -146,9 +145,7 @@ def test_what_a_script_started_ends_with_it(tmp_path: Path) -> None:
 
 
 def test_the_end_of_a_long_log_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    from robomme_interference_data.evaluate.policies import served
-
-    monkeypatch.setattr(served, "_LOG_BYTES", 5)
+    monkeypatch.setattr(websocket, "_LOG_BYTES", 5)
     policy: Any = make_policy("websocket:echo {port} is the port")
     try:
         with pytest.raises(InterferenceError, match="ended"):

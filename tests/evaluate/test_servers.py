@@ -1,10 +1,9 @@
-"""Policy servers of a run: named, of the right kind, held, and begun again where keepalive ends."""
+"""Policy servers of a run: named, of the right kind, locked, and started by workers."""
 
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from robomme_interference_data.errors import (
     RunFolderError,
     ServerKeepaliveError,
 )
-from robomme_interference_data.evaluate.policies.servers import check_kind, hold_servers
+from robomme_interference_data.evaluate.policies.identity import check_kind, hold_servers
 from robomme_interference_data.evaluate.systems import PAPER_SYSTEMS, name_system
 
 NAMED = ("checkpoint=a",)
@@ -35,7 +34,7 @@ def test_a_server_that_says_nothing_needs_a_checkpoint(
         server.metadata = said
         with pytest.raises(InvalidOptionError, match="does not say which checkpoint") as raised:
             run_one(tmp_path / "run", policy=server.url)
-        assert "--policy-option checkpoint=" in (raised.value.hint or "")
+        assert "checkpoint=TEXT" in (raised.value.hint or "")
     assert server.calls == [] and not (tmp_path / "run").exists()
     run_one(tmp_path / "run", policy=server.url, policy_options=NAMED)
     assert header(tmp_path / "run")["identity"]["policy_options"]["checkpoint"] == "a"
@@ -148,26 +147,12 @@ def test_a_server_may_compile_while_it_is_asked_for_its_kind() -> None:
         assert server.connections == 2
 
 
-# --- /healthz ----------------------------------------------------------------------------------
-
-
-def test_a_server_that_is_not_ready_is_not_connected_to(server: PolicyServer) -> None:
-    server.status = HTTPStatus.SERVICE_UNAVAILABLE
-    with client(server, connect_s=0.5) as policy:
-        with pytest.raises(PolicyServerError, match=r"it answers 503 \(for 0\.5 s\)"):
-            policy.metadata()
-        assert server.connections == 0
-        server.status = None
-        policy.metadata()
-        assert server.connections == 1
-
-
 # --- locks -------------------------------------------------------------------------------------
 
 
 DRIVE = """
 import pathlib, sys, time
-from robomme_interference_data.evaluate.policies.servers import hold_servers
+from robomme_interference_data.evaluate.policies.identity import hold_servers
 with hold_servers(sys.argv[1], pathlib.Path(sys.argv[2])):
     print("driving", flush=True)
     time.sleep(600)
@@ -211,10 +196,10 @@ def test_a_run_lets_its_servers_go(tmp_path: Path) -> None:
 
 
 def test_without_a_place_for_locks_a_run_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with hold_servers("websocket://gpu1:8013", tmp_path):
         pass
-    assert "Nothing keeps other runs from the policy server gpu1:8013" in capsys.readouterr().err
+    assert "Nothing keeps other runs from the policy server gpu1:8013" in caplog.text

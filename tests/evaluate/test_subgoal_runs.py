@@ -20,7 +20,7 @@ from support.chat_server import (
 )
 from support.own_policies import Told
 from support.policy_server import PolicyServer
-from support.runs import config, header, roll, run, run_one, untimed
+from support.runs import config, header, roll, run, run_one
 
 from robomme_interference_data import load_split
 from robomme_interference_data.errors import (
@@ -124,12 +124,6 @@ def test_an_endpoint_that_goes_away_costs_no_row(tmp_path: Path) -> None:
     assert sorted(row.attempt for row in second.rows) == [1, 1, 2, 2]
 
 
-def test_the_same_answers_make_the_same_rows(tmp_path: Path) -> None:
-    with ChatServer(lambda seen: f"go {len(seen.images)}") as server:
-        rows = [run(tmp_path / name, **asking(server)).rows for name in "ab"]
-    assert untimed(rows[0]) == untimed(rows[1])
-
-
 def test_what_the_model_is_shown(tmp_path: Path, tiny_split: Path) -> None:
     with ChatServer() as server:
         run_one(tmp_path, **asking(server, conditions=("k1",)))
@@ -138,16 +132,6 @@ def test_what_the_model_is_shown(tmp_path: Path, tiny_split: Path) -> None:
     frames = buffer.frames("front")[[0, 26, 52, 79]]  # of 80, four evenly spread
     assert all(np.array_equal(*pair) for pair in zip(images[:4], frames, strict=True))
     assert np.array_equal(images[4], buffer.query.frame("front"))
-
-
-def test_the_clip_shows_them(tmp_path: Path) -> None:
-    with ChatServer(lambda seen: "go to <500, 500>") as server:
-        told, alone = (
-            run_one(tmp_path / name, videos=True, **changes).rows[0].video
-            for name, changes in (("a", asking(server)), ("b", {"policy": TOLD}))
-        )
-    pictures = [(tmp_path / name / str(path)).stat() for name, path in (("a", told), ("b", alone))]
-    assert pictures[0].st_size > pictures[1].st_size
 
 
 # --- what makes the run the one that it is -------------------------------------------------------

@@ -71,8 +71,6 @@ def test_own_names() -> None:
         ("FrameSamp-Modul", "perceptual-framesamp-modul"),  # a display name
         ("perceptual_framesamp_modul", "perceptual-framesamp-modul"),
         ("Perceptual-FrameSamp-Modul", "perceptual-framesamp-modul"),
-        ("perceptual-framesamp-modu", "perceptual-framesamp-modul"),  # a slip
-        ("perceptual-framesamp-modul-v2", "perceptual-framesamp-modul"),  # a variant
         ("pi05-baseline", "pi05_baseline"),
         ("Oracle", "oracle"),
         ("replayfull", "replay-full"),

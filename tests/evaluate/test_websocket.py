@@ -14,8 +14,6 @@ from support.runs import run
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.evaluate.policies.identity import plain
-from robomme_interference_data.evaluate.policies.websocket import WebsocketPolicy
-from robomme_interference_data.simulators.base import Observation
 
 
 @pytest.mark.parametrize(
@@ -136,28 +134,6 @@ def test_every_answer_is_checked(server: PolicyServer, call: str, answer: Any, t
     server.before = respond
     with client(server) as policy, pytest.raises(PolicyServerError, match=text):
         rollout(policy, 2, [2], [])
-
-
-def test_a_memory_has_4096_positions(server: PolicyServer) -> None:
-    with client(server, chunk_frames=2000) as policy:
-        rollout(policy, 4095, [4095], [])
-        with pytest.raises(PolicyServerError, match="reports: .*index 4096 is out of bounds"):
-            rollout(policy, 4096, [4096], [])
-    # All frames were taken; it is the asking that fails.
-    assert (server.memory.count, server.calls[-1]) == (4097, INFER)
-
-
-def test_a_subclass_may_send_more(server: PolicyServer) -> None:
-    class Guided(WebsocketPolicy):
-        def message(self, observation: Observation, goal: str) -> dict[str, Any]:
-            return super().message(observation, goal) | {"simple_subgoal": f"{goal} it"}
-
-    sent = []
-    server.before = lambda message: sent.append(message.get("simple_subgoal"))
-    policy = Guided("127.0.0.1", server.port)
-    rollout(policy, 0, [], [])
-    policy.close()
-    assert sent == [None, None, "pick it"]
 
 
 def test_a_run_keeps_the_servers_account(tmp_path: Path, world: None, server: PolicyServer) -> None:

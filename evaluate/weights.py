@@ -1,0 +1,31 @@
+"""Digests of model files, kept so that large ones are read once on a machine."""
+
+import hashlib
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from robomme_interference_data.storage.cache import default_cache_folder
+from robomme_interference_data.storage.files import canonical_json, digest_folder, write_text
+
+
+def digest_weights(folder: Path, patterns: Sequence[str]) -> str:
+    """Return `digest_folder`, from the cache where no file has another size or time since.
+
+    A cache that cannot be written costs time only.
+    """
+    paths = sorted({path for one in patterns for path in folder.rglob(one) if path.is_file()})
+    stats = [(str(path.relative_to(folder)), path.stat()) for path in paths]
+    state = [[name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns] for name, stat in stats]
+    key = canonical_json([str(folder.resolve()), state])
+    name = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
+    kept = default_cache_folder().parent / "weights" / name
+    with suppress(OSError, UnicodeDecodeError):
+        digest = kept.read_text("utf-8")
+        if len(digest) == 64 and set(digest) <= set("0123456789abcdef"):
+            return digest
+    digest = digest_folder(folder, patterns)
+    with suppress(OSError):
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_text(kept, digest)
+    return digest

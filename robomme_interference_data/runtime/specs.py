@@ -1,0 +1,217 @@
+"""Specifications: `kind:target` texts, `NAME=VALUE` options, and the factories behind them.
+
+Policies, models and simulators are named by such texts. What makes them is imported when one is
+made, as it may bring large libraries.
+"""
+
+import inspect
+import json
+import re
+import types
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError, nearest
+from robomme_interference_data.lazy import load_extra
+
+Factory = Callable[..., Any]
+
+_TYPES = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    type(None): "null",
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of a registry.
+
+    Attributes:
+        form: How it is written, for messages.
+        factory: What makes it, `package.module:name`.
+        target: Regular expression of what follows the colon; its named groups are arguments of the
+            factory.
+        default: The target where none is written.
+        given: Further arguments of the factory.
+        extra: The extra that has its libraries.
+        no_effect: Options, and keys of metadata, that change no result.
+    """
+
+    form: str
+    factory: str
+    target: str = ""
+    default: str = ""
+    given: Mapping[str, Any] = field(default_factory=dict)
+    extra: str = ""
+    no_effect: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A text that was read: its kind, what follows the colon, and the arguments in that."""
+
+    kind: str
+    target: str = ""
+    given: Mapping[str, Any] = field(default_factory=dict, compare=False)
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.target}" if self.target else self.kind
+
+
+class Registry:
+    """Kinds by name.
+
+    Args:
+        what: What they are, for messages, such as `policy`.
+        kinds: Name to kind.
+    """
+
+    def __init__(self, what: str, kinds: Mapping[str, Kind]):
+        self._what, self.kinds = what, kinds
+
+    def parse(self, text: str) -> Spec:
+        """Read a text: `UnknownNameError` for an unknown kind, else `InvalidOptionError`."""
+        name, colon, target = text.partition(":")
+        if name not in self.kinds:
+            forms = ", ".join(kind.form for kind in self.kinds.values())
+            raise UnknownNameError(
+                f"there is no {self._what} {text!r}; expected {forms}",
+                nearest(name, self.kinds, more=""),
+            )
+        kind = self.kinds[name]
+        target = target if colon else kind.default
+        match = re.fullmatch(kind.target, target, re.DOTALL)
+        if match is None or bool(colon) > bool(target):
+            raise InvalidOptionError.expected(self._what, text, kind.form)
+        return Spec(name, target, {**kind.given, **match.groupdict()})
+
+    def factory(self, spec: Spec, name: str | None = None) -> Factory:
+        """Import what makes such a spec, or another name of the same module."""
+        kind = self.kinds[spec.kind]
+        module, _, usual = kind.factory.partition(":")
+        return load_extra(module, name or usual, f"the {self._what} {spec}", kind.extra)
+
+    def identity(self, spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return those options, or entries of metadata, that can change a result."""
+        without = self.kinds[spec.kind].no_effect
+        return {name: value for name, value in sorted(values.items()) if name not in without}
+
+
+def import_factory(what: str, target: str) -> Factory:
+    """Import a function or class by `module:name`; `what` it makes is for messages."""
+    module, _, name = target.partition(":")
+    if module == "__main__":
+        raise InvalidOptionError(
+            f"{what} {target!r}: worker processes run another program, and find no such function "
+            "in it",
+            "Put the function into a module, a .py file beside the script or on PYTHONPATH, and "
+            "write MODULE:FUNCTION.",
+        )
+    try:
+        loaded = import_module(module)
+    except Exception as error:
+        raise InvalidOptionError(
+            f"{what} {target!r}: importing {module} failed: {type(error).__name__}: {error}",
+            "Install it, or run with PYTHONPATH set to the folder that it is in.",
+        ) from error
+    found: Any = getattr(loaded, name, None)
+    if not callable(found):
+        known = [key for key, value in vars(loaded).items() if callable(value)]
+        raise UnknownNameError.among("function", name, f"module {module!r}", known)
+    return found  # type: ignore[no-any-return]
+
+
+def bind_options(
+    what: str,
+    factory: Factory,
+    given: Mapping[str, Any],
+    options: Iterable[str],
+    also: Iterable[str] = (),
+) -> dict[str, Any]:
+    """Return all options that a factory is called with, defaults included.
+
+    Text stays text where the factory declares it. Elsewhere it is read as JSON (`3`, `0.5`,
+    `true`, `null`) if it is that. Anything wrong is an `InvalidOptionError`.
+
+    Args:
+        what: What is made, for messages, such as `policy 'replay:full'`.
+        factory: What makes it.
+        given: Arguments that are no options.
+        options: Options as they are typed, `NAME=VALUE`.
+        also: Options that something else takes from the same list, for messages.
+    """
+    signature, declared = signature_of(factory), _declared_types(factory)
+    values: dict[str, Any] = {}
+    for name, text in _split(what, options).items():
+        kinds = declared.get(name)
+        value = text if kinds and str in kinds else _read(text)
+        if kinds and float in kinds and type(value) is int:
+            value = float(value)
+        if kinds and type(value) not in kinds:  # bool is none of the numbers here
+            expected = " or ".join(_TYPES[kind] for kind in kinds)
+            raise InvalidOptionError.expected(f"{what}: its option {name} is", value, expected)
+        values[name] = value
+    try:
+        bound = signature.bind(**given, **values)
+    except TypeError as error:
+        names = [*(name for name in signature.parameters if name not in given), *also]
+        raise InvalidOptionError(
+            f"{what}: {error}", f"Its options: {', '.join(names) or 'none'}."
+        ) from error
+    bound.apply_defaults()
+    taken: dict[str, Any] = {}
+    for name, value in bound.arguments.items():
+        if signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD:
+            taken |= value
+        elif signature.parameters[name].kind is not inspect.Parameter.VAR_POSITIONAL:
+            taken[name] = value
+    return {name: value for name, value in taken.items() if name not in given}
+
+
+def signature_of(factory: Factory) -> inspect.Signature:
+    """Return a factory's parameters; of one that declares none, that it takes any by name."""
+    try:
+        return inspect.signature(factory)
+    except ValueError:  # something built in
+        return inspect.signature(lambda **options: None)
+
+
+def _split(what: str, options: Iterable[str]) -> dict[str, str]:
+    values: dict[str, str] = {}
+    for option in options:
+        name, equals, value = option.partition("=")
+        if not name.isidentifier() or not equals:
+            raise InvalidOptionError.expected(
+                f"{what}: option", option, "NAME=VALUE, such as device=cpu"
+            )
+        if name in values:
+            raise InvalidOptionError(f"{what}: option {name} is given twice", "Give it once.")
+        values[name] = value
+    return values
+
+
+def _read(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _declared_types(factory: Factory) -> dict[str, tuple[type, ...]]:
+    """Return the types of the parameters that are declared as plain values."""
+    try:
+        hints = get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
+    except (AttributeError, NameError, TypeError):  # nothing can be known of it
+        return {}
+    declared = {}
+    for name, hint in hints.items():
+        union = get_origin(hint) in (Union, types.UnionType)
+        kinds = get_args(hint) if union else (hint,)
+        if all(kind in _TYPES for kind in kinds):
+            declared[name] = kinds
+    return declared
