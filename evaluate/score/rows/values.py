@@ -17,9 +17,9 @@ from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
-from robomme_interference_data.simulators.registry import SIMULATORS
+from robomme_interference_data.simulators.registry import OFFICIAL, SIMULATORS
 
-RELEASED_SIMULATOR = "robomme"
+RELEASED_SIMULATOR = OFFICIAL
 """The simulator of rows that name none."""
 
 
