@@ -291,7 +291,7 @@ def main() -> None:
     With `versions` alone, print what is installed.
     """
     if sys.argv[1:] == ["versions"]:
-        sys.stdout.write(json.dumps(installed_versions()))
+        sys.stdout.write(json.dumps(installed_versions()))  # noqa: TID251 - a program of its own
         return
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the other side's to handle
     os.set_inheritable(int(sys.argv[1]), False)
