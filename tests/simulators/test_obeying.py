@@ -57,6 +57,7 @@ def test_told_what_to_do_it_always_succeeds(blind: TabletopSimulator, family: st
         assert status is Status.SUCCESS, (index, heard)
 
 
+@pytest.mark.slow
 def test_the_steps_are_told_in_order(blind: TabletopSimulator) -> None:
     # Episode 2 is hard: the cube is asked for two times.
     put, cube = "put it down", "pick up the cube"

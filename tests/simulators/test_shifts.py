@@ -59,6 +59,7 @@ def test_each_shift_is_seen_and_the_stronger_the_more(shifted: TabletopSimulator
     assert all(np.array_equal(again.images[name], plain.images[name]) for name in plain.images)
 
 
+@pytest.mark.slow
 def test_a_shift_comes_after_the_demonstration_and_is_the_episodes_own(
     shifted: TabletopSimulator,
 ) -> None:

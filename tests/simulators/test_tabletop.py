@@ -98,6 +98,7 @@ def test_another_process_gives_the_same_bits() -> None:
     assert one.stdout == other.stdout != b""
 
 
+@pytest.mark.slow
 def test_the_same_actions_have_the_same_outcome_whatever_is_drawn(
     tabletop: TabletopSimulator,
 ) -> None:
