@@ -22,7 +22,6 @@ from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset import question_pictures
-from robomme_interference_data.build_dataset import questions as module
 from robomme_interference_data.build_dataset.question_pictures import picture
 from robomme_interference_data.build_dataset.questions import (
     make_questions,
@@ -35,6 +34,7 @@ from robomme_interference_data.errors import BuildError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop.camera import SIZE
 from robomme_interference_data.simulators.tabletop.episodes import difficulty_of, seed_of
+from robomme_interference_data.simulators.tabletop.family import Family
 from robomme_interference_data.storage.encode import decode_image
 
 GREY = np.full((SIZE, SIZE, 3), 128, np.uint8)
@@ -198,7 +198,7 @@ def test_with_another_answer_only_the_right_place_is_another(
         found = []
         episode = EpisodeId(family, "test", index)
         for number in range(len(scene_of(episode)[0].answers)):
-            monkeypatch.setattr(module, "turn_of", lambda seed, count, n=number: n)
+            monkeypatch.setattr(Family, "own_answer", lambda one, _, n=number: one.answers[n])
             found += make(episode)
         rights = {one.question.right for one in found}
         assert rights == set(range(len(found[0].question.options)))

@@ -62,10 +62,9 @@ def test_a_server_that_dies_is_started_again(tmp_path: Path) -> None:
     assert "out of memory" in first.read_text() and "out of memory" not in second.read_text()
 
 
-@pytest.mark.parametrize("words", [("--port",), ("--metadata", "no JSON")])
-def test_one_that_cannot_start_is_told_with_its_last_words(tmp_path: Path, words: Any) -> None:
-    with pytest.raises(ServerDiedError, match="ended, exit code [12]") as raised:
-        serve(tmp_path / "run", *words)
+def test_one_that_cannot_start_is_told_with_its_last_words(tmp_path: Path) -> None:
+    with pytest.raises(ServerDiedError, match="ended, exit code 1") as raised:
+        serve(tmp_path / "run", "--metadata", "no JSON")
     assert "rror" in str(raised.value.hint)
     assert not (tmp_path / "run").exists()
 
@@ -108,11 +107,6 @@ def test_it_has_to_say_what_it_serves(tmp_path: Path) -> None:
         serve(tmp_path / "run", "--metadata", "{}")
     with pytest.raises(PolicyServerError, match="serves the checkpoint 'tiny/1', not 'mine'"):
         serve(tmp_path / "other", policy_options=("checkpoint=mine",))
-
-
-def test_a_server_of_another_kind_than_the_systems_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(PolicyServerError, match="refuses to act without frames"):
-        serve(tmp_path / "run", system="pi05_baseline", conditions=("no-history",))
 
 
 def test_a_worker_whose_server_says_something_else_does_no_rollout(tmp_path: Path) -> None:
