@@ -311,7 +311,7 @@ def test_where_answers_are_not_known_a_model_can_be_asked(tmp_path: Path) -> Non
         root,
     )
     assert len(read_questions(split)) == 3
-    with pytest.raises(InvalidOptionError, match="in tabletop alone, not in "):
+    with pytest.raises(InvalidOptionError, match="recall does not know"):
         ask(tmp_path / "recall", split=root)
     with ChatServer(lambda seen: "B") as server:
         rows = ask(tmp_path / "run", split=root, **behind(server, frames=3)).rows
