@@ -59,9 +59,6 @@ def plan(margin: float, episodes: int, flips: float) -> Plan:
         margin: A difference of interest, a fraction.
         episodes: Their number.
         flips: Share of them that flips by itself.
-
-    Raises:
-        InvalidOptionError: A value is out of range, or more than all episodes would flip.
     """
     if not 0 < margin <= 1:
         expected = "points, more than 0 up to 100"

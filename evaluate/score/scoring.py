@@ -64,9 +64,6 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     Args:
         settings: What is scored, and how.
         draws: Bootstrap samples.
-
-    Raises:
-        BadRowsError: Rows are bad, or there are none; and more, see `rows.reading.read_rows`.
     """
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     if not len(rows):

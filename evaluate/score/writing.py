@@ -37,10 +37,6 @@ def write_score(
 
     Returns:
         The exported files.
-
-    Raises:
-        MissingExtraError: matplotlib or jinja2 is not installed.
-        InvalidOptionError: The released layout cannot hold the rows (see `export`).
     """
     with open_figure():
         load_jinja2("the report")

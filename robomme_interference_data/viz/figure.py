@@ -48,10 +48,6 @@ def open_page(out: Path, width: float) -> Iterator["Page"]:
     Args:
         out: File to write, `.png` or `.svg`.
         width: Width of the page in inches; its height is set in the block.
-
-    Raises:
-        InvalidOptionError: `out` has another suffix or cannot be written.
-        MissingExtraError: matplotlib is not installed.
     """
     _suffix(out)  # before anything is drawn
     with open_figure() as figure:
@@ -67,9 +63,6 @@ def open_figure() -> Iterator[Any]:
     """Give an empty white matplotlib `Figure`; the reader's own settings have no effect.
 
     It is drawn, and saved with `save_figure`, inside the block.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
     """
     try:
         import matplotlib.style
@@ -98,11 +91,7 @@ def open_figure() -> Iterator[Any]:
 
 
 def save_figure(figure: Any, out: Path) -> None:
-    """Write a figure to `.png` or `.svg`, atomically, without the date and the version.
-
-    Raises:
-        InvalidOptionError: `out` has another suffix or cannot be written.
-    """
+    """Write a figure to `.png` or `.svg`, atomically, without the date and the version."""
     suffix = _suffix(out)
     try:
         with atomic_path(out) as partial:

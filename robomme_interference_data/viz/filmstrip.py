@@ -5,16 +5,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX, SAMPLE_FRAMES, UNIT_FRAMES
-from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.sampling import even_sample, spread
 
 from .figure import INK, Hue, Page, ink_on, open_page, tint
+
+if TYPE_CHECKING:
+    from robomme_interference_data.data.buffer import Buffer
 
 LESSON_COLOR = Hue.VERMILION
 COLORS = (Hue.SKY, Hue.ORANGE, Hue.GREEN, Hue.PINK, Hue.BLUE, Hue.YELLOW, "#999999", "#000000")
@@ -104,7 +107,7 @@ def session_colors(sessions: Sequence[Session]) -> list[str]:
     return [LESSON_COLOR if s.role == "lesson" else by_family[s.family] for s in sessions]
 
 
-def mark_evidence(page: Page, buffer: Buffer, left: float, scale: float, bottom: float) -> None:
+def mark_evidence(page: Page, buffer: "Buffer", left: float, scale: float, bottom: float) -> None:
     """Draw a dark line along the foot of a bar wherever the buffer's frames show the answer.
 
     Args:
@@ -121,7 +124,7 @@ def mark_evidence(page: Page, buffer: Buffer, left: float, scale: float, bottom:
 
 
 def draw_strip(
-    buffer: Buffer, out: Path, *, camera: str = "front", live: NDArray[np.uint8] | None = None
+    buffer: "Buffer", out: Path, *, camera: str = "front", live: NDArray[np.uint8] | None = None
 ) -> None:
     """Draw a buffer: its sessions, a timeline to scale, and the first live observation.
 
@@ -134,11 +137,6 @@ def draw_strip(
         camera: Name of the camera.
         live: Picture of the first live observation, such as one under a shift; None for the stored
             one.
-
-    Raises:
-        InvalidOptionError, MissingExtraError: See `open_page`.
-        UnknownNameError: There is no such camera.
-        MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
     """
     with open_page(out, _WIDTH) as page:
         colors = session_colors(buffer.sessions)
@@ -156,12 +154,12 @@ def draw_strip(
         page.height = bottom + 0.28
 
 
-def shown_camera(buffer: Buffer) -> str:
+def shown_camera(buffer: "Buffer") -> str:
     """Return the camera of a strip for which none is chosen: the front one if there is one."""
     return "front" if "front" in buffer.cameras else buffer.cameras[0]
 
 
-def strip_png(buffer: Buffer) -> bytes:
+def strip_png(buffer: "Buffer") -> bytes:
     """Return what `draw_strip` draws of the camera that `shown_camera` names, as PNG."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "strip.png"
@@ -169,7 +167,7 @@ def strip_png(buffer: Buffer) -> bytes:
         return out.read_bytes()
 
 
-def _draw_head(page: Page, buffer: Buffer, camera: str) -> float:
+def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
     """Write the title and return the y under it."""
     manifest = buffer.manifest
     title = f"{buffer.episode_id}   {buffer.condition}"
@@ -194,7 +192,7 @@ def _draw_head(page: Page, buffer: Buffer, camera: str) -> float:
 
 
 def _draw_sessions(
-    page: Page, buffer: Buffer, camera: str, colors: Sequence[str], top: float
+    page: Page, buffer: "Buffer", camera: str, colors: Sequence[str], top: float
 ) -> float:
     """Draw all sessions and return the y under them."""
     slots, blocks = arrange([len(s) for s in buffer.sessions])
@@ -241,7 +239,7 @@ def _draw_card(
     page.text(left, under + 0.13, str(session.source), 6, width=inner, align="left")
 
 
-def _draw_timeline(page: Page, buffer: Buffer, colors: Sequence[str], top: float) -> None:
+def _draw_timeline(page: Page, buffer: "Buffer", colors: Sequence[str], top: float) -> None:
     """Draw the history to scale, the live observation at its end, and the even sample's ticks."""
     width = _INNER - _LIVE - 0.42
     scale = width / (len(buffer) + 1)

@@ -12,9 +12,6 @@ def load_jinja2(what: str) -> Any:
 
     Args:
         what: What is filled in, such as `the report`, for the message.
-
-    Raises:
-        MissingExtraError: It is not installed.
     """
     try:
         import jinja2
@@ -34,9 +31,6 @@ def fill(
         values: What it may name; it fails on any other name.
         what: What is filled in, for the message.
         options: Further ones of `jinja2.Environment`, such as `autoescape`, and `filters`.
-
-    Raises:
-        MissingExtraError: jinja2 is not installed.
     """
     jinja2 = load_jinja2(what)
     folder = resources.files(package).joinpath("templates")

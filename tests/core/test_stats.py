@@ -30,17 +30,6 @@ from robomme_interference_data.stats.significance import (
 COUNTS = st.tuples(*[st.integers(0, 300)] * 4).filter(any)
 
 
-def test_wilson_interval_by_hand() -> None:
-    # 8 of 10, z² = 3.841459: (8 + 1.920729)/13.841459 = 0.716741, half
-    # 1.959964 · √(10 · 0.8 · 0.2 + 0.960365)/13.841459 = 0.226579
-    assert wilson(8, 10) == pytest.approx((0.490162, 0.943318), abs=1e-6)
-    # 202 of 450: (202 + 1.920729)/453.841459 = 0.449322, half
-    # 1.959964 · √(450 · 0.448889 · 0.551111 + 0.960365)/453.841459 = 0.045761
-    assert wilson(202, 450) == pytest.approx((0.403560, 0.495083), abs=1e-6)
-    assert wilson(0, 0) == (0.0, 1.0)
-    assert (wilson(0, 50)[0], wilson(50, 50)[1]) == (0.0, 1.0)
-
-
 @given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_wilson_is_scipys(counts: tuple[int, int]) -> None:
     expected = scipy.stats.binomtest(*counts).proportion_ci(0.95, method="wilson")
@@ -151,12 +140,6 @@ def test_sign_flips_are_counted(differences: list[float]) -> None:
     assert mid == pytest.approx((above + equal / 2) / len(sums) if observed > 1e-9 else 1)
 
 
-def test_sign_flips_of_many_repeats_are_of_twentieths() -> None:
-    # Thirteenths of 3, 6 and −1 are 4.6, 9.2 and −1.5 twentieths, hence 5, 9 and −2.
-    found = sign_flip(np.array([3, 6, -1]) / 13)
-    assert found == sign_flip(np.array([5, 9, -2]) / 20) == (0.5, 0.375)
-
-
 def test_sign_flips_of_five_repeats_are_exact_where_one_broke() -> None:
     # In twentieths 16, −12, −4 and 15, with the sum 15. Of the sums ±16 ± 12 ± 4, ±32 are as far
     # from 0 with either sign of the 15, ±24 and ±8 with one, and 0, twice, with either: 12 of 16,
@@ -172,26 +155,11 @@ def test_of_single_rollouts_sign_flips_are_mcnemars(gained: int, lost: int, same
     )
 
 
-def test_mcnemar_by_hand() -> None:
-    assert mcnemar(13, 13) == (1.0, 1.0)  # as the released rows flip between k0 and k7
-    assert mcnemar(0, 0) == (1.0, 1.0)
-    # Of 5 discordant pairs none the other way: 2 · 1/32, and its half
-    assert mcnemar(5, 0) == mcnemar(0, 5) == (0.0625, 0.03125)
-    # 2 of 10: 2 · (1 + 10 + 45)/1024, less 45/1024
-    assert mcnemar(8, 2) == (0.109375, 67 / 1024)
-
-
 @given(st.integers(0, 3000), st.integers(0, 3000))
 def test_mcnemar_is_the_binomial_test(gained: int, lost: int) -> None:
     if gained + lost:
         expected = scipy.stats.binomtest(gained, gained + lost).pvalue
         assert mcnemar(gained, lost)[0] == pytest.approx(expected, rel=1e-8, abs=1e-200)
-
-
-def test_right_guesses_by_hand() -> None:
-    # (1/2 + x/2) (3/4 + x/4) = (3 + 4 x + x²) / 8
-    assert [poisson_binomial(n, [1 / 2, 1 / 4]) for n in range(4)] == [1, 5 / 8, 1 / 8, 0]
-    assert poisson_binomial(0, []) == poisson_binomial(1, [1, 0]) == 1
 
 
 @given(st.integers(0, 450), st.integers(0, 450), st.integers(2, 5))
@@ -287,22 +255,3 @@ def test_ten_episodes_must_stand_out_for_an_interval() -> None:
     assert varies_enough(np.array([1.0] * 6 + [-1.0] * 4 + [0.0] * 20))
     # What rounding alone tells apart is equal.
     assert not varies_enough(np.array([0.1 + 0.2] * 10 + [0.3] * 20))
-
-
-def test_missing_episodes_do_not_count() -> None:
-    values = outcomes()
-    holes = np.concatenate([values, np.full((30, 4), np.nan)])
-    holes[80:, 0] = 1.0  # these have one condition alone
-    for a, b in zip(bootstrap(values[:, 1:], ""), bootstrap(holes, "")[1:], strict=True):
-        assert a.value == b.value
-        assert (a.low, a.high) == pytest.approx((b.low, b.high), abs=0.12)
-
-
-def test_nothing_to_compare_is_no_number() -> None:
-    for values in (np.zeros((0, 1)), np.full((2, 1), np.nan)):
-        (found,) = bootstrap(values, "")
-        assert all(map(math.isnan, found))
-    # One episode alone has no interval.
-    found, both = bootstrap(np.array([[1.0, 1.0], [np.nan, 1.0]]), "key", 100)
-    assert found.value == 1.0 and math.isnan(found.low) and math.isnan(found.high)
-    assert both == (1.0, 1.0, 1.0)

@@ -14,19 +14,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.retrieval import remade, sessions_of
+from support.retrieval import remade
 from support.splits import QUERIES
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.viz.filmstrip import (
-    COLORS,
-    LESSON_COLOR,
     Block,
     arrange,
     draw_strip,
-    session_colors,
 )
 
 pytest.importorskip("matplotlib")
@@ -103,19 +100,6 @@ def test_every_session_has_a_place_of_its_own(frames: list[int]) -> None:
     assert places == sorted(set(places))
     assert {row for row, _ in places} == set(range(blocks[-1].row + 1))
     assert max(slot for _, slot in places) < slots
-
-
-def colors_of(families: str, lessons: Sequence[int]) -> list[str]:
-    names = [f"{family}/train/0" for family in families]
-    return session_colors(sessions_of(names, [(n, n + 1) for n in range(len(names))], lessons))
-
-
-def test_colors_by_family_in_order_of_appearance() -> None:
-    assert colors_of("MIRI", [0]) == [LESSON_COLOR, COLORS[0], COLORS[1], COLORS[0]]
-    assert colors_of("IMRM", [1, 3]) == [COLORS[0], LESSON_COLOR, COLORS[1], LESSON_COLOR]
-    assert colors_of("MM", []) == [COLORS[0]] * 2
-    colors = colors_of("ABCDEFGHIJ", [0])
-    assert len(set(colors[:9])) == 9 and colors[9] == colors[1]  # a tenth starts over
 
 
 # --- pictures ----------------------------------------------------------------------------------

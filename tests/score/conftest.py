@@ -7,13 +7,6 @@ from support import full_grid
 from support import scoring as made
 
 from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.schema.conditions import KINDS, Kind
-
-
-@pytest.fixture
-def filler(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kind of conditions, `filler-k<n>`, of which scoring knows nothing."""
-    monkeypatch.setitem(KINDS, "filler", Kind("filler", KINDS["k"].rule))
 
 
 @pytest.fixture(scope="session")

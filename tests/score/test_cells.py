@@ -107,23 +107,3 @@ def test_the_benchmarks_grid_is_nine_families_of_fifty_episodes(tmp_path: Path) 
     assert (lacking["n"], lacking["other_episodes"]) == (51, "test 50")
     few = made.score(made.released(tmp_path / "c.csv", lines[:12]), grid=Grid.BENCHMARK)
     assert record(few, "main", condition="k0")["missing"] == 450 - 12
-
-
-def test_a_condition_of_another_kind_is_a_cell_and_no_contrast(
-    tmp_path: Path, filler: None
-) -> None:
-    given = {
-        (made.OWN, NO_HISTORY): "ffff",
-        (made.OWN, "filler-k3"): "sfff",
-        (made.OWN, "k7"): "ssff",
-        (made.OWN, "k0"): "ssss",
-    }
-    found = made.score(made.write_csv(tmp_path / "a.csv", made.cells(given)))
-    rates = [(r["condition"], r["rate"]) for r in made.records(found, "main")]
-    assert rates == [(NO_HISTORY, 0), ("k0", 1), ("k7", 0.5), ("filler-k3", 0.25)]
-    assert record(found, "decay")["conditions"] == "k0 k7"
-    assert [r["condition"] for r in made.records(found, "lift")] == ["k0", "k7"]
-    assert [r["condition"] for r in made.records(found, "effects")] == ["k7"]
-    # Alone it is a score, too.
-    alone = made.write_csv(tmp_path / "b.csv", made.cells({(made.OWN, "filler-k3"): "sf"}))
-    assert made.score(alone, grid=Grid.BENCHMARK).tables["lift"].rows == ()

@@ -20,7 +20,6 @@ from robomme_interference_data.errors import (
     InvalidIdError,
     InvalidOptionError,
     MissingExtraError,
-    UnknownNameError,
 )
 from robomme_interference_data.evaluate.score.plots import figures
 from robomme_interference_data.evaluate.score.rows.export import RELEASED_COLUMNS, export
@@ -113,23 +112,6 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     done = run("compare", path, again(path), "--lenient", "--json")
     assert json.loads(done.stdout)["bad_rows"] == [1, 1]
     assert done.stderr.count("family 'MoveCub'") == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "error"),
-    [("ret rieval", InvalidIdError), ("pi05-baseline", UnknownNameError), ("", InvalidIdError)],
-)
-def test_a_name_that_is_none_is_a_bad_option_not_bad_rows(
-    tmp_path: Path, name: str, error: type[Exception]
-) -> None:
-    path = made.write_csv(tmp_path / "a.csv", made.rows())
-    for given in (
-        ("score", path, "--system", name, "--out", tmp_path / "out", "--lenient"),
-        ("compare", path, again(path), "--system-b", name),
-    ):
-        done = run(*given)
-        assert isinstance(done.exception, error) and repr(name) in str(done.exception)
-    assert files(tmp_path) == {"a.csv", "again-a.csv"}
 
 
 # --- the folder of a score ---------------------------------------------------------------------

@@ -25,17 +25,6 @@ def told(tmp_path: Path, outcomes: dict[tuple[str, str], str], grid: Grid = Grid
 # --- headlines ---------------------------------------------------------------------------------
 
 
-def test_the_headline_of_made_up_rows(tmp_path: Path) -> None:
-    text = headline(made.score(made.write_csv(tmp_path / "a.csv", made.rows())), "tabletop")
-    assert text.startswith("FrameSamp-Modul succeeds in 58.3% of 12 episodes when the history")
-    # Both have 7 of 12 at k0. Of 5 + 4 + 5 expected cells, retrieval lacks k1 and k3, and the
-    # own memory k1, k3 and k7, and part of k0.
-    assert text.endswith(
-        "Under k0, Retrieval-FrameSamp-Modul has the same rate. The highest rate at k7 is 58.3%, "
-        "of Retrieval-FrameSamp-Modul. 8 of 14 cells are complete."
-    )
-
-
 HEADLINES = {
     "a lucky episode does not lead": (
         {("lucky", "k0"): "s----", ("a-memory", "k0"): "sssff", ("a-memory", "k7"): "sffff"},
@@ -101,13 +90,6 @@ def test_headlines(
 ) -> None:
     text = told(tmp_path, outcomes)
     assert text.startswith(ends[0]) and text.endswith(ends[1])
-
-
-def test_the_benchmark_names_what_it_misses(tmp_path: Path) -> None:
-    assert told(tmp_path, {("one", "k0"): "sss--"}, Grid.BENCHMARK) == (
-        "No cell is complete, so no system leads. Nearest to it is one under k0: 447 of 450 "
-        "episodes are missing. 0 of 5 cells are complete."
-    )
 
 
 # --- the paper ---------------------------------------------------------------------------------

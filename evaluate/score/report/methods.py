@@ -21,9 +21,6 @@ def methods(score: Score) -> tuple[str, str]:
     """Return the paragraph as Markdown, citing as Pandoc reads it, and what it cites as BibTeX.
 
     It tells nothing that the score does not hold: a method that no table needed is not named.
-
-    Raises:
-        MissingExtraError: jinja2 is not installed.
     """
     intervals = {
         record["interval"]

@@ -59,9 +59,6 @@ def write_report(
         figures: Names and SVG files, as `draw_figures` returns them.
         out: The HTML file.
         command: The command line that made the score; None shows the call of `score`.
-
-    Raises:
-        MissingExtraError: jinja2 is not installed.
     """
     names = {name for one in score.outcomes.values() for name in one.conditions}
     conditions = [one.name for one in in_order(names)]

@@ -35,10 +35,6 @@ def export(rows: Rows, folder: Path) -> list[Path]:
 
     Returns:
         The files.
-
-    Raises:
-        InvalidOptionError: The layout cannot tell the rows apart: there are repeats with several
-            model seeds, or episodes that are not `test`. Or bad rows were left out.
     """
     seeds = len(rows.names("model_seed"))
     other = sum(row.episode_split != "test" for row in rows)

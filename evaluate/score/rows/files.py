@@ -77,10 +77,6 @@ def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
         path: The file: `.jsonl`, `.parquet` or `.csv`.
         names: Names of the columns.
         has_system: Whether the system of rows that name none is known.
-
-    Raises:
-        FormatError: The file cannot be read, lacks columns, or has one that reads like another,
-            two of one name, or one of nested values.
     """
     readers = {".parquet": _read_parquet, ".csv": _read_csv, ".jsonl": _read_record}
     reader = readers.get(path.suffix.lower())

@@ -68,11 +68,7 @@ _TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false"
 
 
 def parse(name: str, value: Any) -> Any:
-    """Return a value of a column as rows have it.
-
-    Raises:
-        InterferenceError, ValueError: It is none; the latter says what was expected.
-    """
+    """Return a value of a column as rows have it."""
     text = "" if value is None or value != value else str(value)  # noqa: PLR0124 - NaN
     if name in _OPTIONAL and text.lower() in ("", "nan", "none"):
         return None
