@@ -63,18 +63,10 @@ def test_put_replaces_and_another_shape_or_type_counts_as_absent(tmp_path: Path)
     "damage",
     [
         lambda data: b"",
-        lambda data: data[:4],
         lambda data: data[:60],
-        lambda data: data[:128],
         lambda data: data[:-1],
-        lambda data: b"garbage" * 100,
         lambda data: b"PK\x03\x04" + data,  # looks like an .npz
-        lambda data: b"\x80\x04K\x01." + data,  # looks like a pickle
-        lambda data: data[:6] + b"\x09" + data[7:],  # an unknown version
-        lambda data: data.replace(b"shape", b"shapf"),
         lambda data: data.replace(b"(4, 8", b"(((("),
-        lambda data: data[:60] + b"\xff" * 20 + data[80:],
-        lambda data: data.replace(b"|u1", b"|O "),
     ],
 )
 def test_damaged_files_count_as_absent(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:

@@ -168,9 +168,18 @@ def test_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ['{"a": NaN}', '{"a": -Infinity}', '{"a": 1e999}', '{"a": ' + "9" * 5000 + "}", "\xff"]
+    "text",
+    [
+        '{"a": 1, "b": 2, "a": 1}',
+        '{"a": [{"b": 1, "b": 2}]}',
+        '{"a": NaN}',
+        '{"a": -Infinity}',
+        '{"a": 1e999}',
+        '{"a": ' + "9" * 5000 + "}",
+        "\xff",
+    ],
 )
-def test_json_holds_finite_numbers_alone(text: str) -> None:
+def test_json_holds_finite_numbers_and_each_key_once(text: str) -> None:
     with pytest.raises(FormatError, match="here: not JSON"):
         parse_json(text.encode("latin-1"), "here")
 

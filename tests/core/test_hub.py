@@ -36,18 +36,13 @@ FILES |= {"README.md": b"read me", "meta/deep/a.parquet": b"a"}
 # --- where a location leads ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["lerobot/robomme", "a/b", "A-1/b.c_d"])
-def test_repositories(text: str) -> None:
-    found = locate(text + "@v1.0")
-    assert isinstance(found, HubFiles)
-    assert (found.repo_id, found.revision, found.repo_type) == (text, "v1.0", "dataset")
-
-
 @pytest.mark.parametrize("text", ["robomme", "a/b/c", "/a/b", "~/a", "a/", "a b/c", "a/b@", "@v1"])
 def test_what_is_none(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
         locate(text, "model")
+    found = locate("A-1/b.c_d@v1.0")
+    assert isinstance(found, HubFiles) and (found.repo_id, found.revision) == ("A-1/b.c_d", "v1.0")
     (tmp_path / REPO).mkdir(parents=True)
     assert isinstance(locate(REPO), LocalFiles)  # a folder goes before a repository
 
@@ -248,9 +243,7 @@ def test_no_address_of_a_hub(monkeypatch: pytest.MonkeyPatch, run: Run, given: s
     assert repr(given) in err and "unset HF_ENDPOINT" in err
 
 
-@pytest.mark.parametrize(
-    "given", ["https://huggingface.co/", "http://127.0.0.1:8080", "http://[::1]:80/hub"]
-)
+@pytest.mark.parametrize("given", ["https://huggingface.co/", "http://[::1]:80/hub"])
 def test_addresses_of_a_hub(monkeypatch: pytest.MonkeyPatch, given: str) -> None:
     monkeypatch.setenv("HF_ENDPOINT", given)
     assert HubFiles(REPO).repo_id == REPO
@@ -291,15 +284,6 @@ def test_a_source_fetches_what_it_needs_and_opens_offline_again(
     assert len(list(source.read(source.episodes()[1], ("front",)).frames)) == 7
     with pytest.raises(HubError, match="of the dataset repository .* is not in the cache"):
         list(source.read(source.episodes()[1], ("wrist",)).frames)
-
-
-def test_a_source_at_a_revision(hub: HubServer, tmp_path: Path) -> None:
-    old = hub.push(DATASET, write_lerobot(tmp_path / "made"))
-    hub.push(DATASET, FILES)
-    source = open_source(f"lerobot:{REPO}@{old}")
-    assert (len(source.episodes()), source.provenance["revision"]) == (3, old)
-    with pytest.raises(MissingFileError, match="is no LeRobot dataset"):
-        open_source(f"lerobot:{REPO}").episodes()
 
 
 def test_the_known_repositories_are_of_robomme(hub: HubServer, tmp_path: Path) -> None:

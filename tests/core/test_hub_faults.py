@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 from huggingface_hub import constants
 from support.hub import BASE, SPLIT, push_split, running_hub
 from support.hub_server import HubServer, User
-from support.machine import DAY, WRONG, full_disk, set_clocks
+from support.machine import full_disk
 from support.splits import GOLDEN
 
 from robomme_interference_data import Buffer, load_buffer, load_split
@@ -71,25 +70,6 @@ def test_what_does_not_come_whole(hub: HubServer, path: str, what: dict[str, Any
     assert whole()
 
 
-@pytest.mark.parametrize("status", [429, 503])
-def test_a_busy_hub_is_asked_again(hub: HubServer, status: int) -> None:
-    hub.fault("GET", VIDEO, status=status, headers={"Retry-After": "0"})
-    hub.fault("HEAD", VIDEO, status=status, headers={"Retry-After": "0"})
-    try:
-        assert whole()
-    except HubError as error:  # where the client gives up at once, the same call goes on
-        assert error.hint
-        assert whole()
-
-
-def test_a_hub_that_is_down(hub: HubServer) -> None:
-    hub.down = True
-    with pytest.raises(HubError, match="cannot be reached|503"):
-        load()
-    hub.down = False
-    assert whole()
-
-
 def test_who_may_not_see_it(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
     repository = hub.repositories[f"datasets/{SPLIT}"]
     repository.private = True
@@ -103,14 +83,6 @@ def test_who_may_not_see_it(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> 
     hub.tokens["good"] = User("someone")
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_IMPLICIT_TOKEN", False)
     monkeypatch.setenv("HF_TOKEN", "good")
-    assert whole()
-
-
-def test_a_renamed_repository_is_found(hub: HubServer) -> None:
-    repository = hub.repositories.pop(f"datasets/{SPLIT}")
-    repository.name = "datasets/someone/new"
-    hub.repositories[repository.name] = repository
-    hub.renamed[f"datasets/{SPLIT}"] = "datasets/someone/new"
     assert whole()
 
 
@@ -173,23 +145,6 @@ def test_a_cache_that_can_only_be_read(hub: HubServer, tmp_path: Path, revision:
     again = load_buffer(QUERY, "k3", split=SPLIT, revision=revision, verify=True)
     assert np.array_equal(again.frames(), loaded)
     assert len(hub.downloads()) == before
-
-
-@pytest.mark.parametrize("clocks", WRONG)
-def test_a_wrong_clock(hub: HubServer, monkeypatch: pytest.MonkeyPatch, clocks: str) -> None:
-    set_clocks(hub, monkeypatch, *WRONG[clocks])
-    assert whole()
-
-
-@pytest.mark.parametrize("seconds", [-DAY, DAY])
-def test_a_cache_of_another_day(hub: HubServer, tmp_path: Path, seconds: float) -> None:
-    load()
-    moment = time.time() + seconds
-    for path in (tmp_path / "cache").rglob("*"):
-        os.utime(path, (moment, moment))
-    before = len(hub.requests)
-    assert whole()
-    assert len(hub.requests) == before
 
 
 def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> None:
