@@ -86,7 +86,7 @@ def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
                 wanted |= {*_paths(dataset, episodes[name], cameras, config.index, sizes)}
         if lacking := sorted(wanted - sizes.keys()):
             more = f" and {len(lacking) - 1} more files" if len(lacking) > 1 else ""
-            hint = "Without --index, the frames can be fetched." if config.index else None
+            hint = "Without the index, the frames can be fetched." if config.index else None
             raise MissingFileError(f"{files.describe()} lacks {lacking[0]}{more}", hint)
         chosen = {path: sizes[path] for path in sorted(wanted)}
         parts.append(Part(files, folder, chosen, tuple(files.missing(chosen))))
@@ -131,7 +131,7 @@ def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
     if not any(found.values()):
         raise InvalidOptionError(
             f"no buffer of {split.location} is of episodes {config.episodes}",
-            f"Its buffers: robomme-interference list {split.location}",
+            command=f"list {split.location}",
         )
     return found
 

@@ -119,7 +119,7 @@ class VideoEncoder:
             raise BuildError(
                 f"{path.stem}: frames of {width}×{height} pixels are too small for {codec.name}, "
                 f"which takes {codec.min_side}×{codec.min_side} and more",
-                "Use --codec av1-lossless.",
+                "Use the codec 'av1-lossless'.",
             )
         self._path = path
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise

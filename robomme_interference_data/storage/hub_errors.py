@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlsplit
 
 from robomme_interference_data.errors import HubError, InvalidOptionError, MissingFileError
 
@@ -14,6 +13,7 @@ from .files import with_filename
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _BUSY = (429, 503)
 _PUBLIC = "https://huggingface.co"
+_ENDPOINT = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:.]+\])(:[1-9]\d{0,4})?(/\S*)?")
 
 _LOGIN = (
     "the Hub at {endpoint} does not know this login",
@@ -56,12 +56,7 @@ fits counts."""
 def check_endpoint() -> None:
     """Check that `HF_ENDPOINT` is an address: some others break the client's import."""
     given = os.environ.get("HF_ENDPOINT", _PUBLIC)
-    try:
-        url = urlsplit(given)
-        valid = url.scheme in ("http", "https") and url.hostname and url.port != 0
-    except ValueError:
-        valid = False
-    if not valid or any(map(str.isspace, given)):
+    if not _ENDPOINT.fullmatch(given):
         expected, hint = f"an address such as {_PUBLIC}", "For that one, type: unset HF_ENDPOINT"
         raise InvalidOptionError.expected("HF_ENDPOINT", given, expected, hint)
 
@@ -142,24 +137,19 @@ class HubCall:
         what = f"{self.path} of the {repository}" if self.path else f"the {repository}"
         if self.revision:
             what += " is not in the cache, and"
-        seconds = _seconds(error)
-        again = self.again[0].upper() + self.again[1:]
+        seconds, hint = _seconds(error), f"{self.again[0].upper()}{self.again[1:]}"
         if constants.HF_HUB_OFFLINE:
             why = "cannot be reached: HF_HUB_OFFLINE is set"
-            again = f"With a network, type: {self._download}"
+            file = f"{self.repo_id} --revision {self.revision} {self.path or ''}".rstrip()
+            hint = "With a network, unset HF_HUB_OFFLINE"
+            if self.revision:
+                hint += f", or: HF_HUB_OFFLINE=0 hf download --repo-type {self.repo_type} {file}"
         elif seconds is not None:
             why = f"cannot be had: the Hub is busy ({_status(error)})"
-            again += f" in {max(seconds / 60, 1):.0f} minutes or more."
+            hint += f" in {max(seconds / 60, 1):.0f} minutes or more."
         else:
-            why, again = f"cannot be had: {' '.join(str(error).split())}", f"{again}."
-        return HubError(f"{what} {why}", self._folder + again)
-
-    @property
-    def _download(self) -> str:
-        if self.revision is None:
-            return "HF_HUB_OFFLINE=0 and the same command"
-        what = f"{self.repo_id} --revision {self.revision} {self.path or ''}".rstrip()
-        return f"HF_HUB_OFFLINE=0 hf download --repo-type {self.repo_type} {what}"
+            why, hint = f"cannot be had: {' '.join(str(error).split())}", f"{hint}."
+        return HubError(f"{what} {why}", self._folder + hint)
 
     @property
     def _folder(self) -> str:
