@@ -1,11 +1,13 @@
 """Simulators of the benchmark's task families.
 
-from . import make_simulator
+```python
+from robomme_interference_data.simulators import make_simulator
 
 simulator = make_simulator("tabletop")
 lesson, first, info = simulator.reset("MoveCube/test/3")
 observation, status = simulator.step(action)
 simulator.close()
+```
 """
 
 from typing import TYPE_CHECKING

@@ -1,8 +1,8 @@
 """The command `simulate`."""
 
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -11,15 +11,8 @@ from robomme_interference_data.cli.options import AsJson
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
 POLICIES = ("oracle", "guess", "none")
 """Built-in policies; `none` plays the demonstration only, which is all that some can do."""
-
-LESSON, LIVE = (40, 90, 200), (230, 130, 20)
-"""Colours of the bar above the pictures."""
 
 
 def simulate(
@@ -54,12 +47,9 @@ def simulate(
     robomme-interference simulate --simulator robomme --robomme-python PATH --family MoveCube
     ```
     """
-    from robomme_interference_data.constants import FPS
     from robomme_interference_data.ids import EpisodeId
-    from robomme_interference_data.schema.rollouts import Status
-    from robomme_interference_data.storage.encode import CLIP, VideoEncoder
-    from robomme_interference_data.storage.files import atomic_path
 
+    from .play import play
     from .registry import check_shift, make_simulator, simulator_class
 
     check_shift(simulator, shift)
@@ -76,39 +66,19 @@ def simulate(
     if video is None:
         settings["cameras"] = ()
     options = {one: settings[one] for one in able.settings if one in settings}
-    clip: VideoEncoder | None = None
-    with ExitStack() as stack:
-        # First: minutes are spent on what is to be in it.
-        path = None if video is None else stack.enter_context(atomic_path(video))
-        running = stack.enter_context(closing(make_simulator(simulator, **options)))
-        lesson, seen, info = running.reset(str(name))
-        if path is not None:
-            first = _picture(seen.images, LIVE)
-            height, width, _ = first.shape
-            clip = VideoEncoder(path, CLIP, FPS, height, width, container="mp4")
-            for index in range(len(lesson)):
-                images = {camera: frames[index] for camera, frames in lesson.images.items()}
-                clip.add(_picture(images, LESSON))
-            clip.add(first)
-        steps, status = 0, Status.ONGOING
-        while status is Status.ONGOING and policy != "none":
-            seen, status = running.step(running.act(policy))
-            steps += 1
-            if clip is not None:
-                clip.add(_picture(seen.images, LIVE))
-        if clip is not None:
-            clip.close()
+    with closing(make_simulator(simulator, **options)) as running:
+        played = play(running, name, policy, video)
     result: dict[str, Any] = {
         "episode": str(name),
-        "simulator": info.simulator,
-        "goal": info.goal,
-        "difficulty": info.difficulty,
-        "seed": info.seed,
+        "simulator": played.info.simulator,
+        "goal": played.info.goal,
+        "difficulty": played.info.difficulty,
+        "seed": played.info.seed,
         "shift": shift,
         "policy": policy,
-        "status": str(status),
-        "lesson_frames": len(lesson),
-        "steps": steps,
+        "status": str(played.status),
+        "lesson_frames": played.lesson_frames,
+        "steps": played.steps,
     }
     if video is not None:
         result["video"] = str(video)
@@ -117,13 +87,3 @@ def simulate(
         return
     for key, value in result.items():
         echo(f"{key.replace('_', ' ')}: {value}")
-
-
-def _picture(
-    images: "dict[str, NDArray[np.uint8]]", colour: tuple[int, int, int]
-) -> "NDArray[np.uint8]":
-    """Return the cameras side by side, under a bar of a colour."""
-    import numpy as np
-
-    views = np.concatenate(list(images.values()), axis=1)
-    return np.concatenate([np.full((16, views.shape[1], 3), colour, np.uint8), views])
