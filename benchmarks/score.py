@@ -1,14 +1,12 @@
 """How fast rows are scored, against pandas computing the same tables.
 
-    python benchmarks/score.py               # the full grid, then a million rows; minutes
-    python benchmarks/score.py --repeats 20  # fewer repeats in the second part
-    python benchmarks/score.py --command     # the command alone, figures and report included
+    python benchmarks/score.py            # the full grid; minutes
+    python benchmarks/score.py --command  # the command alone, figures and report included
 
 Each way reads the rows, checks them, and writes the same rates, intervals, exact tests and
 bootstrap intervals. With pandas the bootstrap is done twice: as one would write it down, a call of
 scipy.stats.bootstrap for each statistic, and by hand, all statistics of a system from one set of
-draws. The second part takes the latter, the faster one. pandas is no dependency of the package:
-install it for this.
+draws. pandas is no dependency of the package: install it for this.
 """
 
 import argparse
@@ -19,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from operator import mul
@@ -30,7 +27,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from common import in_fresh_process, interleave, machine, megabytes, peak_memory, positive, table
+from common import interleave, machine, positive, table
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.score.config import Settings
@@ -45,21 +42,10 @@ SYSTEMS = 11
 EPISODES = len(FAMILIES) * 50
 
 
-@dataclass(frozen=True)
-class Run:
-    """Seconds of one scoring, and bytes of memory over what the process held before."""
-
-    seconds: float
-    memory: int
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rounds", type=positive, default=3, help="repetitions of the full grid")
-    parser.add_argument(
-        "--repeats", type=positive, default=40, help="repeats of the grid in the second part"
-    )
     parser.add_argument("--draws", type=positive, default=10_000, help="of each bootstrap")
     parser.add_argument("--command", action="store_true", help="time the command alone")
     options = parser.parse_args()
@@ -70,7 +56,7 @@ def main() -> None:
     print(machine("pyarrow", "pandas", "numpy", "scipy"), end="\n\n")
     with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
         folder = Path(name)
-        rows = write_rows(folder / "grid.parquet", 1)
+        rows = write_rows(folder / "grid.parquet")
         calls = {w: partial(c, rows, folder / "out", options.draws) for w, c in WAYS.items()}
         times = interleave(calls, options.rounds)
         lines = [
@@ -83,31 +69,6 @@ def main() -> None:
                 f"{options.rounds} rounds.",
                 [">rows", "<way", ">s", ">× score"],
                 lines,
-            ),
-            end="\n\n",
-        )
-        rows = write_rows(folder / "many.parquet", options.repeats)
-        runs = {
-            way: in_fresh_process(measure, way, rows, folder / "out", options.draws)
-            for way in WAYS
-            if way != SCIPY
-        }
-        lines = [
-            [
-                f"{grid() * options.repeats:,}",
-                way,
-                f"{run.seconds:.1f}",
-                f"{run.seconds / runs['score'].seconds:.1f}",
-                megabytes(run.memory),
-                f"{run.memory / runs['score'].memory:.1f}",
-            ]
-            for way, run in runs.items()
-        ]
-        print(
-            table(
-                f"{options.repeats} repeats of it, each way once in a process of its own.",
-                [">rows", "<way", ">s", ">× score", ">peak MB", ">× score"],
-                lines,
             )
         )
 
@@ -117,7 +78,7 @@ def time_command(rounds: int) -> None:
     print(machine("pyarrow", "numpy", "matplotlib"), end="\n\n")
     seconds, busy = [], []
     with tempfile.TemporaryDirectory(prefix="interference-score-") as name:
-        rows = write_rows(Path(name) / "grid.parquet", 1)
+        rows = write_rows(Path(name) / "grid.parquet")
         program = Path(sys.executable).with_name("robomme-interference")
         for _ in range(rounds):
             before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -135,22 +96,13 @@ def time_command(rounds: int) -> None:
     print(table(title, [">rows", ">s", ">processor s"], [line]))
 
 
-def measure(way: str, rows: Path, out: Path, draws: int) -> Run:
-    """Score once, libraries loaded beforehand, and say what it took."""
-    WAYS[way](rows.with_name("grid.parquet"), out, draws)
-    before = peak_memory()
-    began = time.perf_counter()
-    WAYS[way](rows, out, draws)
-    return Run(time.perf_counter() - began, peak_memory() - before)
-
-
 def grid() -> int:
     """Return the rows of the full grid: each system under five conditions, π0.5 under one."""
     return (SYSTEMS * len(CONDITIONS) + 1) * EPISODES
 
 
-def write_rows(path: Path, repeats: int) -> Path:
-    """Write made-up rows of the grid, in the columns of a run, a row group per repeat or more."""
+def write_rows(path: Path) -> Path:
+    """Write made-up rows of the grid, in the columns of a run."""
     numbers = np.random.default_rng(0)
     skill = numbers.random((SYSTEMS, len(CONDITIONS))) * 0.4 + 0.1
     skill[:, 0] = 0  # without history
@@ -176,30 +128,26 @@ def write_rows(path: Path, repeats: int) -> Path:
     fixed = {"protocol_version": 1, "steps": 200, "history_frames": 300, "lesson_frames": 100}
     fixed |= {"lesson_share": 0.5, "attempt": 1}
     schema = arrow_schema(Rollout)
-    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
-        for repeat in range(repeats):
-            won = numbers.random(grid()) < chance
-            columns: dict[str, Any] = {
-                name: pa.DictionaryArray.from_arrays(
-                    pa.array(codes.astype(np.int32)), pa.array(values)
-                ).cast(pa.string())
-                for name, (values, codes) in texts.items()
-            }
-            columns |= {name: np.full(grid(), value) for name, value in fixed.items()}
-            columns |= {
-                "episode": episode,
-                "model_seed": np.full(grid(), repeat),
-                "seed": family * 50 + episode,
-                "status": pa.array(np.where(won, "success", "fail")),
-                "success": won,
-            }
-            arrays = [
-                pa.array(columns[f.name]).cast(f.type)
-                if f.name in columns
-                else pa.nulls(grid(), f.type)
-                for f in schema
-            ]
-            writer.write_table(pa.table(arrays, schema=schema))
+    won = numbers.random(grid()) < chance
+    columns: dict[str, Any] = {
+        name: pa.DictionaryArray.from_arrays(
+            pa.array(codes.astype(np.int32)), pa.array(values)
+        ).cast(pa.string())
+        for name, (values, codes) in texts.items()
+    }
+    columns |= {name: np.full(grid(), value) for name, value in fixed.items()}
+    columns |= {
+        "episode": episode,
+        "model_seed": same,
+        "seed": family * 50 + episode,
+        "status": pa.array(np.where(won, "success", "fail")),
+        "success": won,
+    }
+    arrays = [
+        pa.array(columns[f.name]).cast(f.type) if f.name in columns else pa.nulls(grid(), f.type)
+        for f in schema
+    ]
+    pq.write_table(pa.table(arrays, schema=schema), path, compression="zstd")
     return path
 
 

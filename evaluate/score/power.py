@@ -92,7 +92,7 @@ def power(margin: float, episodes: int, flips: float) -> float:
     low = max(0, int(episodes * both - reach))
     d = np.arange(low, min(episodes, int(episodes * both + reach)) + 1)
     logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, episodes + 1)))])
-    x = np.arange(d[-1] + 1)
+    x = np.arange(d[-1] // 2 + 1)  # of the smaller tail
     rest = d[:, None] - x
     ways = np.where(rest >= 0, logs[d][:, None] - logs[x] - logs[np.maximum(rest, 0)], -np.inf)
     fair = np.exp(ways - d[:, None] * math.log(2))

@@ -23,7 +23,7 @@ SMALLEST: dict[str, tuple[object, ...]] = {
     "policies": ("--lesson", 10, *SPLIT, "--episode", "MoveCube/test/0"),
     "retrieval": ("--help",),  # needs weights
     "robomme": ("--families", "MoveCube", "--steps", 20),
-    "score": ("--repeats", 2, "--draws", 50),
+    "score": ("--draws", 50),
     "simulators": ("--help",),  # needs a renderer
 }
 

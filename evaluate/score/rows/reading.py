@@ -11,7 +11,7 @@ from typing import Any
 from robomme_interference_data.errors import BadRowsError, InterferenceError, InvalidOptionError
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
-from robomme_interference_data.schema.rollouts import Status
+from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
 from .files import Part, find_sources, read_file, system_of
@@ -19,6 +19,7 @@ from .values import DEFAULTS, Row, parse, shifted
 
 _SHOWN = 10  # so many bad rows are named; the others are counted
 
+_SUCCESS = {str(one): one == Status.SUCCESS for one in FINAL} | {str(Status.ERROR): None}
 _EPISODE = ("simulator", "family", "episode_split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
 
@@ -108,10 +109,6 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     return Rows(rows, sources, revisions, unpinned, retrieval, shown, len(refusals))
 
 
-class _Bad(str):
-    """Why a value is none."""
-
-
 class _Checks:
     """All rows, and the reason against each bad one, by number of the file and line in it.
 
@@ -135,22 +132,26 @@ class _Checks:
         """
         number, count = len(self._paths), len(part.lines)
         self._paths.append(path)
-        self._reasons |= {(number, line): reason for line, reason in part.malformed.items()}
         default = {**dict.fromkeys(Row._fields), **DEFAULTS, "system": system}
-        columns = [
-            _parsed(name, part.columns[name], run)
-            if name in part.columns
-            else [default[name]] * count
-            for name in Row._fields
-        ]
-        for line, row in zip(part.lines, map(Row._make, zip(*columns, strict=True)), strict=True):
-            if reason := _wrong(row):
-                self._reasons[number, line] = reason
+        columns, wrong = list[Sequence[Any]](), dict[int, str]()
+        for name in Row._fields:
+            if name in part.columns:
+                columns.append(_parsed(name, part.columns[name], run, wrong))
+            else:
+                columns.append([default[name]] * count)
+        rows = map(Row._make, zip(*columns, strict=True))
+        for place, (line, row) in enumerate(zip(part.lines, rows, strict=True)):
+            if place not in wrong and row.success is not _SUCCESS[row.status]:
+                shown = "(empty)" if row.success is None else row.success
+                wrong[place] = f"success {shown} contradicts status {row.status!r}"
+            if place in wrong:
+                self._reasons[number, line] = wrong[place]
             elif row.shift == NO_SHIFT:
                 self.sound[number, line] = row
             else:
                 simulator = shifted(row.simulator, row.shift)
                 self.sound[number, line] = row._replace(simulator=simulator)
+        self._reasons |= {(number, line): reason for line, reason in part.malformed.items()}
 
     def check_together(self) -> None:
         """Check rows against others."""
@@ -202,28 +203,26 @@ class _Checks:
                 self._refuse(number, f"the same rollout as {self._place(first)}{more}")
 
 
-def _parsed(name: str, values: Sequence[Any], run: Path | None) -> list[Any]:
-    """Return the values of a column as rows have them; `_Bad` for what is none."""
-    known: dict[Any, Any] = {}
+def _parsed(name: str, values: Sequence[Any], run: Path | None, wrong: dict[int, str]) -> list[Any]:
+    """Return the values of a column as rows have them.
+
+    Args:
+        name: The column.
+        values: What the file has.
+        run: The folder that videos are relative to, if it is known.
+        wrong: Place of a row to the first reason against it, which are added.
+    """
+    known, reasons = dict[Any, Any](), dict[Any, str]()
     for value in set(values):  # of one type, and most occur in many rows
         try:
             found = parse(name, value)
             known[value] = run and run / found if name == "video" and found else found
         except InterferenceError as error:
-            known[value] = _Bad(f"{error.message}. {error.hint or ''}".strip())
+            reasons[value] = f"{error.message}. {error.hint or ''}".strip()
         except ValueError as error:
             shown = "(empty)" if value in (None, "") else repr(value)
-            known[value] = _Bad(f"{name} {shown}; expected {error}")
-    return [known[value] for value in values]
-
-
-def _wrong(row: Row) -> str:
-    """Return what is wrong with a row by itself; nothing if it is sound."""
-    for value in row:
-        if type(value) is _Bad:
-            return value
-    expected = None if row.status == Status.ERROR else row.status == Status.SUCCESS
-    if row.success is expected:
-        return ""
-    shown = "(empty)" if row.success is None else row.success
-    return f"success {shown} contradicts status {row.status!r}"
+            reasons[value] = f"{name} {shown}; expected {error}"
+    for place, value in enumerate(values if reasons else ()):
+        if value in reasons:
+            wrong.setdefault(place, reasons[value])
+    return [*map(known.get, values)]
