@@ -20,7 +20,7 @@ from common import Times, interleave, machine, positive, table
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.cut import cut_demonstration
+from robomme_interference_data.build_dataset.frame_selection import select_demonstration
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import load_lerobot, require_lerobot
 from robomme_interference_data.build_dataset.sources import (
@@ -177,7 +177,7 @@ def row(times: Times, count: int, way: str, text: str, cores: int, aim: str) -> 
 def read(source: Source, episode: SourceEpisode) -> tuple[Recording, list[Frame]]:
     """Read the demonstration of an episode into memory."""
     recording = source.read(episode, None)
-    return recording, list(cut_demonstration(recording.frames))
+    return recording, list(select_demonstration(recording.frames))
 
 
 def path_of(folder: Path, episode: SourceEpisode, camera: str) -> Path:

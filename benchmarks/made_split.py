@@ -17,8 +17,11 @@ from numpy.typing import NDArray
 from robomme_interference_data.build_dataset.identity import complete_dataset, identity_of
 from robomme_interference_data.build_dataset.image_stats import STATISTICS
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode, write_lerobot
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,

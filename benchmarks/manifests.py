@@ -20,8 +20,12 @@ import pyarrow.parquet as pq
 from common import in_fresh_process, machine, megabytes, peak_memory, positive, table
 from support.made_up import write_metadata
 
-from robomme_interference_data.build_dataset.manifests import planned_buffers, write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    planned_buffers,
+    write_manifests,
+)
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,

@@ -25,8 +25,11 @@ from common import Times, add_split, demo_split, interleave, machine, positive, 
 from manifests import write_dataset
 
 from robomme_interference_data import Dataset, load_split
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,

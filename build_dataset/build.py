@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from robomme_interference_data.constants import ACTION, IDENTITY_PATH
+from robomme_interference_data.constants import ACTION
 from robomme_interference_data.errors import (
     BuildError,
     InterferenceError,
@@ -29,7 +29,7 @@ from robomme_interference_data.storage.encode import get_codec
 from robomme_interference_data.storage.files import canonical_json, replace_folder, staging_dir
 
 from .config import BuildPlan
-from .earlier import Earlier, read_earlier
+from .existing import ExistingDataset, open_existing
 from .identity import complete_dataset, identity_of
 from .lerobot_writer import (
     StoredEpisode,
@@ -45,8 +45,6 @@ from .stage import (
     read_staged,
     staged_name,
 )
-
-_ADVICE = "Choose another --out, or remove the folder first."
 
 
 @dataclass(frozen=True)
@@ -78,13 +76,6 @@ def build_dataset(
         out: Folder of the dataset; made by the build.
         executor: Who stages the episodes.
         progress: Where to show how far the build is.
-
-    Raises:
-        SourceError: The recordings cannot be used, or yield nothing.
-        BuildError: `out` holds something else, another build of it is running, or episodes
-            failed (those that succeeded are kept for the next attempt).
-        InvalidOptionError: An option does not fit the sources.
-        MissingExtraError: lerobot is not installed.
     """
     require_lerobot()
     get_codec(plan.codec)
@@ -93,59 +84,20 @@ def build_dataset(
         str(out).encode()
     except UnicodeEncodeError:
         raise InvalidOptionError.expected(
-            "--out", str(out), "a path in UTF-8: LeRobot's writer can use no other"
+            "out", str(out), "a path in UTF-8: LeRobot's writer can use no other"
         ) from None
     with staging_dir(out) as work:
-        earlier = find_earlier(out, plan)
-        stored = list(earlier.episodes) if earlier else []
-        skipped = dict(earlier.skipped) if earlier else {}
+        existing = open_existing(out, plan)
+        stored = list(existing.episodes) if existing else []
+        skipped = dict(existing.skipped) if existing else {}
         known = {*skipped, *(str(one.record.episode_id) for one in stored)}
         todo = [task for task in plan.tasks if str(task[1].id) not in known]
         before = len(stored)
-        if todo or not earlier:
+        if todo or not existing:
             _stage(work, plan, todo, stored, skipped, executor, progress)
-            _write(work, out, plan, earlier, stored, skipped, progress)
+            _write(work, out, plan, existing, stored, skipped, progress)
     frames = sum(one.record.length for one in stored)
     return BuildResult(out, len(stored), frames, len(stored) - before, skipped)
-
-
-# --- what is there already ---------------------------------------------------------------------
-
-
-def find_earlier(out: Path, plan: BuildPlan) -> Earlier | None:
-    """Return the dataset that is there, built in the same way; None if nothing is.
-
-    Raises:
-        BuildError: Something else is there.
-        MissingFileError, FormatError: It is damaged.
-    """
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return None
-    if not (out / IDENTITY_PATH).is_file():
-        raise BuildError(f"{out} exists and is not a dataset of this package", _ADVICE)
-    earlier = read_earlier(out)
-    identity = earlier.dataset.identity
-    cameras = tuple(sorted(plan.cameras)) if plan.cameras is not None else identity.cameras
-    found = (identity.kind, identity.version, identity.codec, identity.cameras)
-    wanted = (plan.kind, plan.version, plan.codec, cameras)
-    if found != wanted:
-        raise BuildError(
-            f"{out} exists and was built otherwise: kind, version, codec and cameras are {found}, "
-            f"not {wanted}",
-            _ADVICE,
-        )
-    # Of a simulator, the same episode of another version is another one.
-    told = {one.get("kind"): one for one in identity.sources}
-    for source in plan.sources:
-        before = told.get(source.provenance["kind"], source.provenance)
-        if "suite_version" in before and before != source.provenance:
-            raise BuildError(
-                f"{out} exists and was built from {before}, not from {source.provenance}", _ADVICE
-            )
-    return earlier
-
-
-# --- stage and write ---------------------------------------------------------------------------
 
 
 def _stage(
@@ -203,8 +155,7 @@ def _check_alike(one: StoredEpisode, other: StoredEpisode) -> None:
         raise SourceError(
             f"{one.record.episode_id} and {other.record.episode_id} cannot be in one dataset: "
             f"their features are {one.features} and {other.features}",
-            "Choose cameras that all have with --cameras, build the sources apart, or choose "
-            "another --out.",
+            "Choose `cameras` that all have, build the sources apart, or choose another `out`.",
         )
 
 
@@ -220,7 +171,7 @@ def _failure(failures: Sequence[Outcome], total: int) -> InterferenceError:
     more = f"\n  … and {len(failures) - 10} more" if len(failures) > 10 else ""
     return BuildError(
         f"{len(failures)} of {total} episodes failed:\n" + "\n".join(lines) + more,
-        "The others are kept. Mend these or leave them out (--families, --episodes), then run the "
+        "The others are kept. Mend these or leave them out (`families`, `episodes`), then run the "
         "same command again.",
     )
 
@@ -229,7 +180,7 @@ def _write(
     work: Path,
     out: Path,
     plan: BuildPlan,
-    earlier: Earlier | None,
+    existing: ExistingDataset | None,
     stored: Sequence[StoredEpisode],
     skipped: dict[str, str],
     progress: WorkProgress,
@@ -239,7 +190,7 @@ def _write(
         reasons = "; ".join(f"{name}: {why}" for name, why in list(skipped.items())[:5])
         raise SourceError(
             f"no episode yields {plan.kind}: {len(skipped)} unusable ({reasons})",
-            "Check --families, --split and --episodes against the sources.",
+            "Check `families`, `split` and `episodes` against the sources.",
         )
     ordered = sorted(stored, key=lambda one: one.record.episode_id)
     # Actions are kept only where all episodes have them: buffers do not show them.
@@ -254,8 +205,8 @@ def _write(
         progress.advance(1)
     records = [_placed(one.record, index, features) for index, one in enumerate(ordered)]
     told = {canonical_json(source.provenance): source.provenance for source in plan.sources}
-    if earlier:
-        told |= {canonical_json(one): one for one in earlier.dataset.identity.sources}
+    if existing:
+        told |= {canonical_json(one): one for one in existing.dataset.identity.sources}
     sources = [one for _, one in sorted(told.items())]
     identity = identity_of(records, plan.kind, plan.version, plan.codec, sources)
     with progress.status("Hashing"):

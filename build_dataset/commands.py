@@ -64,10 +64,8 @@ _TOLD = 10
 """Episodes that are named when they are left out."""
 
 
-@app.command()
-@with_settings
-def demonstrations(config: BuildConfig, as_json: AsJson = False) -> None:
-    r"""Build the query episodes' demonstrations, each with its first live observation at the end.
+_DATASETS = {
+    DEMONSTRATIONS: r"""Build the query episodes' demonstrations, with the first live observation.
 
     Stopped with Ctrl-C, or killed, a build goes on where it was when the command is run again. A
     dataset that is there grows by what it lacks.
@@ -79,15 +77,8 @@ def demonstrations(config: BuildConfig, as_json: AsJson = False) -> None:
     robomme-interference build demonstrations --source tabletop --split test --episodes 0-4 \
         --cameras front --out S/demonstrations
     ```
-    """
-    with stoppable(_KEPT):
-        _build(plan_build(DEMONSTRATIONS, config), config.out, config, as_json=as_json)
-
-
-@app.command()
-@with_settings
-def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
-    r"""Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
+    """,
+    DISTRACTORS: r"""Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
 
     Episodes of fewer than 249 raw frames yield no unit; they are listed in meta/build_report.json.
 
@@ -97,15 +88,8 @@ def distractors(config: BuildConfig, as_json: AsJson = False) -> None:
     robomme-interference build distractors --source robomme-h5:recordings/ --source frames:mine/ \
         --cameras front --out S/distractors
     ```
-    """
-    with stoppable(_KEPT):
-        _build(plan_build(DISTRACTORS, config), config.out, config, as_json=as_json)
-
-
-@app.command(name=RAW_DISTRACTORS)
-@with_settings
-def raw_distractors(config: BuildConfig, as_json: AsJson = False) -> None:
-    """Build distractor units at full rate, for raw-k<n>: the first 256 raw frames of each episode.
+    """,
+    RAW_DISTRACTORS: """Build distractor units at full rate, for raw-k<n>: 256 raw frames each.
 
     Take the episodes of the distractors: a buffer's units must all be there.
 
@@ -113,32 +97,19 @@ def raw_distractors(config: BuildConfig, as_json: AsJson = False) -> None:
     ```
     robomme-interference build distractors-raw --source tabletop --out S/distractors-raw
     ```
-    """
-    with stoppable(_KEPT):
-        _build(plan_build(RAW_DISTRACTORS, config), config.out, config, as_json=as_json)
+    """,
+    CONTRADICTIONS: r"""Build contradicting lessons: the same scene, another answer.
 
-
-@app.command()
-@with_settings
-def contradictions(config: BuildConfig, as_json: AsJson = False) -> None:
-    r"""Build contradicting lessons, for stale-k<n> and misled-k<n>: another answer, the same scene.
-
-    Take the query episodes. Only tabletop can play them: elsewhere, scene and answer come together.
+    For stale-k<n> and misled-k<n>. Take the query episodes. Only tabletop can play them: elsewhere,
+    scene and answer come together.
 
     Example:
     ```
     robomme-interference build contradictions --source tabletop --split test --episodes 0-4 \
         --out S/contradictions
     ```
-    """
-    with stoppable(_KEPT):
-        _build(plan_build(CONTRADICTIONS, config), config.out, config, as_json=as_json)
-
-
-@app.command()
-@with_settings
-def shifted(config: BuildConfig, as_json: AsJson = False) -> None:
-    r"""Build what query episodes look like under each shift, for `retrieval-score --shift`.
+    """,
+    SHIFTED: r"""Build what query episodes look like under each shift, for retrieval-score.
 
     Nine frames of each episode: the first live view under light, camera and clutter, each at
     strengths 1, 2 and 3. Take the query episodes; build manifests and index the split afterwards.
@@ -148,9 +119,22 @@ def shifted(config: BuildConfig, as_json: AsJson = False) -> None:
     robomme-interference build shifted --source tabletop --split test --episodes 0-4 \
         --out S/shifted
     ```
-    """
-    with stoppable(_KEPT):
-        _build(plan_build(SHIFTED, config), config.out, config, as_json=as_json)
+    """,
+}
+"""Kind of dataset to the help of the command that builds it."""
+
+
+def _add_command(kind: str, text: str) -> None:
+    @with_settings
+    def build(config: BuildConfig, as_json: AsJson = False) -> None:
+        with stoppable(_KEPT):
+            _build(plan_build(kind, config), config.out, config, as_json=as_json)
+
+    app.command(name=kind, help=text)(build)
+
+
+for _kind, _text in _DATASETS.items():
+    _add_command(_kind, _text)
 
 
 @app.command()
@@ -280,8 +264,7 @@ def _plan(split: Path, config: PlanConfig, *, as_json: bool, base: "Files | None
     from robomme_interference_data.data.loading import load_split
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from .manifests import write_manifests
-    from .material import in_folder, plan_manifests
+    from .manifests import in_folder, plan_manifests, write_manifests
 
     limit = position_limit(config)
     places = in_folder(split) | ({} if base is None else {DEMONSTRATIONS: base})

@@ -131,13 +131,7 @@ class BuildPlan:
 
 
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
-    """Plan the datasets of a split, and check all that can be known before anything is read.
-
-    Raises:
-        PoolTooSmallError: Even if every train episode yielded a unit, there were too few.
-        InvalidIdError, InvalidOptionError, SourceError: As `plan_build` and `in_order`.
-        BuildError: Something else lies where one of the outputs is to be.
-    """
+    """Plan the datasets of a split, and check all that can be known before anything is read."""
     every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
     names = [*datasets_of(in_order(plan.conditions)), *[SHIFTED] * config.shifted]
     plans = {name: plan_build(name, every if name in UNITS else config) for name in names}
@@ -150,27 +144,20 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
     """Open published demonstrations, and plan units for them; see `plan_all`.
 
     The units have the cameras of the demonstrations, unless some are asked for.
-
-    Raises:
-        InvalidOptionError: What is given as demonstrations is a folder, or of another kind; and as
-            `plan_all`.
-        SourceError: A condition needs a dataset that the split lacks; and as `plan_all`.
-        HubError, MissingFileError, FormatError: The demonstrations cannot be read.
     """
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.storage.hub import HubFiles, locate
 
-    from .material import check_needs, in_folder
+    from .manifests import check_needs, in_folder
 
     base = Dataset(locate(config.demonstrations))
     if not isinstance(base.files, HubFiles) or base.kind != DEMONSTRATIONS:
         raise InvalidOptionError.expected(
-            "--demonstrations",
+            "demonstrations",
             config.demonstrations,
             "demonstrations that are published",
             "A published split's card names the repository of its demonstrations. For "
-            "demonstrations in a folder: robomme-interference build all, or build distractors and "
-            "build manifests.",
+            "demonstrations in a folder, build distractors and manifests beside it.",
         )
     check_needs(in_order(plan.conditions), in_folder(config.out))
     cameras = config.cameras or base.cameras
@@ -185,7 +172,7 @@ def _check_plans(
 ) -> None:
     from robomme_interference_data.schema.draw import UnitPool
 
-    from .build import find_earlier
+    from .existing import open_existing
     from .manifests import check_place
 
     conditions = in_order(plan.conditions)
@@ -195,13 +182,13 @@ def _check_plans(
         for condition in conditions:
             condition.sessions(_Unread(query, pool))
     for kind, one in plans.items():
-        find_earlier(out.resolve() / kind, one)
+        open_existing(out.resolve() / kind, one)
     check_place(out)
 
 
 @dataclass(frozen=True)
 class _Unread:
-    """The material of a query before anything is read: it tells whether units are enough."""
+    """The sessions of a query before anything is read: whether units are enough."""
 
     query: EpisodeId
     pool: "UnitPool"
@@ -224,25 +211,20 @@ def _unread(role: str, source: EpisodeId) -> SessionEntry:
 
 
 def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
-    """Open the sources and plan one dataset.
-
-    Raises:
-        InvalidOptionError: A setting is not what it may be, or does not fit the sources.
-        SourceError, MissingExtraError, HubError: A source cannot be used.
-    """
+    """Open the sources and plan one dataset."""
     from robomme_interference_data.storage.encode import get_codec
 
     from .sources import open_source
 
     get_codec(config.codec)
     if config.time_limit is not None and not config.time_limit > 0:
-        raise InvalidOptionError.expected("--time-limit", config.time_limit, "seconds, above 0")
+        raise InvalidOptionError.expected("time_limit", config.time_limit, "seconds, above 0")
     make_executor(config)  # refuses what it may not be
     numbers = None if config.episodes is None else parse_numbers(config.episodes)
     pairs = [text.partition("=") for text in config.columns]
     if not all(name and equals and column for name, equals, column in pairs):
         raise InvalidOptionError.expected(
-            "--columns", config.columns, "NAME=COLUMN, such as front=image"
+            "columns", config.columns, "NAME=COLUMN, such as front=image"
         )
     sources = tuple(
         open_source(
@@ -259,7 +241,8 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
             raise InvalidOptionError(
                 f"{text} plays demonstrations only, and distractor units need whole episodes",
                 "Build the two datasets apart, the distractors from RoboMME's own training "
-                "recordings: robomme-interference build distractors --source robomme-h5:FOLDER",
+                "recordings.",
+                "build distractors --source robomme-h5:FOLDER --out SPLIT/distractors",
             )
     split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)
@@ -290,19 +273,14 @@ def list_episodes(
         families: Their families; none for all.
         split: `train`, `val` or `test`; None for all.
         numbers: Their indices; None for all.
-
-    Raises:
-        InvalidOptionError: A family or split is unknown.
-        SourceError: Two sources hold the same episode, no episode is left, or a source cannot be
-            used.
     """
     listed = [(number, one) for number, source in enumerate(sources) for one in source.episodes()]
     known = {one.id.family for _, one in listed}
     wanted = set(families) or known
     for family in sorted(wanted - known):
-        raise InvalidOptionError.one_of("--families", family, sorted(known))
+        raise InvalidOptionError.one_of("families", family, sorted(known))
     if split is not None and split not in SPLITS:
-        raise InvalidOptionError.one_of("--split", split, SPLITS)
+        raise InvalidOptionError.one_of("split", split, SPLITS)
     indices = None if numbers is None else set(numbers)
     chosen = sorted(
         (
@@ -318,25 +296,21 @@ def list_episodes(
         if one.id == other.id:
             raise SourceError(
                 f"{one.id} is recorded twice (in source {first + 1} and source {second + 1})",
-                "Leave one out: --families, --split, --episodes, or fewer --source.",
+                "Leave one out with `families`, `split` or `episodes`, or take fewer sources.",
             )
     if not chosen:
         raise SourceError(
             f"no episode is left of the {len(listed)} that are listed",
-            "Check --families, --split and --episodes against the sources.",
+            "Check `families`, `split` and `episodes` against the sources.",
         )
     return tuple(chosen)
 
 
 def position_limit(config: PlanConfig) -> int | None:
-    """Return the position limit of a plan; None for none.
-
-    Raises:
-        InvalidOptionError: It is neither `none` nor a positive number.
-    """
+    """Return the position limit of a plan; None for none."""
     text = config.position_limit
     if text == "none":
         return None
     if not text.isdecimal() or int(text) == 0:
-        raise InvalidOptionError.expected("--position-limit", text, "a positive number or none")
+        raise InvalidOptionError.expected("position_limit", text, "a positive number or none")
     return int(text)

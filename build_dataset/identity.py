@@ -7,14 +7,13 @@ those that delete episodes or split a dataset drop them, and refuse the lossless
 reads is a copy of that table without LeRobot's statistics, which are most of its bytes.
 """
 
-import hashlib
 import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -33,11 +32,12 @@ from robomme_interference_data.constants import (
     SUMS_PATH,
     UNITS,
 )
+from robomme_interference_data.data.dataset import revision_of
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.records import Counts, DatasetIdentity, EpisodeRecord
 from robomme_interference_data.storage.files import (
     all_files,
-    canonical_json,
     format_sums,
     sha256_file,
     write_json,
@@ -72,9 +72,6 @@ def identity_of(
     sums: str = "",
 ) -> DatasetIdentity:
     """Return the identity of a dataset with these episodes; see `DatasetIdentity`."""
-    revision = hashlib.sha256()
-    for record in records:
-        revision.update(canonical_json(to_dict(record)).encode() + b"\n")
     families = Counter(record.episode_id.family for record in records)
     features = {name for record in records for name in record.feature_sha256}
     cameras = sorted(name for name in features if name.startswith(CAMERA_PREFIX))
@@ -82,7 +79,7 @@ def identity_of(
         format_version=FORMAT_VERSION,
         kind=kind,
         version=version,
-        revision=revision.hexdigest(),
+        revision=revision_of(records),
         exact=all(record.exact for record in records),
         codec=codec,
         cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in cameras),
@@ -110,16 +107,43 @@ def complete_dataset(
     """
     _add_columns(root, records)
     _sort_statistics(root / STATS_PATH)
-    report = {
+    write_json(root / REPORT_PATH, report_of(identity, skipped))
+    write_text(root / SUMS_PATH, format_sums(root, listed_files(root)))
+    identity = replace(identity, sums=sha256_file(root / SUMS_PATH))
+    write_json(root / IDENTITY_PATH, to_dict(identity))
+
+
+@dataclass(frozen=True)
+class SkippedEpisode:
+    """An episode that yielded nothing."""
+
+    episode_id: Annotated[EpisodeId, "Its id."]
+    why: Annotated[str, "Why it yielded nothing."]
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """`meta/build_report.json`."""
+
+    format_version: Annotated[int, "Of the files."]
+    kind: Annotated[str, "Name of the dataset in a split."]
+    counts: Annotated[dict[str, Any], "What the identity counts, and `skipped` episodes."]
+    skipped: Annotated[tuple[SkippedEpisode, ...], "Episodes that yielded nothing, by id."]
+
+
+def report_of(identity: DatasetIdentity, skipped: dict[str, str]) -> dict[str, Any]:
+    """Return the build report of a dataset as plain values.
+
+    Args:
+        identity: The dataset.
+        skipped: Ids of episodes that yielded nothing, and why.
+    """
+    return {
         "format_version": FORMAT_VERSION,
         "kind": identity.kind,
         "counts": {**to_dict(identity.counts), "skipped": len(skipped)},
         "skipped": [{"episode_id": name, "why": why} for name, why in sorted(skipped.items())],
     }
-    write_json(root / REPORT_PATH, report)
-    write_text(root / SUMS_PATH, format_sums(root, listed_files(root)))
-    identity = replace(identity, sums=sha256_file(root / SUMS_PATH))
-    write_json(root / IDENTITY_PATH, to_dict(identity))
 
 
 def _add_columns(root: Path, records: Sequence[EpisodeRecord]) -> None:

@@ -1,13 +1,22 @@
-"""Statistics of images, as LeRobot stores them."""
+"""Statistics of images, as LeRobot stores them, and those that a dataset has of its episodes."""
 
 import math
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
+
+from robomme_interference_data.constants import EPISODES_DIR
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.errors import FormatError, MissingFileError
+from robomme_interference_data.storage.parquet import RowSpan, reading
 
 STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 """Names of the statistics in LeRobot's order, which is that of its columns."""
+
+Statistics = dict[str, dict[str, NDArray[Any]]]
+"""Feature to name of a statistic to its values."""
 
 
 class ImageStats:
@@ -49,12 +58,38 @@ class ImageStats:
         return stats
 
 
+def episode_table(dataset: Dataset) -> pa.Table:
+    """Return LeRobot's table of the episodes with its statistics, by episode index."""
+    paths = [dataset.files.path(path) for path in dataset.files.list(EPISODES_DIR, ".parquet")]
+    if not paths:
+        raise MissingFileError(f"{EPISODES_DIR} is missing in {dataset.files.describe()}")
+    tables = [RowSpan(path).table() for path in paths]
+    with reading(paths[0]):  # files with columns of different types
+        return pa.concat_tables(tables).sort_by("episode_index")
+
+
+def episode_statistics(table: pa.Table) -> list[Statistics]:
+    """Return the statistics of each episode in LeRobot's table, images on the scale 0 to 1."""
+    columns = [name for name in table.column_names if name.startswith("stats/")]
+    found: list[Statistics] = []
+    for row in table.select(columns).to_pylist():
+        found.append({})
+        for column, values in row.items():
+            feature, _, name = column.removeprefix("stats/").rpartition("/")
+            try:
+                numbers = np.ravel(np.asarray(values, np.int64 if name == "count" else np.float64))
+            except (TypeError, ValueError):
+                raise FormatError.damaged(EPISODES_DIR, f"{column} is {values}") from None
+            found[-1].setdefault(feature, {})[name] = numbers
+    return found
+
+
 def before_scaling(name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Return what LeRobot divided by 255 when it stored a statistic of images, bit for bit."""
     if name == "count":
         return values
     found = []
-    for value in values.astype(np.float64):
+    for value in values.tolist():
         near = value * 255
         steps = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
         found.append(next((one for one in steps if one / 255 == value), near))

@@ -52,11 +52,7 @@ class StoredEpisode:
 
 
 def require_lerobot() -> None:
-    """Check that lerobot is installed, before any work is done, without importing it.
-
-    Raises:
-        MissingExtraError: It is not.
-    """
+    """Check that lerobot is installed, before any work is done, without importing it."""
     if find_spec("lerobot") is None or find_spec("datasets") is None:
         raise MissingExtraError.needs("writing LeRobot datasets", "lerobot", "build")
 

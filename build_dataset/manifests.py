@@ -1,37 +1,52 @@
 """Plan the buffers of a split: for every query episode and every condition, what it holds.
 
-Rules 5 and 8 of the protocol; what a condition holds is `conditions.py`, of what it is made
-`material.py`.
+Rules 5 and 8 of the protocol; what a condition holds is `schema/conditions.py`, what sessions there
+are `data/query_sessions.py`.
 """
 
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import batched
 from pathlib import Path
 
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import (
+    ACTION,
+    DEMONSTRATIONS,
+    DISTRACTORS,
     FORMAT_VERSION,
     IDENTITY_PATH,
     MANIFEST_HEADER,
     MANIFEST_ROWS,
     MANIFESTS,
     MAX_STEPS,
+    OPTIONAL_DATASETS,
+    POSITION_LIMIT,
     RULE_VERSION,
+    SHIFTED,
+    UNITS,
 )
-from robomme_interference_data.data.query import Query
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.data.manifest_table import pending_rows
+from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import (
     BuildError,
     HistoryTooLongError,
+    InvalidOptionError,
+    SourceError,
 )
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
 from robomme_interference_data.schema.manifest import (
     BufferManifest,
     ManifestDataset,
     ManifestHeader,
 )
 from robomme_interference_data.storage.files import (
+    Files,
+    LocalFiles,
     sha256_file,
     staging_dir,
     write_json,
@@ -39,38 +54,136 @@ from robomme_interference_data.storage.files import (
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
 
-from .material import ManifestPlan, QueryMaterial
-
 _BATCH = 1024
 """Rows in a row group: few bytes find one buffer."""
 
 
-def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
-    """Yield the manifests of all buffers: queries in canonical order, conditions as planned.
+@dataclass(frozen=True)
+class ManifestPlan:
+    """All that decides the manifests.
 
-    Raises:
-        PoolTooSmallError: A query needs more units than there are.
-        SourceError: A query has no contradicting lesson, or a unit no raw one.
-        HistoryTooLongError: A buffer exceeds the position limit.
+    Attributes:
+        source: The datasets of the split, and the seed of the draw.
+        conditions: For which buffers are planned, in order.
+        position_limit: Longest history plus rollout that the systems hold; None for no limit.
     """
-    lossy = {
-        (name, e.episode_id)
-        for name, dataset in plan.datasets.items()
-        for e in dataset.records()
-        if not e.exact
-    }
-    for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
-        query, material = Query(plan.demonstrations, record), QueryMaterial(plan, record)
-        # The largest first: fewer units begin those that are drawn for it.
-        sessions = {one.name: one.sessions(material) for one in reversed(plan.conditions)}
-        for condition in plan.conditions:
-            entries = sessions[condition.name]
-            exact = record.exact and not (
-                lossy and any((one.dataset, one.source) in lossy for one in entries)
+
+    source: SessionSource
+    conditions: tuple[Condition, ...]
+    position_limit: int | None = POSITION_LIMIT
+
+    @property
+    def datasets(self) -> Mapping[str, Dataset]:
+        """The datasets of the split by name."""
+        return self.source.datasets
+
+    @property
+    def demonstrations(self) -> Dataset:
+        """The query episodes."""
+        return self.datasets[DEMONSTRATIONS]
+
+
+def in_folder(root: Path) -> dict[str, Files]:
+    """Return where the datasets of a split lie that is built in a folder."""
+    further = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
+    return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *further)}
+
+
+def plan_manifests(
+    places: Mapping[str, Files],
+    conditions: Sequence[str | Condition] = DEFAULT_CONDITIONS,
+    seed: int = 0,
+    position_limit: int | None = POSITION_LIMIT,
+) -> ManifestPlan:
+    """Check that the datasets of a split and the options fit each other.
+
+    Args:
+        places: Where the datasets of the split lie, by name; see `in_folder`.
+        conditions: For which buffers are planned.
+        seed: Seed of the draw.
+        position_limit: See `ManifestPlan`.
+    """
+    ordered = in_order(conditions)
+    check_needs(ordered, places)
+    opened = {}
+    for name, files in places.items():
+        opened[name] = dataset = Dataset(files)
+        if dataset.kind != name:
+            raise InvalidOptionError(
+                f"{files.describe()} is a dataset of {dataset.kind}",
+                f"Put the {name} there.",
+                f"build {name} --source KIND:PATH --out {files.location}",
             )
-            manifest = query.manifest(condition, entries, exact=exact)
-            _check_length(manifest, plan.position_limit)
-            yield manifest
+    _check_features(opened)
+    for name in UNITS.keys() & opened.keys():
+        splits = {record.episode_id.split for record in opened[name].records()}
+        if splits != {"train"}:
+            raise SourceError(
+                "distractor units must come from train episodes, so that no query's own scene "
+                f"leaks into another buffer; found {', '.join(sorted(splits))}",
+                f'Build the {name} with split="train".',
+            )
+    if SHIFTED in opened:
+        _check_scenes(opened[SHIFTED], opened[DEMONSTRATIONS])
+    return ManifestPlan(SessionSource(opened, seed), ordered, position_limit)
+
+
+def check_needs(conditions: Iterable[Condition], there: Collection[str]) -> None:
+    """Check that a split has the datasets that conditions need.
+
+    Args:
+        conditions: The conditions.
+        there: Names of the datasets that it has.
+    """
+    for condition in conditions:
+        for name in condition.kind.needs:
+            if name not in there:
+                raise SourceError(
+                    f"{condition} needs the dataset {name}, which the split lacks",
+                    f"Build it first, or leave {condition} out.",
+                    f"build {name} --source KIND:PATH --out SPLIT/{name}",
+                )
+
+
+def _check_features(datasets: Mapping[str, Dataset]) -> None:
+    """Check that sessions of all datasets can follow one another in a buffer."""
+    shown = {
+        name: {feature: s for feature, s in one.features.items() if feature != ACTION}
+        for name, one in datasets.items()
+    }
+    for name, features in shown.items():
+        if features != shown[DEMONSTRATIONS]:
+            raise SourceError(
+                "sessions of the datasets cannot follow one another in a buffer: the "
+                f"demonstrations have {shown[DEMONSTRATIONS]}, the {name} {features}",
+                "Build all with the same `cameras`, from sources with the same sizes.",
+            )
+
+
+def _check_scenes(shifted: Dataset, base: Dataset) -> None:
+    """Check that views under shifts are of the scenes of the demonstrations, and of all."""
+    found, wanted = ([*one.identity.sources] for one in (shifted, base))
+    why = f"was built from {found}, the demonstrations from {wanted}"
+    if all(one in wanted for one in found):
+        there, asked = ({r.episode_id for r in one.records()} for one in (shifted, base))
+        why = f"lacks {min(asked - there)}" if asked - there else ""
+    if why:
+        raise SourceError(
+            f"{shifted.files.describe()} {why}",
+            "Build it of all query episodes, or remove it.",
+            f"build {SHIFTED}",
+        )
+
+
+def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
+    """Yield the manifests of all buffers: queries in canonical order, conditions as planned."""
+    for record in sorted(plan.demonstrations.records(), key=lambda one: one.episode_id.sort_key):
+        sessions = QuerySessions(plan.source, record)
+        # The largest first: fewer units begin those that are drawn for it.
+        buffers = {one.name: sessions.buffer(one) for one in reversed(plan.conditions)}
+        for condition in plan.conditions:
+            _check_length(buffers[condition.name], plan.position_limit)
+            yield buffers[condition.name]
 
 
 def _check_length(manifest: BufferManifest, limit: int | None) -> None:
@@ -80,19 +193,14 @@ def _check_length(manifest: BufferManifest, limit: int | None) -> None:
         raise HistoryTooLongError(
             f"{manifest} needs {needed} positions ({manifest.history_frames} history frames + "
             f"{MAX_STEPS} steps); the released servers hold {limit}",
-            "Leave out that condition, or --position-limit none for systems without such a limit.",
+            'Leave out that condition, or set position_limit="none" for systems without a limit.',
         )
 
 
 def check_place(root: Path) -> None:
-    """Check that nothing else lies where the manifests of a split are to be.
-
-    Raises:
-        BuildError: The folder holds something else.
-    """
+    """Check that nothing else lies where the manifests of a split are to be."""
     out = root.resolve() / MANIFESTS
-    strangers = {path.name for path in out.iterdir()} if out.is_dir() else set()
-    strangers -= {MANIFEST_ROWS, MANIFEST_HEADER}
+    strangers = {path.name for path in out.glob("[!.]*")} - {MANIFEST_ROWS, MANIFEST_HEADER}
     if (strangers and not (out / MANIFEST_HEADER).is_file()) or out.is_file():
         raise BuildError(
             f"{out} exists and holds no manifests, but {min(strangers, default='is a file')}"
@@ -102,15 +210,12 @@ def check_place(root: Path) -> None:
 def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
     """Write the manifests of a split; yields the number of buffers done after each batch.
 
-    The files appear whole; `manifest.json` is the last, and names the SHA-256 of the rows.
+    Whenever it is interrupted, the split has either the earlier manifests or the new ones: until
+    `manifest.json` is replaced, the new rows lie beside the old ones under a name that it tells.
 
     Args:
         plan: What to write.
         root: The split; manifests of an earlier run are replaced.
-
-    Raises:
-        PoolTooSmallError, HistoryTooLongError: As `planned_buffers`.
-        BuildError: The folder holds something else, or is being written by another process.
     """
     out = root.resolve() / MANIFESTS
     rows, header = out / MANIFEST_ROWS, out / MANIFEST_HEADER
@@ -120,11 +225,14 @@ def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
             check_place(root)
             written = work / rows.name
             counts = yield from _write_rows(plan, written)
-            write_json(work / header.name, to_dict(_header(plan, counts, sha256_file(written))))
-            # An old header must not vouch for new rows, should this end here.
-            header.unlink(missing_ok=True)
-            written.replace(rows)
+            made = _header(plan, counts, sha256_file(written))
+            write_json(work / header.name, to_dict(made))
+            pending = out.parent / pending_rows(made)
+            written.replace(pending)
             (work / header.name).replace(header)
+            pending.replace(rows)
+            for leftover in out.glob(".*.parquet"):  # of a run that was interrupted
+                leftover.unlink()
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
@@ -149,7 +257,7 @@ def _header(plan: ManifestPlan, counts: dict[str, int], rows: str) -> ManifestHe
     return ManifestHeader(
         format_version=FORMAT_VERSION,
         rule_version=RULE_VERSION,
-        seed=plan.seed,
+        seed=plan.source.seed,
         conditions=tuple(condition.name for condition in plan.conditions),
         position_limit=plan.position_limit,
         datasets={

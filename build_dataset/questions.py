@@ -28,14 +28,7 @@ Marks = Sequence[Sequence[Pixel]]
 
 
 def make_questions(split: Split) -> Iterator[Question]:
-    """Make the questions of a split, in canonical order; the same split gives the same bytes.
-
-    Raises:
-        BuildError: An episode is not of `tabletop`, so that its possible answers are not known; or
-            it was not recorded in the size that `tabletop` draws.
-        MissingExtraError: Pillow is not installed.
-        MissingFileError, FormatError, TruncatedVideoError: A first live view cannot be read.
-    """
+    """Make the questions of a split, in canonical order; the same split gives the same bytes."""
     module = "robomme_interference_data.build_dataset.question_pictures"
     picture = load_extra(module, "picture", "build questions", "retrieval")
     for question, marks in planned_questions(split):
@@ -51,11 +44,7 @@ def make_questions(split: Split) -> Iterator[Question]:
 
 
 def planned_questions(split: Split) -> Iterator[tuple[Question, Marks]]:
-    """Yield the questions of a split without their pictures, and what is marked on these.
-
-    Raises:
-        BuildError: See `make_questions`.
-    """
+    """Yield the questions of a split without their pictures, and what is marked on these."""
     revision = split.datasets[DEMONSTRATIONS].identity.revision
     for episode in sorted(split.episode_ids):
         yield _planned(split.query(episode), revision)

@@ -20,16 +20,17 @@ from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, FPS, LESS
 from robomme_interference_data.errors import BuildError, InterferenceError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
 from robomme_interference_data.storage.arrays import write_array
 from robomme_interference_data.storage.digest import FeatureDigests, SpanDigester, combine
 from robomme_interference_data.storage.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.storage.files import canonical_json, write_json
+from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.video import iter_frames
 
 from .config import BuildPlan
-from .cut import CUTS, NothingToStore
+from .frame_selection import FRAME_SELECTORS, NothingToStore
 from .image_stats import STATISTICS, ImageStats
 from .lerobot_writer import StoredEpisode
 from .sources import Frame, Recording, SourceEpisode
@@ -101,13 +102,7 @@ class StageTask:
     plan: BuildPlan
 
     def __call__(self, task: Task, worker: Worker) -> Staged:
-        """Cut, encode and check one episode, send its files, and return what is known of it.
-
-        Raises:
-            InvalidOptionError: It has no such camera.
-            SourceError: The recording breaks off, or holds what cannot be stored.
-            BuildError: A video does not decode to what went in.
-        """
+        """Cut, encode and check one episode, send its files, and return what is known of it."""
         number, episode = task
         with tempfile.TemporaryDirectory(dir=worker.folder) as name:
             folder = Path(name)
@@ -131,7 +126,7 @@ class StageTask:
         codec = get_codec(self.plan.codec)
         writer = _Writer(codec, folder)
         try:
-            for frame in CUTS[self.plan.kind](recording.frames):
+            for frame in FRAME_SELECTORS[self.plan.kind](recording.frames):
                 writer.add(frame)
         except NothingToStore as reason:
             writer.close()
@@ -145,7 +140,8 @@ class StageTask:
         if codec.exact and whole != writer.digests.current():
             raise BuildError(
                 f"a video does not decode to the frames that were encoded with {codec.name}",
-                "Please report this with the versions that robomme-interference doctor prints.",
+                "Please report this with the versions of the libraries.",
+                "doctor",
             )
         # Of a lossy codec, what a reader gets is what is hashed.
         record = EpisodeRecord(
@@ -225,7 +221,7 @@ class _Writer:
                 raise SourceError(
                     f"{name} of stored frame {self.length} is {value.tolist()}; expected finite "
                     "float32 numbers",
-                    "Mend the recording, or leave the episode out: --episodes",
+                    "Mend the recording, or leave the episode out with `episodes`.",
                 )
             self._vectors[name].append(value)
             self.digests.update(name, value)

@@ -1,45 +1,72 @@
 """Recompute every hash and every rule of a split, and name each violation."""
 
-from collections.abc import Iterable, Iterator, Mapping
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
     DATASETS,
     DISTRACTORS,
     IDENTITY_PATH,
     INDEX_DIR,
     INDEX_HEADER,
+    INFO_PATH,
     LESSONS,
     MANIFEST_HEADER,
+    MANIFEST_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     QUESTIONS_PATH,
+    REPORT_PATH,
     RULE_VERSION,
     SHIFTED,
+    STATS_PATH,
+    SUMS_PATH,
     UNIT_MIN_RAW_FRAMES,
     UNITS,
 )
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import IndexHeader, index_folder
-from robomme_interference_data.data.questions import read_questions
-from robomme_interference_data.errors import FormatError, InterferenceError
+from robomme_interference_data.data.questions import Question, read_questions
+from robomme_interference_data.errors import FormatError, InterferenceError, visible
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.codec import arrow_schema, to_dict
 from robomme_interference_data.schema.conditions import datasets_of
-from robomme_interference_data.schema.manifest import ManifestHeader
+from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.storage.digest import combine
 from robomme_interference_data.storage.encode import CODECS, decode_image
-from robomme_interference_data.storage.files import LocalFiles, all_files, sha256_file
+from robomme_interference_data.storage.files import (
+    LocalFiles,
+    all_files,
+    indented_json,
+    read_json,
+    sha256_file,
+)
+from robomme_interference_data.storage.headers import read_header
+from robomme_interference_data.storage.parquet import open_parquet
 
-from .identity import identity_of, listed_files
-from .lerobot_meaning import lerobot_violations
-from .manifests import planned_buffers
-from .material import plan_manifests
+from .identity import BuildReport, identity_of, listed_files, report_of
+from .image_stats import (
+    ImageStats,
+    Statistics,
+    before_scaling,
+    episode_statistics,
+    episode_table,
+)
+from .lerobot_checks import lerobot_violations
+from .manifests import plan_manifests, planned_buffers
 from .questions import planned_questions
 
 _TOO_MANY = "is too many: it is in no list"
@@ -73,15 +100,13 @@ def verify_split(
         split: The split; all of one on the Hub is downloaded.
         decode: Whether to decode all data: by far the longest part.
         progress: Where to show how many frames are decoded.
-
-    Raises:
-        HubError: The Hub cannot be reached.
     """
     return _split(split, decode, progress or WorkProgress(quiet=True))
 
 
 def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Violation]:
     header, own = split.header, split.files.snapshot("*")
+    yield from _json(own / MANIFEST_PATH, MANIFEST_PATH)
     for path in all_files(own / MANIFESTS):
         if path not in (MANIFEST_HEADER, MANIFEST_ROWS):
             yield Violation(f"{MANIFESTS}/{path}", _TOO_MANY)
@@ -91,6 +116,8 @@ def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Viola
     elif sha256_file(rows) != header.rows:
         what = f"does not have the SHA-256 of {MANIFEST_HEADER}"
         yield Violation(f"{MANIFESTS}/{MANIFEST_ROWS}", what)
+    else:
+        yield from _told(MANIFESTS, _table(own, f"{MANIFESTS}/{MANIFEST_ROWS}", BufferManifest))
     datasets: dict[str, Dataset] = {}
     for name in header.datasets:
         try:
@@ -105,6 +132,7 @@ def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Viola
     if len(datasets) == len(header.datasets):
         yield from _told(MANIFESTS, _buffers(split, datasets))
     if (own / QUESTIONS_PATH).is_file():
+        yield from _told(QUESTIONS_PATH, _table(own, QUESTIONS_PATH, Question))
         yield from _told(QUESTIONS_PATH, _questions(split))
 
 
@@ -116,18 +144,43 @@ def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
         yield Violation(where, error.message)
 
 
+def _json(
+    file: Path, where: str, text: Callable[[Any], str] = indented_json
+) -> Iterator[Violation]:
+    """Check that a JSON file has the bytes that its values are written as."""
+    if file.read_bytes() != text(read_json(file)).encode(errors="backslashreplace"):
+        yield Violation(where, "is not written as this package writes it")
+
+
+def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
+    """Check that a table has the columns of its records, and no others."""
+    found, expected = open_parquet(root / path).schema_arrow, arrow_schema(record)
+    if not found.remove_metadata().equals(expected):
+        differing = {field.name for field in {*found} ^ {*expected}}
+        yield Violation(path, f"does not have the declared columns; differing: {sorted(differing)}")
+
+
+_LEROBOT_TEXT: dict[str, Callable[[Any], str]] = {
+    INFO_PATH: partial(json.dumps, indent=4, ensure_ascii=False),
+    STATS_PATH: lambda value: json.dumps(value, indent=4, sort_keys=True) + "\n",
+}
+
+
 def _dataset(
     name: str, dataset: Dataset, header: ManifestHeader, progress: WorkProgress | None
 ) -> Iterator[Violation]:
     yield from _files(name, dataset, header)
     records = list(dataset.records())
     yield from _identity(name, dataset, records, header)
+    yield from _report(name, dataset, records)
     yield from (Violation(f"{name}/{where}", what) for where, what in lerobot_violations(dataset))
+    statistics = None if progress is None else episode_statistics(episode_table(dataset))
     for record in records:
         where = f"{name} {record.episode_id}"
         yield from _record(where, name, record)
-        if progress is not None:
-            yield from _told(where, _episode(where, dataset, record))
+        if progress is not None and statistics is not None:
+            own = statistics[record.episode_index]
+            yield from _told(where, _episode(where, dataset, record, own))
             progress.advance(record.length)
 
 
@@ -139,7 +192,13 @@ def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Viol
         yield Violation(f"{name}/{IDENTITY_PATH}", what)
     # Of a split that was fetched, one dataset is at its root, and the other in a folder there.
     others = tuple(f"{other}/" for other in header.datasets if other != name)
+    for path in (IDENTITY_PATH, REPORT_PATH, INFO_PATH, STATS_PATH):
+        text = _LEROBOT_TEXT.get(path, indented_json)
+        yield from _json(files.path(path), f"{name}/{path}", text)
     sums = dataset.sums()
+    lines = "".join(f"{digest}  {path}\n" for path, digest in sorted(sums.items()))
+    if files.path(SUMS_PATH).read_bytes() != lines.encode():
+        yield Violation(f"{name}/{SUMS_PATH}", "is not written as this package writes it")
     there = {path for path in listed_files(root) if not path.startswith(others)}
     for path in sorted(sums.keys() | there):
         if path not in sums:
@@ -167,6 +226,18 @@ def _identity(
             yield Violation(f"{MANIFESTS}/{MANIFEST_HEADER}", f"{what}{getattr(given, field)}")
 
 
+def _report(name: str, dataset: Dataset, records: list[EpisodeRecord]) -> Iterator[Violation]:
+    where = f"{name}/{REPORT_PATH}"
+    report = read_header(dataset.files.path(REPORT_PATH), BuildReport)
+    skipped = {str(one.episode_id): one.why for one in report.skipped}
+    if read_json(dataset.files.path(REPORT_PATH)) != report_of(dataset.identity, skipped):
+        yield Violation(where, "does not have the counts of the dataset, or an order of its own")
+    if there := skipped.keys() & {str(record.episode_id) for record in records}:
+        yield Violation(where, f"{min(there)} is skipped, and in the dataset")
+    if any(visible(why) != why for why in skipped.values()):
+        yield Violation(where, "has control characters")
+
+
 def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]:
     start = record.exec_start_idx
     lessons = {name in LESSONS, start is not None, record.span_sha256 is not None}
@@ -184,9 +255,24 @@ def _record(where: str, name: str, record: EpisodeRecord) -> Iterator[Violation]
         yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")
 
 
-def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
+def _episode(
+    where: str, dataset: Dataset, record: EpisodeRecord, statistics: Statistics
+) -> Iterator[Violation]:
     recorded, spans = record.feature_sha256, record.spans
-    session, *parts = dataset.digests(record.episode_index, [record.session, *spans.values()])
+    images: defaultdict[str, ImageStats] = defaultdict(ImageStats)
+
+    def count(feature: str, value: NDArray[Any]) -> None:
+        if feature.startswith(CAMERA_PREFIX):
+            images[feature].add(value)
+
+    wanted = [record.session, *spans.values()]
+    session, *parts = dataset.digests(record.episode_index, wanted, count)
+    codec = CODECS.get(dataset.identity.codec)
+    for feature, found in images.items() if codec and codec.exact else ():
+        for one, value in found.result().items():
+            scaled = statistics.get(feature, {}).get(one, np.empty(0))
+            if not np.array_equal(before_scaling(one, scaled), value):
+                yield Violation(where, f"stats/{feature}/{one} is not that of its frames")
     for feature in sorted(session.keys() | recorded.keys()):
         if session.get(feature) != recorded.get(feature):
             yield Violation(where, f"{feature} does not have the recorded SHA-256")
@@ -215,7 +301,9 @@ def _indexes(name: str, dataset: Dataset, units: Dataset | None) -> Iterator[Vio
 
 def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> Iterator[Violation]:
     where = f"{name}/{folder}"
-    header = read_header(dataset.files.path(f"{folder}/{INDEX_HEADER}"), IndexHeader)
+    path = dataset.files.path(f"{folder}/{INDEX_HEADER}")
+    header = read_header(path, IndexHeader)
+    yield from _json(path, where)
     made = header.encoder.name, header.camera
     if index_folder(*made) != folder:
         yield Violation(where, f"holds the embeddings of {made[0]}, camera {made[1]}")

@@ -8,10 +8,10 @@ from pathlib import PurePosixPath
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     DISTRACTORS,
-    FURTHER,
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFEST_PATH,
+    OPTIONAL_DATASETS,
     QUESTIONS_PATH,
     SUMS_PATH,
 )
@@ -65,7 +65,7 @@ def split_tree(split: Split, base: str | None) -> Tree:
     header = indented_json(to_dict(placed(split.header, base))).encode()
     further = {
         f"{name}/{path}": content
-        for name in FURTHER
+        for name in OPTIONAL_DATASETS
         if name in split.datasets
         for path, content in dataset_tree(split.datasets[name]).items()
     }

@@ -5,11 +5,11 @@ from pathlib import Path
 
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
-    FURTHER,
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFEST_PATH,
     MANIFESTS,
+    OPTIONAL_DATASETS,
 )
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import PublishError
@@ -27,7 +27,7 @@ from .publish_config import PublishConfig
 from .tree import Content, Tree
 
 _CARD = (render.README, render.STRIP, render.CROISSANT)
-_OURS = {"data", "meta", "videos", INDEX_DIR, MANIFESTS, DEMONSTRATIONS, *FURTHER, *_CARD}
+_OURS = {"data", "meta", "videos", INDEX_DIR, MANIFESTS, DEMONSTRATIONS, *OPTIONAL_DATASETS, *_CARD}
 """What stands at the root of an export."""
 
 

@@ -13,7 +13,7 @@ if __name__ == "__main__":  # worker processes import the script
 
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.lazy import lazily
+from robomme_interference_data.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .policies.policy import Policy, RolloutInfo
@@ -31,4 +31,12 @@ __all__ = [
     "run_evaluation",
 ]
 
-__getattr__ = lazily(__name__, ".run.config", ".policies.policy", ".run.merge", ".run.evaluation")
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        ".policies.policy": "Policy RolloutInfo",
+        ".run.config": "RunConfig",
+        ".run.evaluation": "RunResult run_evaluation",
+        ".run.merge": "Merged merge_runs",
+    },
+)

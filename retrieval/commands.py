@@ -288,7 +288,7 @@ def _measured(
     if not measured:
         raise InvalidOptionError(
             f"none of the {left_out} buffers of {split} holds a lesson: there is nothing to grade",
-            f"Type: {opened.planning('k0', 'k3')}",
+            command=opened.planning("k0", "k3"),
         )
     if left_out and not quiet:
         say(f"{left_out} of {total} buffers hold no lesson and are left out")

@@ -10,21 +10,21 @@ buffer.frames("front")  # (T, H, W, 3) uint8
 
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.lazy import lazily
+from .lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from robomme_interference_data.data.buffer import Buffer, Chunk
-    from robomme_interference_data.data.buffer_set import Split
-    from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.data.loading import load_buffer, load_split
-    from robomme_interference_data.data.query import Query
-    from robomme_interference_data.errors import InterferenceError
-    from robomme_interference_data.ids import EpisodeId
-    from robomme_interference_data.schema.conditions import Condition
-    from robomme_interference_data.schema.manifest import BufferManifest, Session, SessionEntry
-    from robomme_interference_data.schema.records import EpisodeRecord
-    from robomme_interference_data.schema.rollouts import Rollout
-    from robomme_interference_data.storage.cache import DecodedCache
+    from .data.buffer import Buffer, Chunk
+    from .data.buffer_set import Split
+    from .data.dataset import Dataset
+    from .data.loading import load_buffer, load_split
+    from .data.query import Query
+    from .errors import InterferenceError
+    from .ids import EpisodeId
+    from .schema.conditions import Condition
+    from .schema.manifest import BufferManifest, Session, SessionEntry
+    from .schema.records import EpisodeRecord
+    from .schema.rollouts import Rollout
+    from .storage.cache import DecodedCache
 
 __all__ = [
     # load
@@ -48,9 +48,20 @@ __all__ = [
     "InterferenceError",
 ]
 
-__getattr__ = lazily(
+__getattr__ = lazy_exports(
     __name__,
-    *(".data.loading", ".data.buffer_set", ".data.buffer", ".storage.cache", ".data.query"),
-    *(".schema.records", ".schema.manifest", ".schema.rollouts"),
-    *(".ids", ".schema.conditions", ".data.dataset", ".errors"),
+    {
+        ".data.loading": "load_buffer load_split",
+        ".data.buffer_set": "Split",
+        ".data.buffer": "Buffer Chunk",
+        ".data.query": "Query",
+        ".data.dataset": "Dataset",
+        ".storage.cache": "DecodedCache",
+        ".ids": "EpisodeId",
+        ".schema.conditions": "Condition",
+        ".schema.records": "EpisodeRecord",
+        ".schema.manifest": "BufferManifest Session SessionEntry",
+        ".schema.rollouts": "Rollout",
+        ".errors": "InterferenceError",
+    },
 )

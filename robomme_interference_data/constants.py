@@ -118,10 +118,10 @@ UNITS = {
 }
 """Of what the units of a dataset are."""
 
-FURTHER = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
+OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
 """Datasets that a split may lack; on the Hub they are folders of its repository."""
 
-DATASETS = (DEMONSTRATIONS, DISTRACTORS, *FURTHER)
+DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)
 """Names of a split's datasets, which are their kinds."""
 QUESTIONS_PATH = "questions.parquet"
 """Questions about the past, which a split may have."""

@@ -1,29 +1,28 @@
-"""What is imported when it is asked for: public names of packages, and what needs an extra.
+"""Import on first use: the public names of packages, and modules that need an extra.
 
 The command line and workers import packages first, and need few of their names.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
 from robomme_interference_data.errors import MissingExtraError
 
 
-def lazily(package: str, *modules: str) -> Callable[[str], Any]:
-    """Return a package's `__getattr__`, which finds what its `__all__` names in its modules.
+def lazy_exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return a package's `__getattr__`, which imports the module of a name, and no other.
 
     Args:
         package: Its `__name__`.
-        modules: Where its names are, in the order of looking, such as `.split`.
+        modules: Module, relative or absolute, to the names it provides, separated by spaces.
     """
+    module_of = {name: module for module, names in modules.items() for name in names.split()}
 
     def find(name: str) -> Any:
-        if name in import_module(package).__all__:
-            for module in modules:
-                if hasattr(found := import_module(module, package), name):
-                    return getattr(found, name)
-        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        if name not in module_of:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(module_of[name], package), name)
 
     return find
 
@@ -36,9 +35,6 @@ def load_extra(module: str, name: str, what: str, extra: str) -> Callable[..., A
         name: The name.
         what: What needs it, for the message.
         extra: The extra, such as `evaluate`.
-
-    Raises:
-        MissingExtraError: A library is not installed.
     """
     try:
         loaded = import_module(module)

@@ -40,19 +40,13 @@ def open_source(
         families_file: `lerobot`: file that names the family of every episode.
         robomme_python: `robomme`: the interpreter that has RoboMME.
         shifted: Whether the first live views under shifts are wanted, not the episodes.
-
-    Raises:
-        InvalidOptionError: The specification or kind is unknown, there is no such folder, or the
-            kind has no shifts.
-        SourceError: The place does not hold what the kind expects.
-        MissingExtraError: The kind needs an extra that is not installed.
     """
     kind, colon, location = specification.partition(":")
     usage = KINDS.get(kind, "")
     incomplete = usage.startswith(f"{kind}:") and not location
     if not usage or incomplete or (colon and ":" not in usage):
         raise InvalidOptionError(
-            f"--source {specification!r} is not one of {', '.join(KINDS.values())}",
+            f"source {specification!r} is not one of {', '.join(KINDS.values())}",
             nearest(kind, KINDS, more=""),
         )
     if shifted and not (kind in SIMULATORS and simulator_class(kind).shifts):
@@ -88,6 +82,6 @@ def _folder(location: str) -> Path:
     folder = Path(location).expanduser()
     if not folder.exists():
         raise InvalidOptionError(
-            f"{folder} does not exist", "Give the folder after the colon of --source."
+            f"{folder} does not exist", "Give the folder after the colon of the source."
         )
     return folder

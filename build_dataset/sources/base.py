@@ -63,9 +63,6 @@ class Recording:
             releases the files.
         evidence: Which frames of the demonstration show the hidden answer, part by part; None
             where the source does not say.
-
-    Raises:
-        SourceError: There is no goal, or no such difficulty.
     """
 
     goals: tuple[str, ...]
@@ -135,7 +132,7 @@ class Source(Protocol):
         raise SourceError(
             f"no contradicting lesson of {episode.id}: in what {self.provenance['kind']} gives, "
             "scene and answer come together",
-            "Conditions with contradicting lessons, stale-k<n> and misled-k<n>, are for --source "
+            "Conditions with contradicting lessons, stale-k<n> and misled-k<n>, are for the source "
             "tabletop, which draws them apart.",
         )
 
@@ -163,9 +160,6 @@ def demonstration_length(flags: ArrayLike, what: str) -> int:
     Args:
         flags: Whether each frame belongs to the demonstration, `(T,) bool`.
         what: What says so, for the message.
-
-    Raises:
-        SourceError: The demonstration does not come first and in one piece.
     """
     shown = np.asarray(flags, bool)
     length = int(shown.sum())

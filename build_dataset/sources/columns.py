@@ -33,17 +33,11 @@ def resolve_columns(
 
     Returns:
         Logical name to column, of those that the dataset has: `front` and `state` at least.
-
-    Raises:
-        InvalidOptionError: A logical name is unknown.
-        UnknownNameError: A given column is not in the dataset.
-        SourceError: The front camera or the state is not found, or a column is not of a fitting
-            type.
     """
     given = given or {}
     for name in given:
         if name not in _USUAL:
-            raise InvalidOptionError.one_of(f"--columns {name}={given[name]}: name", name, _USUAL)
+            raise InvalidOptionError.one_of(f"columns {name}={given[name]}: name", name, _USUAL)
     found = {}
     for name, usual in _USUAL.items():
         column = given.get(name) or next((one for one in usual if one in features), None)
@@ -51,19 +45,19 @@ def resolve_columns(
             raise SourceError(
                 f"{place} has no column named {' or '.join(usual)} for {name!r}; its columns are: "
                 f"{', '.join(sorted(features))}",
-                f"Say which one it is: --columns {name}=COLUMN",
+                f"Name it in `columns`: {name}=COLUMN",
             )
         if column is None:
             continue
         if column not in features:
-            raise UnknownNameError.among(f"--columns {name}: column", column, place, features)
+            raise UnknownNameError.among(f"columns {name}: column", column, place, features)
         kind, shape = features[column]["dtype"], tuple(features[column]["shape"])
         expected = _unmet(name, kind, shape)
         if expected:
             raise SourceError(
                 f"{place}: column {column!r} holds {kind} of the shape {shape}; {name!r} needs "
                 f"{expected}",
-                f"Say which column it is: --columns {name}=COLUMN",
+                f"Name the right one in `columns`: {name}=COLUMN",
             )
         found[name] = column
     return found

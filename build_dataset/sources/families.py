@@ -44,9 +44,6 @@ def ids_by_columns(rows: Sequence[Mapping[str, Any]], place: str) -> dict[int, E
 
     Returns:
         Episode index to id, or None if the dataset has no such columns.
-
-    Raises:
-        SourceError: A value is not valid, or two episodes have the same id.
     """
     if not rows or not {"episode_id", "family"} & set(rows[0]):
         return None
@@ -61,9 +58,6 @@ def ids_by_file(path: Path, count: int) -> dict[int, EpisodeId]:
         path: A `.json` file (episode index to family), or a CSV file with the columns
             `episode_index`, `family` and, optionally, `split` and `index`.
         count: Number of the dataset's episodes; all must be named.
-
-    Raises:
-        SourceError: The file cannot be read, or a line of it is wrong; says which.
     """
     read, (expected, example) = (_csv, _CSV) if path.suffix != ".json" else (_json, _JSON)
     try:

@@ -53,9 +53,6 @@ class FramesSource(Source):
 
     Args:
         folder: The folder that holds `frames.parquet`.
-
-    Raises:
-        SourceError: There is no such table in it.
     """
 
     def __init__(self, folder: Path):

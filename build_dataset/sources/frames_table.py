@@ -74,11 +74,7 @@ _MAY_BE_EMPTY = ("seed", "difficulty", "simulator", "exact")
 
 
 def read_frames_table(path: Path) -> dict[EpisodeId, EpisodeRows]:
-    """Read and check the table of a frames folder.
-
-    Raises:
-        SourceError: It is malformed; says which episode and row, and what to do.
-    """
+    """Read and check the table of a frames folder."""
     try:
         table = RowSpan(path).table()
     except FormatError as error:

@@ -74,10 +74,6 @@ class H5Source(Source):
 
     Args:
         folder: The folder, or one such file.
-
-    Raises:
-        SourceError: It holds no such file.
-        MissingExtraError: h5py is not installed.
     """
 
     def __init__(self, folder: Path):
@@ -93,7 +89,7 @@ class H5Source(Source):
         if not self._files:
             raise SourceError(
                 f"{folder} holds no record_dataset_<Family>.h5 file",
-                "Point to the folder of RoboMME's recordings: --source robomme-h5:FOLDER",
+                "Point to the folder of RoboMME's recordings: robomme-h5:FOLDER",
             )
 
     def episodes(self) -> list[SourceEpisode]:

@@ -28,9 +28,6 @@ def probe_video(path: Path) -> tuple[float, bool]:
 
     Returns:
         Frames per second, and whether codec and pixel format alone make the video exact.
-
-    Raises:
-        SourceError: It is not a video, or does not say its frame rate.
     """
     hint = "Write it again with a constant frame rate, for example with codec ffv1 in a .mkv file."
     try:
@@ -87,9 +84,6 @@ def decode_images(
     Args:
         encoded: Where each image lies, for messages, and its bytes.
         exact: Whether the episode counts as exact: its images must be PNG then.
-
-    Raises:
-        FormatError: As `decode_image`, or one is not PNG; says where.
     """
     for where, data in encoded:
         try:

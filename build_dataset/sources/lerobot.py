@@ -48,7 +48,7 @@ from .robomme_families import (
 _ROBOMME_REPOS = ("lerobot/robomme", "Yinpei/robomme_data_lerobot")
 _MEND = "Correct the dataset, or leave the episode out."
 _MEND_FAMILIES = (
-    "Name the family of every episode in a file: --families-file families.csv, with the line "
+    "Name the family of every episode in a file, `families_file`, with the line "
     "episode_index,family first."
 )
 
@@ -80,10 +80,6 @@ class LeRobotSource(Source):
         columns: Logical name (`front`, `wrist`, `state`, `action`, `is_demo`, `exec_start_idx`,
             `subgoal`) to the dataset's column, where that is not named as usual.
         families_file: File that names the family of every episode, see `docs/sources.md`.
-
-    Raises:
-        InvalidOptionError: The location is neither.
-        HubError: The repository or its revision is unknown, or cannot be reached.
     """
 
     def __init__(
@@ -105,14 +101,7 @@ class LeRobotSource(Source):
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     def episodes(self) -> list[SourceEpisode]:
-        """List all episodes; see `Source.episodes`. Only `meta/` is read.
-
-        Raises:
-            MissingFileError, HubError: A file in `meta/` is missing, or cannot be fetched.
-            FormatError: A file in `meta/` cannot be read.
-            UnknownNameError, InvalidOptionError: The column map does not fit.
-            SourceError: The dataset cannot be used; says which episode, why and what to do.
-        """
+        """List all episodes; see `Source.episodes`. Only `meta/` is read."""
         columns = set(self._columns.values())
         rows, known = self._lerobot.table.to_pylist(), self._lerobot.tasks
         ids, simulator = self._ids(rows)

@@ -18,13 +18,7 @@ import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, RunFolderError, first_line
-from robomme_interference_data.schema.codec import (
-    arrow_schema,
-    from_dict,
-    read_header,
-    to_dict,
-    to_table,
-)
+from robomme_interference_data.schema.codec import arrow_schema, from_dict, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
 from robomme_interference_data.storage.files import (
     atomic_path,
@@ -34,6 +28,7 @@ from robomme_interference_data.storage.files import (
     read_bytes,
     write_json,
 )
+from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.parquet import writing
 
 from .plan import Plan, WorkItem

@@ -1,47 +1,39 @@
 """A history buffer: its sessions in order, and their frames when asked for."""
 
-import math
-import os
 from bisect import bisect_right
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby, repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DISTRACTORS, KEY_FRAMES, STATE
+from robomme_interference_data.constants import DISTRACTORS, STATE
 from robomme_interference_data.errors import (
-    FormatError,
     HashMismatchError,
     InvalidOptionError,
     MissingExtraError,
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.schema.evidence import Evidence, place_evidence
+from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.schema.evidence import Evidence, map_evidence
 from robomme_interference_data.schema.manifest import (
     BufferManifest,
     Session,
-    SessionEntry,
-    place_sessions,
+    layout_sessions,
 )
-from robomme_interference_data.schema.sampling import runs
-from robomme_interference_data.storage.cache import DecodedCache, frames_sha256
+from robomme_interference_data.storage.cache import DecodedCache
 from robomme_interference_data.storage.digest import combine
 
 from .buffer_set_index import SplitIndex
-from .dataset import Dataset, camera_feature
+from .dataset import Dataset
+from .frame_reader import FrameReader, room_for
 from .query import Query
 
-_PIECE = 8 * KEY_FRAMES
-"""Frames that one thread decodes at a time."""
-
-_MOST_BYTES = 16 << 30
-"""Bytes of frames that are held at once, at most: a short video may hold many large frames."""
+_DAMAGED = "The data is damaged or belongs to another version: download or build it again."
+_VERIFY = "verify SPLIT"
 
 
 @dataclass(frozen=True)
@@ -84,11 +76,9 @@ class Buffer:
     ):
         self.manifest = manifest
         self.query = query
-        self.sessions = place_sessions(manifest.sessions)
+        self.sessions = layout_sessions(manifest.sessions)
         self._datasets = datasets
-        self._cache = cache
-        self._threads = threads or os.cpu_count() or 1
-        self._verified = False
+        self._reader = FrameReader(self.sessions, datasets, cache, threads)
 
     def __repr__(self) -> str:
         return (
@@ -129,6 +119,10 @@ class Buffer:
         return self.query.dataset.cameras
 
     @property
+    def _stops(self) -> list[int]:
+        return [session.stop for session in self.sessions]
+
+    @property
     def session_index(self) -> NDArray[np.int64]:
         """For each frame, the number of its session, `(T,) int64`; a new array."""
         return np.repeat(
@@ -154,7 +148,7 @@ class Buffer:
 
         None where that is unknown of a lesson that it holds, or of one that contradicts it.
         """
-        return place_evidence(
+        return map_evidence(
             self.sessions,
             lambda entry: self._datasets[entry.dataset].record(entry.episode_index).evidence,
         )
@@ -170,11 +164,22 @@ class Buffer:
             MissingFileError, HubError: A file is not there, or the Hub cannot be reached.
         """
         wanted = self.cameras if cameras is None else cameras
-        episodes = {self.query.dataset: [self.query.record.episode_index]}
-        for entry in self.manifest.sessions:
-            episodes.setdefault(self._datasets[entry.dataset], []).append(entry.episode_index)
-        for dataset, indices in episodes.items():
-            dataset.files.fetch(one for i in indices for one in dataset.files_of(i, wanted))
+        query = self.query.dataset, self.query.record.episode_index, wanted
+        self._fetch(query, *(self._source(one, wanted) for one in self.sessions))
+
+    def _source(
+        self, session: Session, cameras: Sequence[str]
+    ) -> tuple[Dataset, int, Sequence[str]]:
+        entry = session.entry
+        return self._datasets[entry.dataset], entry.episode_index, cameras
+
+    def _fetch(self, *wanted: tuple[Dataset, int, Sequence[str]]) -> None:
+        """Bring the vectors and some cameras of episodes here, those of a dataset all at once."""
+        episodes: dict[Dataset, list[tuple[int, Sequence[str]]]] = {}
+        for dataset, index, cameras in wanted:
+            episodes.setdefault(dataset, []).append((index, cameras))
+        for dataset, some in episodes.items():
+            dataset.files.fetch(path for one in some for path in dataset.files_of(*one))
 
     def frames(self, camera: str = "front") -> NDArray[np.uint8]:
         """Decode all frames of a camera, sessions side by side on several threads.
@@ -189,15 +194,9 @@ class Buffer:
             UnknownNameError: There is no such camera.
             MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
         """
-        out = _room(len(self), self.query.dataset.shape(camera))
-        self.fetch([camera])
-        with ThreadPoolExecutor(self._threads) as pool:
-            try:
-                for finish in [self._start_reading(s, camera, out, pool) for s in self.sessions]:
-                    finish()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        out = room_for(len(self), self.query.dataset.shape(camera))
+        self._fetch(*(self._source(one, [camera]) for one in self.sessions))
+        self._reader.read(camera, out)
         return out
 
     def frame(self, index: int, camera: str = "front") -> NDArray[np.uint8]:
@@ -251,7 +250,11 @@ class Buffer:
             raise InvalidOptionError.expected("cameras", cameras, "their names: ['front', 'wrist']")
         wanted = self.cameras if cameras is None else tuple(cameras)
         shapes = {name: self.query.dataset.shape(name) for name in wanted}
-        decoders = {name: self._iter_chosen(name, chosen) for name in wanted}
+        used = {*np.searchsorted(self._stops, chosen, side="right").tolist()}
+        sources = enumerate(self.sessions)
+        # All at once: a chunk would wait for its videos otherwise. States are of all sessions.
+        self._fetch(*(self._source(one, wanted if n in used else ()) for n, one in sources))
+        decoders = {name: self._reader.iter(name, chosen.tolist()) for name in wanted}
         session_index = self.session_index
         try:
             for first in range(0, len(chosen), chunk):
@@ -268,9 +271,9 @@ class Buffer:
 
     def index(self, encoder: str, camera: str = "front") -> SplitIndex:
         """Open the indexes of the datasets that the buffer needs; see `SplitIndex`."""
-        needed = {DISTRACTORS, self.query.dataset.kind}
+        needed = {DISTRACTORS, self.query.dataset.kind} & {*self._datasets}
         needed |= {entry.dataset for entry in self.manifest.sessions}
-        datasets = {name: one for name, one in self._datasets.items() if name in needed}
+        datasets = {name: self._datasets[name] for name in sorted(needed)}
         return SplitIndex(datasets, encoder, camera)
 
     def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
@@ -301,34 +304,53 @@ class Buffer:
         Raises:
             MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
         """
-        place = self.query.place
+        place = self.query.first_frame
         span = place.dataset, place.episode_index, place.frame, place.frame + 1
         return self.index(encoder, camera).span(*span)[0]
 
     def verify(self) -> None:
-        """Decode everything and compare it with the manifest's SHA-256.
+        """Check the manifest, decode everything, and compare it with the recorded SHA-256.
 
         From then on, what a cache holds is compared too, whenever it is read.
 
         Raises:
-            HashMismatchError: A session's data is not what the manifest names.
+            HashMismatchError: The manifest contradicts the query's record, a dataset's records
+                are not those of its revision, or frames or states are not the recorded ones.
         """
-        self._verified = True
-        for entry in self.manifest.sessions:
-            dataset = self._datasets[entry.dataset]
-            [found] = dataset.digests(entry.episode_index, [(entry.start, entry.stop)])
-            if combine(found) == entry.sha256:
-                continue
-            recorded = self._recorded(entry) or {}
-            differing = [name for name in found if found[name] != recorded.get(name)]
-            raise HashMismatchError(
-                f"{self.manifest}: {entry.role} {entry.source} ({entry.dataset} episode "
-                f"{entry.episode_index}, frames {entry.start} to {entry.stop - 1}) does not have "
-                "the SHA-256 of the manifest; differing: "
-                f"{', '.join(differing) or 'the manifest itself'}",
-                "The data is damaged or belongs to another version: download or build it again, "
-                "then run robomme-interference verify SPLIT",
-            )
+        self._reader.verified = True
+        query, manifest = self.query, self.manifest
+        for dataset in {query.dataset, *(self._datasets[e.dataset] for e in manifest.sessions)}:
+            dataset.check_records()
+        condition = parse_condition(manifest.condition)
+        planned = query.manifest(condition, manifest.sessions, exact=manifest.exact)
+        for name, value in vars(planned).items():
+            if getattr(manifest, name) != value:
+                what = f"{name} of {manifest} is not that of its query and sessions"
+                raise HashMismatchError(what, _DAMAGED, _VERIFY)
+        for entry in manifest.sessions:
+            span = entry.start, entry.stop
+            what = f"{entry.role} {entry.source}"
+            self._check_span(what, entry.dataset, entry.episode_index, span, entry.sha256)
+        place, recorded = query.first_frame, query.record.span_sha256
+        span = place.frame, place.frame + 1
+        sha256 = recorded.query if recorded else ""
+        self._check_span("first live view", place.dataset, place.episode_index, span, sha256)
+
+    def _check_span(
+        self, what: str, name: str, index: int, span: tuple[int, int], sha256: str
+    ) -> None:
+        dataset = self._datasets[name]
+        [found] = dataset.digests(index, [span])
+        if combine(found) == sha256:
+            return
+        recorded = dataset.record(index).digests(*span)
+        differing = [name for name in found if recorded and found[name] != recorded.get(name)]
+        raise HashMismatchError(
+            f"{self.manifest}: {what} ({name} episode {index}, frames {span[0]} to {span[1] - 1}) "
+            f"does not have the recorded SHA-256{': ' * bool(differing)}{', '.join(differing)}",
+            _DAMAGED,
+            _VERIFY,
+        )
 
     def _chosen(self, indices: Sequence[int] | None) -> NDArray[np.int64]:
         """Return what `stream` is asked for, `(n,) int64`."""
@@ -350,92 +372,3 @@ class Buffer:
                     f"frame {index} is not in the buffer of {self.manifest}, which has "
                     f"{len(self)} history frames, numbered from 0"
                 )
-
-    def _recorded(self, entry: SessionEntry) -> dict[str, str] | None:
-        """Return the recorded digests of a session by feature; None if none are recorded."""
-        record = self._datasets[entry.dataset].record(entry.episode_index)
-        return record.digests(entry.start, entry.stop)
-
-    def _cached(
-        self, entry: SessionEntry, camera: str
-    ) -> tuple[str | None, NDArray[np.uint8] | None]:
-        """Return what the cache calls a session's frames, if it may keep them; and those it has."""
-        recorded = None if self._cache is None else self._recorded(entry)
-        if self._cache is None or recorded is None:
-            return None, None
-        name = recorded.get(camera_feature(camera), "")
-        shape = (entry.stop - entry.start, *self._datasets[entry.dataset].shape(camera))
-        return name, self._cache.get(name, shape, verify=self._verified)
-
-    def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
-        # Under their own digest only: another split may hold the frames that are called so.
-        if self._cache is not None and name is not None and frames_sha256(frames) == name:
-            self._cache.put(name, frames)
-
-    def _start_reading(
-        self, session: Session, camera: str, out: NDArray[np.uint8], pool: ThreadPoolExecutor
-    ) -> Callable[[], None]:
-        """Start to read a session into its place in `out`; the result waits until it is done."""
-        entry, target = session.entry, out[session.start : session.stop]
-        dataset, length = self._datasets[entry.dataset], entry.stop - entry.start
-        name, cached = self._cached(entry, camera)
-        piece = _PIECE if self._threads > 1 else length
-        shown = target.reshape(length, entry.repeat, *target.shape[1:])  # a view
-
-        def read(first: int) -> None:
-            last = min(first + piece, length)
-            if cached is not None:
-                shown[first:last] = cached[first:last, None]
-                return
-            start, stop = entry.start + first, entry.start + last
-            frames = dataset.iter_frames(entry.episode_index, camera, start, stop)
-            for number, frame in enumerate(frames, first):
-                shown[number] = frame
-
-        reading = [pool.submit(read, first) for first in range(0, length, piece)]
-
-        def finish() -> None:
-            for one in reading:
-                one.result()
-            if cached is None:
-                self._keep(name, shown[:, 0])
-
-        return finish
-
-    def _iter_chosen(self, camera: str, chosen: NDArray[np.int64]) -> Generator[NDArray[np.uint8]]:
-        """Yield frames, `(H, W, 3) uint8`, by their ascending indices."""
-        for start, stop in runs(chosen.tolist()):
-            yield from self._iter_frames(camera, start, stop)
-
-    def _iter_frames(self, camera: str, start: int, stop: int) -> Generator[NDArray[np.uint8]]:
-        """Yield frames `start` to `stop` (excluded), `(H, W, 3) uint8`, in order."""
-        for session in self.sessions:
-            places = range(max(start, session.start), min(stop, session.stop))
-            if not places:
-                continue
-            entry, dataset = session.entry, self._datasets[session.entry.dataset]
-            stored = [(place - session.start) // entry.repeat for place in places]
-            name, whole = self._cached(entry, camera)
-            frames: Iterator[NDArray[np.uint8]]
-            if name is None:
-                first, last = entry.start + stored[0], entry.start + stored[-1] + 1
-                frames = dataset.iter_frames(entry.episode_index, camera, first, last)
-            else:
-                if whole is None:
-                    whole = _room(entry.stop - entry.start, dataset.shape(camera))
-                    dataset.read_frames(entry.episode_index, camera, entry.start, whole)
-                    self._keep(name, whole)
-                frames = iter(whole[stored[0] : stored[-1] + 1])
-            for frame, (_, shown) in zip(frames, groupby(stored), strict=True):
-                yield from repeat(frame, len(list(shown)))
-
-
-def _room(frames: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    size = frames * math.prod(shape)
-    if size > _MOST_BYTES:
-        raise FormatError(
-            f"{frames} frames of shape {shape} take {size:,} bytes; at most {_MOST_BYTES:,} are "
-            "held at once",
-            "Take them in chunks, without a cache: buffer.stream(64)",
-        )
-    return np.empty((frames, *shape), np.uint8)

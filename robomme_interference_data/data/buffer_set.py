@@ -2,21 +2,18 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
-    FURTHER,
     MANIFEST_PATH,
-    MANIFEST_ROWS,
-    MANIFESTS,
+    OPTIONAL_DATASETS,
 )
 from robomme_interference_data.errors import (
     FormatError,
@@ -26,23 +23,23 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId, whole_number
-from robomme_interference_data.schema.codec import from_table, read_header, to_dict
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import Condition, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
 from robomme_interference_data.storage.cache import DecodedCache
 from robomme_interference_data.storage.files import LocalFiles, canonical_json
+from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.hub import HubFiles
-from robomme_interference_data.storage.parquet import RowSpan
 from robomme_interference_data.viz.tables import Table
 
 from .buffer import Buffer
 from .dataset import Dataset
+from .manifest_table import ManifestTable
 from .query import Query
 
 _FOLDER = re.compile(r"\w[\w.-]*")
 _PLACE = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
-_BATCH = 1024
-"""Rows that are read at a time."""
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class Split:
@@ -61,6 +58,8 @@ class Split:
         self._threads = threads
         path = files.path(MANIFEST_PATH)
         self.header = read_header(path, ManifestHeader)
+        if not _DIGEST.fullmatch(self.header.rows):
+            raise FormatError.damaged(path, f"rows: {self.header.rows[:80]!r} is no SHA-256")
         if DEMONSTRATIONS not in self.header.datasets:
             raise FormatError.damaged(path, "no demonstrations")
         for name, dataset in self.header.datasets.items():
@@ -74,7 +73,9 @@ class Split:
 
     def _repr_html_(self) -> str:
         """Return the table of its buffers by family, as notebooks show it."""
-        counts = Counter(zip(self._keys["family"], self._keys["condition"], strict=True))
+        counts = Counter(
+            zip(self._table.keys["family"], self._table.keys["condition"], strict=True)
+        )
         return Table.make(
             "buffers",
             f"{self.name}: {len(self):,} buffers of {len(self.episode_ids):,} query episodes",
@@ -85,7 +86,7 @@ class Split:
 
     def __len__(self) -> int:
         """Return the number of buffers."""
-        return len(self._keys["episode_id"])
+        return len(self._table.keys["episode_id"])
 
     @property
     def name(self) -> str:
@@ -114,22 +115,13 @@ class Split:
         return self.header.conditions
 
     @cached_property
-    def datasets(self) -> dict[str, Dataset]:
-        """The datasets by name, such as `demonstrations` and `distractors`.
+    def datasets(self) -> Mapping[str, Dataset]:
+        """The datasets by name, such as `demonstrations`; each is opened on first use.
 
         Raises:
             HashMismatchError: A dataset is not the one that the manifests were made for.
         """
-        opened = {}
-        for name, recorded in self.header.datasets.items():
-            dataset = opened[name] = Dataset(self.place(name))
-            if dataset.revision != recorded.revision:
-                raise HashMismatchError(
-                    f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
-                    f"manifests were made for {recorded.revision[:12]}…",
-                    self.mend,
-                )
-        return opened
+        return _Datasets(self)
 
     def place(self, name: str) -> LocalFiles | HubFiles:
         """Return where a dataset of the split lies.
@@ -139,21 +131,24 @@ class Split:
         place, own = self.header.datasets[name].place, self.files
         if isinstance(own, LocalFiles) and (place is None or (own.root / name).is_dir()):
             return LocalFiles(own.root / name)
-        if place is None and isinstance(own, HubFiles) and name in FURTHER:
+        if place is None and isinstance(own, HubFiles) and name in OPTIONAL_DATASETS:
             return own.inside(name)
         if place is None:
             raise MissingFileError(
                 f"the manifests of {self.location} do not say where its {name} are",
-                "A published split says it: robomme-interference publish SPLIT --repo-id NAME",
+                "Those of a published split do.",
+                "publish SPLIT --repo-id NAMESPACE/NAME",
             )
         return own if place == "." else HubFiles.parse(place)
 
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
         """Ids of all query episodes, in canonical order."""
-        return tuple(sorted(EpisodeId.parse(text or "") for text in {*self._keys["episode_id"]}))
+        return tuple(
+            sorted(EpisodeId.parse(text or "") for text in {*self._table.keys["episode_id"]})
+        )
 
-    @property
+    @cached_property
     def families(self) -> tuple[str, ...]:
         """Families of the query episodes, in canonical order."""
         return tuple(dict.fromkeys(episode.family for episode in self.episode_ids))
@@ -174,8 +169,8 @@ class Split:
         if wanted.name not in self.conditions:
             raise UnknownNameError(
                 f"condition {wanted.name!r} is not in {self.location}",
-                f"Planned there: {' '.join(self.conditions)}. For another one, type: "
-                f"{self.planning(*self.conditions, wanted.name)}",
+                f"Planned there: {' '.join(self.conditions)}.",
+                self.planning(*self.conditions, wanted.name),
             )
         return wanted
 
@@ -185,7 +180,7 @@ class Split:
         if isinstance(self.files, HubFiles):  # what is published stays as it is
             place = self.header.datasets[DEMONSTRATIONS].place
             command = f"new-split --demonstrations {place} --source KIND:PATH --out SPLIT"
-        return f"robomme-interference {command} --conditions {','.join(conditions)}"
+        return f"{command} --conditions {','.join(conditions)}"
 
     @property
     def mend(self) -> str:
@@ -198,10 +193,7 @@ class Split:
                 f"Fetch it again: type hf cache rm {cached}, and the same command. If that does "
                 "not help, only its publisher can."
             )
-        return (
-            "Put the right files there, or build the manifests again: "
-            f"robomme-interference build manifests {self.location}"
-        )
+        return "Put the right files there, or build the manifests again."
 
     def query(self, episode_id: EpisodeId | str) -> Query:
         """Return a query episode: its goal, scene and first live observation, without a buffer.
@@ -225,13 +217,11 @@ class Split:
         """Return the manifest of one buffer; see `load_buffer` for arguments and errors."""
         episode = EpisodeId.parse(episode_id)
         wanted = self.planned(condition, k)
-        row = self._places.get((str(episode), wanted.name))
-        if row is None:
+        found = self._table.manifest(str(episode), wanted.name)
+        if found is None:
             self._check_episode(episode)
-            raise FormatError.damaged(self._rows.path, f"no row of {episode} under {wanted}")
-        return next(
-            from_table(BufferManifest, self._rows.part(row, row + 1).table(), self._rows.path)
-        )
+            raise FormatError.damaged(self._table.path, f"no row of {episode} under {wanted}")
+        return found
 
     def manifests(
         self,
@@ -262,13 +252,13 @@ class Split:
         }
         keep = np.ones(len(self), bool)
         for column, values in wanted.items():
-            known = {one for one in self._keys[column] if one is not None}
+            known = {one for one in self._table.keys[column] if one is not None}
             for value in values:
                 if value not in known:
                     raise UnknownNameError.among(column, value, self.location, known)
             if values:
-                keep &= np.array([one in values for one in self._keys[column]])
-        return self._read(keep)
+                keep &= np.array([one in values for one in self._table.keys[column]])
+        return self._table.manifests(keep)
 
     def load(
         self,
@@ -283,6 +273,7 @@ class Split:
         buffer = self._buffer(self.manifest(episode_id, condition, k=k))
         buffer.fetch(cameras)
         if verify:
+            self._table.check(self.mend)
             buffer.verify()
         return buffer
 
@@ -294,7 +285,7 @@ class Split:
         for entry in manifest.sessions:
             if entry.dataset not in self.datasets:
                 what = f"a session of {manifest} is of {entry.dataset!r}, no dataset of the split"
-                raise FormatError.damaged(self._rows.path, what)
+                raise FormatError.damaged(self._table.path, what)
         return Buffer(
             manifest,
             self.query(manifest.episode_id),
@@ -304,37 +295,51 @@ class Split:
         )
 
     def _check_episode(self, episode: EpisodeId) -> None:
+        if episode in self._episodes:
+            return
         if episode.family not in self.families:
             raise UnknownNameError.among("family", episode.family, self.location, self.families)
-        if episode not in self.episode_ids:
-            raise UnknownNameError.among("episode", str(episode), self.location, self.episode_ids)
-
-    def _read(self, keep: NDArray[np.bool_]) -> Iterator[BufferManifest]:
-        for first in range(0, len(keep), _BATCH):
-            wanted = keep[first : first + _BATCH]
-            if wanted.any():
-                table = self._rows.part(first, first + len(wanted)).table()
-                yield from from_table(BufferManifest, table.filter(wanted), self._rows.path)
+        raise UnknownNameError.among("episode", str(episode), self.location, self.episode_ids)
 
     @cached_property
-    def _rows(self) -> RowSpan:
-        return RowSpan(self.files.path(f"{MANIFESTS}/{MANIFEST_ROWS}"))
+    def _table(self) -> ManifestTable:
+        return ManifestTable(self.files, self.header)
 
     @cached_property
-    def _keys(self) -> dict[str, list[str | None]]:
-        """The columns by which buffers are found; kept, as many may be asked for."""
-        columns = ["episode_id", "condition", "family", "difficulty"]
-        keys: dict[str, list[str | None]] = self._rows.table(columns).to_pydict()
-        for column, values in keys.items():
-            if not all(value is None or isinstance(value, str) for value in values):
-                raise FormatError.damaged(self._rows.path, f"column {column} is not text")
-        return keys
+    def _episodes(self) -> frozenset[EpisodeId]:
+        return frozenset(self.episode_ids)
 
-    @cached_property
-    def _places(self) -> dict[tuple[str | None, str | None], int]:
-        """The row of each buffer by its key."""
-        keys = zip(self._keys["episode_id"], self._keys["condition"], strict=True)
-        return {key: row for row, key in enumerate(keys)}
+
+class _Datasets(Mapping[str, Dataset]):
+    """The datasets of a split, each opened on first use."""
+
+    def __init__(self, split: Split):
+        self._split = split
+        self._opened: dict[str, Dataset] = {}
+
+    def __getitem__(self, name: str) -> Dataset:
+        if name not in self._opened:
+            recorded = self._split.header.datasets[name]
+            dataset = Dataset(self._split.place(name))
+            if dataset.revision != recorded.revision:
+                local = isinstance(self._split.files, LocalFiles)
+                raise HashMismatchError(
+                    f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
+                    f"manifests were made for {recorded.revision[:12]}…",
+                    self._split.mend,
+                    f"build manifests {self._split.location}" if local else None,
+                )
+            self._opened[name] = dataset
+        return self._opened[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._split.header.datasets
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._split.header.datasets)
+
+    def __len__(self) -> int:
+        return len(self._split.header.datasets)
 
 
 def _condition(condition: Condition | str | None, k: int | None) -> Condition:

@@ -48,13 +48,6 @@ class SplitIndex:
         datasets: Those datasets of the split that are needed, the distractor units among them.
         encoder: Name of the encoder, such as `thumbnail`.
         camera: Name of the camera, with or without `observation.images.`.
-
-    Raises:
-        MissingIndexError: A dataset has no embeddings of this encoder and camera, or there are no
-            distractor units.
-        StaleIndexError: They were made of other data, with another encoder, or with another one
-            than those of the distractor units.
-        FormatError: They are of an unknown version, or damaged.
     """
 
     def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str = "front"):
@@ -114,9 +107,5 @@ class SplitIndex:
 
         Returns:
             `(stop - start, size) float32`, each of length 1; a new array.
-
-        Raises:
-            UnknownNameError: The index does not hold these frames.
-            FormatError: A file of the index is missing or damaged.
         """
         return self.embed(self._indexes[dataset].span(episode_index, start, stop))

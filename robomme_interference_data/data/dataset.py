@@ -5,7 +5,8 @@ a lean copy of that table in `meta/interference.parquet`, and its identity in
 `meta/interference.json`.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import Any
@@ -24,30 +25,36 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import (
     FormatError,
+    HashMismatchError,
     InvalidOptionError,
     MissingFileError,
     UnknownNameError,
 )
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.codec import from_dict, read_header
+from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord
 from robomme_interference_data.storage.digest import SpanDigester, combine
-from robomme_interference_data.storage.files import Files, read_sums, sha256_file
+from robomme_interference_data.storage.files import Files, canonical_json, read_sums, sha256_file
+from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.lerobot import LeRobotFiles
 
 from .embeddings import EmbeddingIndex
 
 
 def camera_feature(camera: str) -> str:
-    """Return the feature name of a camera, whether `observation.images.` is given or not.
-
-    Raises:
-        InvalidOptionError: What is given is no text.
-    """
+    """Return the feature name of a camera, whether `observation.images.` is given or not."""
     if not isinstance(camera, str):
         raise InvalidOptionError.expected("camera", camera, "the name of one, such as 'front'")
     return CAMERA_PREFIX + camera.removeprefix(CAMERA_PREFIX)
+
+
+def revision_of(records: Iterable[EpisodeRecord]) -> str:
+    """Return the SHA-256 over episode records, which is the revision of a dataset of them."""
+    revision = hashlib.sha256()
+    for record in records:
+        revision.update(canonical_json(to_dict(record)).encode(errors="backslashreplace") + b"\n")
+    return revision.hexdigest()
 
 
 class Dataset:
@@ -72,12 +79,13 @@ class Dataset:
             raise MissingFileError(
                 f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
                 f"{IDENTITY_PATH} is missing",
-                "Build one from it: robomme-interference build distractors "
-                f"--source lerobot:{files.describe()} --out DIR",
+                "Build one from it.",
+                f"build distractors --source lerobot:{files.describe()} --out DIR",
             ) from None
         self.identity = read_header(path, DatasetIdentity)
         self._indexes: dict[tuple[str, str], EmbeddingIndex] = {}
         self._records: dict[int, EpisodeRecord] = {}
+        self._checked = False
 
     def __repr__(self) -> str:
         return f"Dataset({self.kind}, {self.files.describe()}, episodes={len(self)})"
@@ -147,6 +155,20 @@ class Dataset:
             for index, row in enumerate(self.lerobot.table.to_pylist()):
                 self._records[index] = from_dict(EpisodeRecord, row, where)
         return (self._records[index] for index in range(len(self)))
+
+    def check_records(self) -> None:
+        """Check the records of all episodes against the revision; once.
+
+        Raises:
+            HashMismatchError: They are others.
+        """
+        if not self._checked and revision_of(self.records()) != self.revision:
+            raise HashMismatchError(
+                f"the episode records of {self.files.describe()} are not those of its revision",
+                "The data is damaged: download or build it again.",
+                "verify SPLIT",
+            )
+        self._checked = True
 
     def session(self, role: str, record: EpisodeRecord) -> SessionEntry:
         """Return the session that an episode of the dataset is: a whole lesson, or a unit.
@@ -236,8 +258,19 @@ class Dataset:
         self.lerobot.check_span(episode_index, start, stop)
         return self.lerobot.vectors(episode_index, feature)[start:stop]
 
-    def digests(self, episode_index: int, spans: Sequence[tuple[int, int]]) -> list[dict[str, str]]:
-        """Decode an episode once; return the digests by feature of spans of it, end excluded."""
+    def digests(
+        self,
+        episode_index: int,
+        spans: Sequence[tuple[int, int]],
+        watch: Callable[[str, NDArray[Any]], None] | None = None,
+    ) -> list[dict[str, str]]:
+        """Decode an episode once; return the digests by feature of spans of it, end excluded.
+
+        Args:
+            episode_index: The episode.
+            spans: First frame, and the one after the last, of each span.
+            watch: Called with each feature and value on the way.
+        """
         first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
         running = SpanDigester(spans)
         for name in self.features:
@@ -248,6 +281,8 @@ class Dataset:
             )
             for index, value in enumerate(values, first):
                 running.update(name, index, value)
+                if watch is not None:
+                    watch(name, value)
         return running.digests()
 
     def sums(self) -> dict[str, str]:

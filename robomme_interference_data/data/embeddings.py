@@ -31,7 +31,7 @@ from robomme_interference_data.errors import (
     StaleIndexError,
     UnknownNameError,
 )
-from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.storage.arrays import read_array
 from robomme_interference_data.storage.files import (
     Files,
@@ -40,6 +40,7 @@ from robomme_interference_data.storage.files import (
     read_sums,
     sha256_file,
 )
+from robomme_interference_data.storage.headers import read_header
 
 CENTRE_FILE = "centre.npy"
 INDEX_SUMS = "SHA256SUMS"
@@ -118,9 +119,6 @@ def encoder_id(encoder: str) -> str:
     Returns:
         `thumbnail`; `siglip` for the paper's model; `siglip:google/siglip2-base-patch16-224`;
         `siglip:NAME` for a folder of that name.
-
-    Raises:
-        InvalidOptionError: It names none.
     """
     kind, _, model = encoder.partition(":")
     if not kind:
@@ -170,11 +168,6 @@ class EmbeddingIndex:
         revision: The dataset's identity, `Dataset.revision`.
         encoder: Name of the encoder, see `encoder_id`.
         camera: Camera, with or without `observation.images.`.
-
-    Raises:
-        MissingIndexError: The dataset has no index of this encoder and camera.
-        StaleIndexError: The index was made of other data, or with another encoder.
-        FormatError: It is of an unknown version, or damaged.
     """
 
     def __init__(self, files: Files, revision: str, encoder: str, camera: str = "front"):
@@ -226,11 +219,7 @@ class EmbeddingIndex:
 
     @property
     def typical_cosine(self) -> float:
-        """What `IndexHeader` says of distractor units.
-
-        Raises:
-            FormatError: It says nothing.
-        """
+        """What `IndexHeader` says of distractor units."""
         if self.header.typical_cosine is None:
             raise self._damaged(f"{INDEX_HEADER} has no typical cosine")
         return self.header.typical_cosine
@@ -240,10 +229,6 @@ class EmbeddingIndex:
 
         Returns:
             `(stop - start, size) float16`, as the encoder gave them, rounded; a new array.
-
-        Raises:
-            UnknownNameError: The index does not hold these frames.
-            FormatError: A file of the index is missing or damaged.
         """
         name = episode_file(episode_index)
         found = self._array(name, (-1, self.header.size), np.float16) if name in self._sums else ()
@@ -261,9 +246,6 @@ class EmbeddingIndex:
         Args:
             lengths: Stored frames of each episode of the dataset.
             units: Whether the dataset is of distractor units.
-
-        Raises:
-            FormatError: A file is missing or damaged, or one is too many.
         """
         header, typical = self.header, self.header.typical_cosine
         finite = typical is None or np.isfinite(typical)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robomme_interference_data.constants import (
-    FURTHER,
     INDEX_DIR,
     INDEX_HEADER,
     MANIFEST_PATH,
     MANIFESTS,
+    OPTIONAL_DATASETS,
     QUESTIONS_PATH,
     SHIFTED,
 )
@@ -79,7 +79,7 @@ def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
             for path, (top, *below) in ((path, path.split("/")) for path in sizes)
             if top in ("meta", MANIFESTS)
             or (not below and (config.questions or top != QUESTIONS_PATH))
-            or (whole and top not in (INDEX_DIR, *FURTHER))
+            or (whole and top not in (INDEX_DIR, *OPTIONAL_DATASETS))
         }
         for name, dataset in split.datasets.items():
             if dataset.files is files:

@@ -49,7 +49,8 @@ def load_split(
         raise MissingFileError(
             f"{files.describe()} is not a split: {MANIFEST_PATH} is missing",
             "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
-            "one: robomme-interference build all --source KIND:PATH --out SPLIT",
+            "one.",
+            "build all --source KIND:PATH --out SPLIT",
         ) from error
 
 

@@ -13,7 +13,7 @@ from robomme_interference_data.schema.manifest import (
     BufferManifest,
     QueryFrame,
     SessionEntry,
-    place_sessions,
+    layout_sessions,
 )
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
@@ -72,7 +72,7 @@ class Query:
         return start
 
     @property
-    def place(self) -> QueryFrame:
+    def first_frame(self) -> QueryFrame:
         """Where the first live observation is stored."""
         dataset, index = self.dataset, self.record.episode_index
         return QueryFrame(dataset.kind, dataset.revision, index, self.lesson_frames)
@@ -87,7 +87,7 @@ class Query:
             sessions: What the buffer holds, in order.
             exact: Whether all frames are the recorded ones, bit for bit.
         """
-        record, lessons = self.record, place_sessions(sessions, "lesson")
+        record, lessons = self.record, layout_sessions(sessions, "lesson")
         frames = sum(one.num_frames for one in sessions)
         return BufferManifest(
             episode_id=record.episode_id,
@@ -101,7 +101,7 @@ class Query:
             lesson_frames=lesson_frames(lessons, range(frames)),
             history_frames=frames,
             lesson_share=lesson_share(lessons, range(frames)),
-            query=self.place,
+            query=self.first_frame,
             sessions=sessions,
         )
 

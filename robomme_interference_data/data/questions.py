@@ -77,28 +77,22 @@ def digest_questions(questions: Iterable[Question]) -> str:
 
 
 def read_questions(split: Split) -> dict[EpisodeId, Question]:
-    """Read the questions of a split, by query episode.
-
-    Raises:
-        MissingFileError: It has none; says how they are made.
-        FormatError: The file is damaged, lacks a query, or was made for other demonstrations.
-        HubError: It is on the Hub, and cannot be fetched.
-    """
-    mend = "Ask its publisher to make them: robomme-interference build questions SPLIT"
-    if isinstance(split.files, LocalFiles):
-        mend = f"Type: robomme-interference build questions {split.location}"
+    """Read the questions of a split, by query episode."""
+    local = isinstance(split.files, LocalFiles)
+    hint = "" if local else "Only its publisher can make them again."
+    command = f"build questions {split.location}" if local else None
     try:
         path = split.files.path(QUESTIONS_PATH)
     except MissingFileError:
         what = f"{split.location} has no questions ({QUESTIONS_PATH})"
-        raise MissingFileError(what, mend) from None
+        raise MissingFileError(what, hint, command) from None
     table = read_table(open_parquet(path), path)
     found = {one.episode_id: one for one in from_table(Question, table, path)}
     revision = split.datasets[DEMONSTRATIONS].identity.revision
     if len(found) != len(table):
         raise FormatError.damaged(path, "a query has two questions")
     if any(one.revision != revision for one in found.values()):
-        raise FormatError(f"{path} has questions for other demonstrations", mend)
+        raise FormatError(f"{path} has questions for other demonstrations", hint, command)
     if lacking := sorted({*split.episode_ids} - found.keys()):
-        raise FormatError(f"{path} lacks the question of {lacking[0]}", mend)
+        raise FormatError(f"{path} lacks the question of {lacking[0]}", hint, command)
     return found

@@ -24,11 +24,6 @@ def live_frame(
         buffer: A buffer of it.
         shift: How the scene differs from the lesson's; None if it does not.
         camera: Name of the camera.
-
-    Raises:
-        UnknownNameError: There is no such camera, or no view of the query.
-        MissingFileError: The split has no views under shifts, or a file is missing.
-        FormatError, TruncatedVideoError: Its video cannot be read.
     """
     if shift is None:
         return buffer.query.frame(camera)
@@ -50,10 +45,6 @@ def live_embedding(
         shift: As for `live_frame`.
         encoder: Name of the encoder.
         camera: Name of the camera.
-
-    Raises:
-        UnknownNameError, MissingFileError: As for `live_frame`.
-        MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
     """
     if shift is None:
         return buffer.query_embedding(encoder, camera)
@@ -71,7 +62,7 @@ def _views(split: Split) -> Dataset:
             raise MissingFileError(what, "Ask its publisher to add them.")
         raise MissingFileError(
             what,
-            f"Type: robomme-interference build {SHIFTED} --source tabletop --split test --out "
-            f"{split.location}/{SHIFTED}, then build manifests and index again.",
+            "Build them, then build manifests and index again.",
+            f"build {SHIFTED} --source tabletop --split test --out {split.location}/{SHIFTED}",
         )
     return split.datasets[SHIFTED]

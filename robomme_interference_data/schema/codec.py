@@ -10,16 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from itertools import accumulate
-from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 
-from robomme_interference_data.constants import FORMAT_VERSION
 from robomme_interference_data.errors import FormatError, first_line
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.storage.files import read_json
 
 _SCALARS: dict[Any, tuple[pa.DataType, tuple[type, ...], str]] = {
     str: (pa.string(), (str,), "text"),
@@ -98,12 +95,7 @@ def _column(field: pa.Field, records: Sequence[Any], shared: dict[int, Any]) -> 
 
 
 def from_table[T](record: type[T], table: pa.Table, path: object) -> Iterator[T]:
-    """Yield the records of a table's rows; further columns are left aside.
-
-    Raises:
-        FormatError: A column is missing or of another type, or a value is not what it should be;
-            `path` is named.
-    """
+    """Yield the records of a table's rows; further columns are left aside."""
     names = _names(record)
     if missing := [name for name in names if name not in table.column_names]:
         raise FormatError.damaged(path, f"column {', '.join(missing)} is missing")
@@ -118,9 +110,6 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
         value: What was read.
         path: Where, for messages.
         strict: Refuse names that the record does not have.
-
-    Raises:
-        FormatError: A value is missing, or not of its field's type, or contradicts another.
     """
     try:
         if strict and isinstance(value, Mapping):
@@ -132,23 +121,6 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
         return found
     except ValueError as error:
         raise FormatError.damaged(path, first_line(error)) from None
-
-
-def read_header[T](path: Path, record: type[T]) -> T:
-    """Read a JSON file with a `format_version` as a record.
-
-    Raises:
-        FormatError: It is damaged, or of a format version that this package does not know.
-    """
-    value = read_json(path)
-    if "format_version" in _names(record):
-        version = value.get("format_version")
-        if version != FORMAT_VERSION:
-            raise FormatError(
-                f"{path} has format version {version!r}; this package reads {FORMAT_VERSION}",
-                "Install the version of robomme-interference-data that wrote it, or make it again.",
-            )
-    return from_dict(record, value, path, strict=True)
 
 
 def _names(record: Any) -> list[str]:

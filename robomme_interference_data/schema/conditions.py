@@ -30,7 +30,7 @@ DEFAULT_CONDITIONS = (NO_HISTORY, "k0", "k1", "k3", "k7")
 """The paper's conditions."""
 
 
-class Material(Protocol):
+class SessionProvider(Protocol):
     """What a rule makes the history of one query of."""
 
     def lesson(self, part: str = "lesson") -> SessionEntry:
@@ -43,27 +43,15 @@ class Material(Protocol):
         ...
 
     def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
-        """Return `k` units of other families, in order; nested in `k`, of the same episodes in all.
-
-        Raises:
-            PoolTooSmallError: There are not so many.
-        """
+        """Return `k` units of other families, in order; nested in `k`, alike in all datasets."""
         ...
 
     def own_units(self, k: int) -> Sequence[SessionEntry]:
-        """Return `k` units of the query's own family, of other scenes; nested in `k`.
-
-        Raises:
-            PoolTooSmallError: There are not so many.
-        """
+        """Return `k` units of the query's own family, of other scenes; nested in `k`."""
         ...
 
     def contradiction(self) -> SessionEntry:
-        """Return a demonstration in the very scene of the query, with another answer.
-
-        Raises:
-            SourceError: There is none.
-        """
+        """Return a demonstration in the very scene of the query, with another answer."""
         ...
 
 
@@ -76,7 +64,7 @@ class Kind:
 
     Attributes:
         name: `k` for the paper's conditions with history, `no-history`, and so on.
-        rule: From a query's material and `k` to its sessions.
+        rule: From a query's provider and `k` to its sessions.
         holds: The sessions in order, in words; units are those of `k<n>`.
         asks: What is asked by it.
         needs: Datasets that a split must hold for it, beside demonstrations and distractors.
@@ -85,7 +73,7 @@ class Kind:
     """
 
     name: str
-    rule: Callable[[Material, int], Sessions] = field(compare=False)
+    rule: Callable[[SessionProvider, int], Sessions] = field(compare=False)
     holds: str = ""
     asks: str = ""
     needs: tuple[str, ...] = ()
@@ -99,49 +87,49 @@ class Kind:
         return f"{prefix}k<n>" if self.counted else self.name
 
 
-def _nothing(material: Material, k: int) -> Sessions:
+def _nothing(provider: SessionProvider, k: int) -> Sessions:
     return ()
 
 
-def _lesson_first(material: Material, k: int) -> Sessions:
-    return (material.lesson(), *material.units(k))
+def _lesson_first(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.lesson(), *provider.units(k))
 
 
-def _before(material: Material, k: int) -> Sessions:
-    return (*material.units(k), material.lesson())
+def _before(provider: SessionProvider, k: int) -> Sessions:
+    return (*provider.units(k), provider.lesson())
 
 
-def _middle(material: Material, k: int) -> Sessions:
-    units, half = material.units(k), (k + 1) // 2
-    return (*units[:half], material.lesson(), *units[half:])
+def _middle(provider: SessionProvider, k: int) -> Sessions:
+    units, half = provider.units(k), (k + 1) // 2
+    return (*units[:half], provider.lesson(), *units[half:])
 
 
-def _held(material: Material, k: int) -> Sessions:
-    return (material.lesson(), *[material.lesson("last")] * k)
+def _held(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.lesson(), *[provider.lesson("last")] * k)
 
 
-def _same(material: Material, k: int) -> Sessions:
-    return (material.lesson(), *material.own_units(k))
+def _same(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.lesson(), *provider.own_units(k))
 
 
-def _parts(material: Material, k: int) -> Sessions:
-    return (material.lesson("first"), *material.units(k), material.lesson("second"))
+def _parts(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.lesson("first"), *provider.units(k), provider.lesson("second"))
 
 
-def _raw(material: Material, k: int) -> Sessions:
-    return (material.lesson(), *material.units(k, RAW_DISTRACTORS))
+def _raw(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.lesson(), *provider.units(k, RAW_DISTRACTORS))
 
 
-def _absent(material: Material, k: int) -> Sessions:
-    return tuple(material.units(k))
+def _absent(provider: SessionProvider, k: int) -> Sessions:
+    return tuple(provider.units(k))
 
 
-def _stale(material: Material, k: int) -> Sessions:
-    return (material.contradiction(), *_lesson_first(material, k))
+def _stale(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.contradiction(), *_lesson_first(provider, k))
 
 
-def _misled(material: Material, k: int) -> Sessions:
-    return (material.contradiction(), *material.units(k))
+def _misled(provider: SessionProvider, k: int) -> Sessions:
+    return (provider.contradiction(), *provider.units(k))
 
 
 _KINDS = (
@@ -207,14 +195,14 @@ class Condition:
     kind: Kind
     k: int
 
-    def sessions(self, material: Material) -> Sessions:
+    def sessions(self, provider: SessionProvider) -> Sessions:
         """Return the sessions of a query's buffer, in order.
 
         Raises:
-            PoolTooSmallError: The material does not hold so many units.
+            PoolTooSmallError: The provider does not hold so many units.
             SourceError: It has no contradicting lesson.
         """
-        return self.kind.rule(material, self.k)
+        return self.kind.rule(provider, self.k)
 
     @property
     def sort_key(self) -> tuple[int, int]:
@@ -226,11 +214,7 @@ class Condition:
 
 
 def parse_condition(text: str | Condition) -> Condition:
-    """Read a condition's name; a condition is returned as it is.
-
-    Raises:
-        InvalidIdError: There is no such condition.
-    """
+    """Read a condition's name; a condition is returned as it is."""
     if isinstance(text, Condition):
         return text
     if isinstance(text, str):
@@ -242,18 +226,13 @@ def parse_condition(text: str | Condition) -> Condition:
             return Condition(text, kind, int(match["k"]))
     raise InvalidIdError(
         f"{text!r} is not a condition",
-        f"Expected {NO_HISTORY}, k0, k1, … k{MAX_K}, before-k3, … All kinds: "
-        "robomme-interference conditions",
+        f"Expected {NO_HISTORY}, k0, k1, … k{MAX_K}, before-k3, …",
+        "conditions",
     )
 
 
 def in_order(conditions: Iterable[str | Condition]) -> tuple[Condition, ...]:
-    """Return conditions in the order of tables.
-
-    Raises:
-        InvalidIdError: One is none.
-        InvalidOptionError: One comes twice, or there is none.
-    """
+    """Return conditions in the order of tables."""
     found = sorted(map(parse_condition, conditions), key=lambda one: one.sort_key)
     names = [one.name for one in found]
     if not found or len(set(names)) < len(names):

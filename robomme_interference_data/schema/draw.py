@@ -37,9 +37,6 @@ class UnitPool:
     Args:
         units: Ids of the episodes that the units were made of; order does not matter.
         seed: Seed of the draw.
-
-    Raises:
-        InvalidOptionError: An id occurs twice.
     """
 
     def __init__(self, units: Iterable[EpisodeId], seed: int = 0):
@@ -63,9 +60,6 @@ class UnitPool:
 
         Returns:
             The units in buffer order. `draw(query, j)` is the beginning of it for every j ≤ k.
-
-        Raises:
-            PoolTooSmallError: The other families together have fewer than `k` units.
         """
         others = {name: units for name, units in self._families.items() if name != query.family}
         count = sum(map(len, others.values()))
@@ -81,9 +75,6 @@ class UnitPool:
         """Draw `k` distinct units of the query's own family, none of the query; nested in `k`.
 
         They follow one another in the family's order, and queries begin seven units apart.
-
-        Raises:
-            PoolTooSmallError: The family has fewer than `k`.
         """
         units = [one for one in self._families.get(query.family, []) if one != query]
         if k > len(units):

@@ -75,7 +75,7 @@ def spans_of_texts(texts: Iterable[str]) -> tuple[EvidenceSpan, ...] | None:
     return tuple(spans) or None
 
 
-def place_evidence(
+def map_evidence(
     sessions: Iterable[Session], recorded: Callable[[SessionEntry], Sequence[EvidenceSpan] | None]
 ) -> tuple[Evidence, ...] | None:
     """Return the evidence of a buffer, session by session; None if that of a lesson is unknown.

@@ -87,7 +87,9 @@ class Session:
         return self.entry.source
 
 
-def place_sessions(entries: Sequence[SessionEntry], role: str | None = None) -> tuple[Session, ...]:
+def layout_sessions(
+    entries: Sequence[SessionEntry], role: str | None = None
+) -> tuple[Session, ...]:
     """Return sessions in their places, one after the other: all, or those of a role."""
     stops = [0, *accumulate(entry.num_frames for entry in entries)]
     placed = zip(stops, stops[1:], entries, strict=False)

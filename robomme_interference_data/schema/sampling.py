@@ -50,9 +50,6 @@ def check_memory(name: str, of: str) -> None:
     Args:
         name: Its name.
         of: Who is asked for it, for the message.
-
-    Raises:
-        UnknownNameError: There is none of that name.
     """
     if name not in MEMORIES:
         raise UnknownNameError.among("memory", name, of, MEMORIES)

@@ -45,11 +45,7 @@ SHIFTS = tuple(Shift(kind, strength) for kind in KINDS for strength in STRENGTHS
 
 
 def parse_shift(text: str) -> Shift | None:
-    """Read a shift; None for `none`.
-
-    Raises:
-        InvalidOptionError: The text is neither.
-    """
+    """Read a shift; None for `none`."""
     if text == NO_SHIFT:
         return None
     match = _SHIFT.fullmatch(text) if isinstance(text, str) else None

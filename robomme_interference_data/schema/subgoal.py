@@ -23,9 +23,6 @@ class Subgoal:
         text: In words; each thing's place is written `<point>`, as in `pick up the cube at
             <point>`.
         points: Where these places are in the front image, (y, x) in pixels, in order.
-
-    Raises:
-        InvalidOptionError: Text and points do not go together.
     """
 
     text: str
@@ -79,10 +76,6 @@ _PIXELS = re.compile(r"<\s*(?P<y>\d{1,4})\s*,\s*(?P<x>\d{1,4})\s*>")
 
 
 def read_grounded(text: str) -> Subgoal:
-    """Read a subgoal that has its places as `<y, x>` in pixels, as RoboMME writes them.
-
-    Raises:
-        InvalidOptionError: There are no words in it.
-    """
+    """Read a subgoal that has its places as `<y, x>` in pixels, as RoboMME writes them."""
     words, numbers = read_points(text, _PIXELS)
     return Subgoal(words.strip(), tuple((one["y"], one["x"]) for one in numbers))

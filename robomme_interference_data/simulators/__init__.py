@@ -12,7 +12,7 @@ simulator.close()
 
 from typing import TYPE_CHECKING
 
-from robomme_interference_data.lazy import lazily
+from robomme_interference_data.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from robomme_interference_data.schema.rollouts import Status
@@ -37,4 +37,11 @@ __all__ = [
     "Status",
 ]
 
-__getattr__ = lazily(__name__, ".registry", ".base")
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        ".registry": "make_simulator SIMULATORS",
+        ".base": "Simulator Demonstration EpisodeInfo Observation",
+        "robomme_interference_data.schema.rollouts": "Status",
+    },
+)

@@ -154,7 +154,7 @@ def test_a_dataset_that_was_built_otherwise_is_left_as_it_is(
     other = MadeUpSource({"A/train/1": (260, 5)}, **source)
     with pytest.raises(InterferenceError, match=told) as caught:
         build(built, other, **options)
-    assert "otherwise" not in told or "Choose another --out" in str(caught.value.hint)
+    assert "otherwise" not in told or "Choose another `out`" in str(caught.value.hint)
     assert contents(built) == before
 
 

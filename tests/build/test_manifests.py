@@ -1,5 +1,6 @@
 """Manifests: what every buffer holds, the same bytes from the same inputs, and what is refused."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,13 @@ from support.splits import CONDITIONS, GOLDEN, QUERIES, contents, copy_split
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
-from robomme_interference_data.build_dataset.manifests import planned_buffers, write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    planned_buffers,
+    write_manifests,
+)
+from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.errors import (
     BuildError,
     FormatError,
@@ -20,7 +26,7 @@ from robomme_interference_data.errors import (
     PoolTooSmallError,
     SourceError,
 )
-from robomme_interference_data.schema.conditions import KINDS, Kind
+from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
 from robomme_interference_data.schema.draw import UnitPool
 from robomme_interference_data.storage.digest import combine
 
@@ -138,7 +144,7 @@ def test_datasets_that_conditions_need(tmp_path: Path) -> None:
     for name, needed in (("raw-k1", "distractors-raw"), ("misled-k0", "contradictions")):
         with pytest.raises(SourceError, match=f"{name} needs the dataset {needed}") as caught:
             plan_manifests(in_folder(root), ("k1", name))
-        assert f"build {needed}" in str(caught.value.hint)
+        assert f"build {needed}" in str(caught.value.command)
     records = [record("contradictions", "PatternLock/test/1/2", lesson=40)]
     write_metadata(root / "contradictions", "contradictions", records)
     plan = plan_manifests(in_folder(root), ("stale-k1",))
@@ -166,7 +172,7 @@ def test_a_buffer_is_exact_where_all_of_it_is(tmp_path: Path) -> None:
 
 def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a kind's k means is its rule's own affair: here it takes one unit more."""
-    more = Kind("more", lambda material, k: tuple(material.units(k + 1)))
+    more = Kind("more", lambda provider, k: tuple(provider.units(k + 1)))
     monkeypatch.setitem(KINDS, "more", more)
     root = made_up(tmp_path)
     plan = plan_manifests(in_folder(root), ("k1", "more-k1", "more-k8"))
@@ -197,7 +203,7 @@ def test_the_position_limit(tmp_path: Path, limit: int, fits: bool) -> None:
         return
     with pytest.raises(HistoryTooLongError, match="under k1 needs 1365 positions") as caught:
         list(planned_buffers(plan))
-    assert "--position-limit none" in str(caught.value.hint)
+    assert 'position_limit="none"' in str(caught.value.hint)
 
 
 def test_units_must_be_of_train_episodes(tmp_path: Path) -> None:
@@ -219,6 +225,42 @@ def test_datasets_that_do_not_fit(tmp_path: Path) -> None:
     (root / "units").rename(root / "demonstrations")
     with pytest.raises(InvalidOptionError, match="is a dataset of distractors"):
         plan_manifests(in_folder(root))
+
+
+@pytest.mark.parametrize("steps", range(4))
+def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int
+) -> None:
+    """A kill between any two files that appear; then the same command finishes."""
+    root, replace, left = copy_split(tmp_path / "split"), Path.replace, [steps]
+
+    def killed(path: Path, target: Path) -> Path:
+        if target.parent == root / "manifests":
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+        return replace(path, target)
+
+    plan = plan_manifests(in_folder(root), ("k0",))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", killed)
+        with suppress(KeyboardInterrupt):
+            list(write_manifests(plan, root))
+    split = load_split(root)
+    assert split.conditions == (CONDITIONS if steps < 2 else ("k0",))
+    assert len(list(split.manifests())) == len(split) == len(QUERIES) * len(split.conditions)
+    assert split.load(QUERIES[0], "k0", verify=True).frames().any()
+    list(write_manifests(plan, root))
+    assert sorted(contents(root / "manifests")) == ["buffers.parquet", "manifest.json"]
+    assert len(load_split(root)) == len(QUERIES)
+
+
+def test_a_buffer_is_planned_without_manifests() -> None:
+    split = load_split(GOLDEN)
+    record = split.query(QUERIES[1]).record
+    sessions = QuerySessions(SessionSource(split.datasets), record)
+    for name in CONDITIONS:
+        assert sessions.buffer(parse_condition(name)) == split.manifest(QUERIES[1], name)
 
 
 def test_earlier_manifests_are_replaced_and_strangers_kept(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
     message = f"episode 950 would be MoveCube/train/50, but its goal {PEG!r} .*it fits InsertPeg"
     with pytest.raises(SourceError, match=message) as caught:
         open_source(f"lerobot:{root}").episodes()
-    assert "--families-file" in str(caught.value.hint)
+    assert "`families_file`" in str(caught.value.hint)
     families = [name.split("/")[0] for _, (name, _) in sorted(found.items())]
     names = tmp_path / "families.json"
     names.write_text(json.dumps(dict(enumerate([*families[:950], "InsertPeg", *families[951:]]))))
@@ -119,7 +119,7 @@ def test_1600_episodes_are_named_by_block_and_quickly(tmp_path: Path) -> None:
 
 def test_families_that_are_not_told_or_do_not_fit(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path / "nameless", episode_id=None)
-    with pytest.raises(SourceError, match=r"of what family its 3 episodes(.|\n)*--families-file"):
+    with pytest.raises(SourceError, match=r"of what family its 3 episodes(.|\n)*`families_file`"):
         read(root)
     root = write_lerobot(tmp_path / "towel", one(make_episode(0, 2, "fold the towel")))
     with pytest.raises(SourceError, match="it fits no family of RoboMME"):

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from support.simulator_doubles import Double
 
-from robomme_interference_data.build_dataset.cut import cut_demonstration
+from robomme_interference_data.build_dataset.frame_selection import select_demonstration
 from robomme_interference_data.build_dataset.sources import Recording, open_source, simulator
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
@@ -49,7 +49,7 @@ def test_an_episode_of_the_tabletop(made: list[Double]) -> None:
     assert actions == [1, 1, 1, 1, 1, 0, 1, 2]
     assert all((frame.images["front"] == 9).all() for frame in frames)
     assert all((frame.images["wrist"] == 99).all() for frame in frames)
-    lesson = list(cut_demonstration(read(source).frames))
+    lesson = list(select_demonstration(read(source).frames))
     assert [float(frame.state[0]) for frame in lesson] == [0, 1, 2, 3, 4, 10]
     assert made[0].executed == 3  # cut without a step
 

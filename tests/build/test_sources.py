@@ -112,7 +112,7 @@ def test_files_that_are_gone_since_they_were_listed(source: Source, tmp_path: Pa
     ],
 )
 def test_what_is_no_source_lists_all_kinds(text: str, hint: str | None) -> None:
-    with pytest.raises(InvalidOptionError, match=f"--source {text!r} is not one of") as caught:
+    with pytest.raises(InvalidOptionError, match=f"source {text!r} is not one of") as caught:
         open_source(text)
     assert all(usage in caught.value.message for usage in KINDS.values())
     assert hint is None or hint in str(caught.value.hint)

@@ -16,7 +16,7 @@ from support.made_up import MadeUpSource, picture
 
 from robomme_interference_data.build_dataset import stage
 from robomme_interference_data.build_dataset.config import BuildPlan
-from robomme_interference_data.build_dataset.cut import CUTS, NothingToStore
+from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS, NothingToStore
 from robomme_interference_data.build_dataset.image_stats import ImageStats
 from robomme_interference_data.build_dataset.lerobot_writer import StoredEpisode
 from robomme_interference_data.build_dataset.sources import Frame
@@ -233,15 +233,15 @@ def steps(frames: Any) -> list[int]:
 
 def test_units_and_demonstrations() -> None:
     # fmt: off
-    assert steps(CUTS[DISTRACTORS](marks(None, 249))) == [
+    assert steps(FRAME_SELECTORS[DISTRACTORS](marks(None, 249))) == [
         0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88, 96, 104, 112, 120,
         128, 136, 144, 152, 160, 168, 176, 184, 192, 200, 208, 216, 224, 232, 240, 248,
     ]
     # fmt: on
-    assert steps(CUTS[DEMONSTRATIONS](marks(3, 100))) == [0, 1, 2, 3]  # 3: the query frame
-    assert steps(CUTS[CONTRADICTIONS](marks(3, 100))) == [0, 1, 2, 3]
+    assert steps(FRAME_SELECTORS[DEMONSTRATIONS](marks(3, 100))) == [0, 1, 2, 3]
+    assert steps(FRAME_SELECTORS[CONTRADICTIONS](marks(3, 100))) == [0, 1, 2, 3]
     for length in (249, 255, 256, 400):  # whatever gives a unit gives a raw one
-        raw = steps(CUTS[RAW_DISTRACTORS](marks(None, length)))
+        raw = steps(FRAME_SELECTORS[RAW_DISTRACTORS](marks(None, length)))
         assert raw == list(range(min(length, 256)))
 
 
@@ -252,7 +252,7 @@ def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
     for kind, needed in ((DISTRACTORS, 249), (DEMONSTRATIONS, (lesson or 0) + 1)):
         read = marks(lesson, length)
         try:
-            found = steps(CUTS[kind](read))
+            found = steps(FRAME_SELECTORS[kind](read))
         except (NothingToStore, SourceError):
             assert length < needed or not lesson
             continue
@@ -271,6 +271,6 @@ def test_nothing_is_read_beyond_the_last_frame_that_is_needed(
 )
 def test_nothing_to_store(kind: str, lesson: int | None, length: int, reason: str) -> None:
     with pytest.raises(NothingToStore, match=reason):
-        list(CUTS[kind](marks(lesson, length)))
-    with pytest.raises(SourceError, match=r"does not mark(.|\n)*build distractors"):
-        list(CUTS[DEMONSTRATIONS](marks(None, 10)))
+        list(FRAME_SELECTORS[kind](marks(lesson, length)))
+    with pytest.raises(SourceError, match=r"does not mark(.|\n)*can be built without"):
+        list(FRAME_SELECTORS[DEMONSTRATIONS](marks(None, 10)))

@@ -21,8 +21,11 @@ from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_split
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.verify import verify_split
 from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.questions import read_questions
@@ -214,7 +217,11 @@ def test_links_that_lead_nowhere(own_split: Path) -> None:
         (RECORDS, first_changed("seed", 1), "revision is"),
         (RECORDS, lambda t: t.drop_columns(["feature_sha256"]), "feature_sha256 is missing"),
         (RECORDS, lambda t: t.slice(1), "does not list the episodes"),
-        (RECORDS, lambda t: t.drop_columns(["dataset_from_index"]), "does not have the columns of"),
+        (
+            RECORDS,
+            lambda t: t.drop_columns(["dataset_from_index"]),
+            "column dataset_from_index is missing",
+        ),
         (EPISODES, first_changed("dataset_from_index", 7), "dataset_from_index is not that of"),
         (EPISODES, first_changed("tasks", ["another"]), "tasks is not that of"),
         (EPISODES, lambda t: t.slice(1), "does not list the episodes"),
@@ -236,7 +243,7 @@ def test_tables_that_mean_something_else(
 @pytest.mark.parametrize(
     ("name", "field", "value", "told"),
     [
-        ("stats", "action", None, "stats.json: has no finite statistics of action"),
+        ("stats", "action", None, "stats.json: action is not what follows"),
         ("stats", "action", {"mean": [float("nan")]}, "NaN is no finite number"),
         ("info", "total_frames", 1, "total_frames is 1"),
         ("info", "total_episodes", 1, "does not list the episodes"),
@@ -261,6 +268,98 @@ def test_json_that_means_something_else(
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     renew_sums(own_split / "distractors")
     expect(own_split, told)
+
+
+def change_statistic(root: Path, feature: str) -> None:
+    """Change a mean of an episode, and that of the dataset with it."""
+    name = f"stats/{feature}/mean"
+    table = pq.read_table(root / EPISODES)
+    values = table[name].to_pylist()
+    shift = np.asarray(values[3]) * 0.01
+    values[3] = (values[3] + shift).tolist()
+    pq.write_table(put(table, name, values), root / EPISODES)
+    path = root / "distractors/meta/stats.json"
+    stats = json.loads(path.read_text())
+    weight = table[f"stats/{feature}/count"].to_pylist()[3][0] / stats[feature]["count"][0]
+    stats[feature]["mean"] = (stats[feature]["mean"] + shift * weight).tolist()
+    path.write_text(json.dumps(stats, indent=4, sort_keys=True) + "\n")
+
+
+@pytest.mark.parametrize("feature", ["observation.state", "observation.images.front"])
+def test_statistics_that_are_not_those_of_the_data(own_split: Path, feature: str) -> None:
+    change_statistic(own_split, feature)
+    renew_sums(own_split / "distractors")
+    expect(own_split, f"stats/{feature}/mean .*is not that of its", decode=True)
+
+
+def as_bytes(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(change(path.read_bytes()))
+
+
+def told_again(text: bytes) -> bytes:
+    return text.replace(b"{", b'{ "format_version": 7,', 1)
+
+
+def with_carriage_returns(text: bytes) -> bytes:
+    return text.replace(b"\n", b"\r\n")
+
+
+def skipping(path: Path) -> None:
+    report = json.loads(path.read_text())
+    report["counts"]["skipped"] = 1
+    report["skipped"] = [{"episode_id": "MoveCube/train/99", "why": "\x1b[2J"}]
+    path.write_text(json.dumps(report, indent=2, sort_keys=True) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "told"),
+    [
+        (HEADER, as_bytes(with_carriage_returns), f"{HEADER}: is not written as"),
+        ("distractors/meta/info.json", as_bytes(with_carriage_returns), "is not written as"),
+        ("distractors/meta/stats.json", as_bytes(lambda t: t + b" "), "is not written as"),
+        ("distractors/meta/interference.json", as_bytes(told_again), "occurs twice"),
+        ("distractors/meta/build_report.json", as_bytes(told_again), "occurs twice"),
+        ("distractors/meta/build_report.json", skipping, "has control characters"),
+        (
+            "distractors/meta/build_report.json",
+            as_bytes(lambda t: t.replace(b'"frames": ', b'"frames": 1')),
+            "does not have the counts",
+        ),
+        (RECORDS, partial(edit, change=lambda t: t.append_column("x", t["seed"])), "x is too many"),
+        (
+            EPISODES,
+            partial(edit, change=lambda t: t.append_column("x", t["seed"])),
+            "x is too many",
+        ),
+        (DATA, partial(edit, change=lambda t: t.append_column("x", t["index"])), "x is too many"),
+        (ROWS, partial(edit, change=lambda t: t.append_column("x", t["seed"])), r"'x'\]"),
+        (ROWS, partial(edit, change=lambda t: pa.concat_tables([t, t[:1]])), "2 rows of Video"),
+        (
+            ROWS,
+            partial(edit, change=lambda t: pa.concat_tables([t[:2], t[1:]])),
+            "2 rows of Video",
+        ),
+    ],
+)
+def test_what_only_the_meaning_shows(
+    own_split: Path, path: str, change: Callable[[Path], object], told: str
+) -> None:
+    change(own_split / path)
+    if path == ROWS:
+        renew_header(own_split)
+    if path.startswith("distractors"):
+        renew_sums(own_split / "distractors")
+    expect(own_split, told)
+
+
+def test_line_ends_of_the_sums(own_split: Path) -> None:
+    path, identity = (
+        own_split / f"distractors/meta/{n}" for n in ("SHA256SUMS", "interference.json")
+    )
+    before = sha256_file(path)
+    path.write_bytes(with_carriage_returns(path.read_bytes()))
+    identity.write_text(identity.read_text().replace(before, sha256_file(path)))
+    expect(own_split, "SHA256SUMS: is not written as")
 
 
 def test_frames_that_are_not_the_hashed_ones(own_split: Path) -> None:

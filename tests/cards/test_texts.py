@@ -10,8 +10,11 @@ from support.cards import OF_DEMONSTRATIONS, OF_RESULTS, OF_SPLIT, RUN
 from support.made_up import record, write_metadata
 
 from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.cards.commands import card_text
 from robomme_interference_data.cards.facts import SplitFacts
 from robomme_interference_data.cards.film import film_of_split

@@ -10,8 +10,11 @@ from support.hub_repositories import Blob
 from support.splits import GOLDEN, contents, copy_split
 
 from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.cards.contents import (
     dataset_tree,
     parts_of_buffers,

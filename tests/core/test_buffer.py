@@ -28,6 +28,7 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     UnknownNameError,
 )
+from robomme_interference_data.storage.files import LocalFiles
 
 SPLIT = load_split(GOLDEN)
 CAMERAS = ("front", "wrist")
@@ -216,7 +217,7 @@ def test_the_query_needs_no_buffer() -> None:
     np.testing.assert_array_equal(query.state(), states[LESSON])
     made = SPLIT.load("PatternLock/test/0", "no-history")
     assert made.query.record == query.record
-    assert made.manifest.query == query.place
+    assert made.manifest.query == query.first_frame
     assert query.seed == made.manifest.seed
     # It is never part of the buffer.
     assert all(
@@ -253,11 +254,26 @@ def test_unknown_camera(camera: str, hint: str) -> None:
         assert caught.value.hint == hint
 
 
+def test_a_stream_fetches_its_files_before_the_first_chunk(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, fetched = buffer("k3"), []
+    monkeypatch.setattr(LocalFiles, "fetch", lambda files, paths: fetched.append(sorted(paths)))
+    stream = made.stream(8, ("front",), range(60, 90))  # of the first two units
+    next(stream)
+    lesson, units = fetched
+    assert len(lesson) == 1 and lesson[0].startswith("data/")
+    assert sum(path.startswith("data/") for path in units) == 3  # states are of all sessions
+    assert sum(path.startswith("videos/observation.images.front") for path in units) == 2
+    assert sum(map(len, stream)) == 22 and len(fetched) == 2
+
+
 def test_verify_names_what_differs() -> None:
     made = buffer("k1")
     lesson, unit = made.manifest.sessions
-    other = of_sessions(lesson, replace(unit, sha256="0" * 64))
-    with pytest.raises(HashMismatchError, match=f"distractor {unit.source} .*the manifest itself"):
+    changed = with_sessions(made.manifest, lesson, replace(unit, sha256="0" * 64))
+    other = Buffer(changed, made.query, SPLIT.datasets)
+    with pytest.raises(HashMismatchError, match=f"distractor {unit.source} .*recorded SHA-256"):
         other.verify()
 
 

@@ -18,11 +18,11 @@ from robomme_interference_data.schema.evidence import (
     Evidence,
     among,
     known_parts,
-    place_evidence,
+    map_evidence,
     spans_of_parts,
     spans_of_texts,
 )
-from robomme_interference_data.schema.manifest import place_sessions
+from robomme_interference_data.schema.manifest import layout_sessions
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import evidence_kept
 
@@ -36,7 +36,7 @@ def placed(
     *entries: SessionEntry, spans: Sequence[EvidenceSpan] = (FIRST, THEN)
 ) -> tuple[Evidence, ...]:
     known = {"demonstrations": spans}
-    found = place_evidence(place_sessions(entries), lambda entry: known.get(entry.dataset))
+    found = map_evidence(layout_sessions(entries), lambda entry: known.get(entry.dataset))
     assert found is not None
     return found
 
@@ -108,8 +108,8 @@ def test_evidence_lies_where_its_frames_do() -> None:
 def test_evidence_of_a_lesson_may_be_unknown(role: str) -> None:
     unknown = replace(ENTRY, role=role, dataset="contradictions")
     known = {"demonstrations": (FIRST,)}
-    sessions = place_sessions([ENTRY, unknown])
-    assert place_evidence(sessions, lambda entry: known.get(entry.dataset)) is None
+    sessions = layout_sessions([ENTRY, unknown])
+    assert map_evidence(sessions, lambda entry: known.get(entry.dataset)) is None
 
 
 def test_a_buffer_tells_its_evidence(tiny_split: Path) -> None:
@@ -169,7 +169,7 @@ def test_of_two_lessons_the_newer_one_counts() -> None:
     wrong = replace(ENTRY, role="contradiction", dataset="contradictions")
     spans = {"demonstrations": (FIRST,), "contradictions": (replace(FIRST, text="peg 1"), THEN)}
     for order, text in (([wrong, ENTRY], "takes peg 2"), ([ENTRY, wrong], "peg 1")):
-        found = place_evidence(place_sessions(order), lambda entry: spans[entry.dataset])
+        found = map_evidence(layout_sessions(order), lambda entry: spans[entry.dataset])
         assert known_parts(found or (), range(40)) == {0: text, 1: "from the left"}
 
 

@@ -148,7 +148,7 @@ def test_questions_of_other_demonstrations_are_stale(
     rewrite(root, change)
     with pytest.raises(FormatError, match=words) as raised:
         read_questions(load_split(root))
-    assert raised.value.hint == f"Type: robomme-interference build questions {root}"
+    assert raised.value.command == f"build questions {root}"
 
 
 def test_further_columns_are_left_aside(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_a_split_without_questions_says_how_to_make_them(tmp_path: Path) -> None
     root = copy_split(tmp_path / "split")
     with pytest.raises(MissingFileError, match="has no questions") as raised:
         read_questions(load_split(root))
-    assert raised.value.hint == f"Type: robomme-interference build questions {root}"
+    assert raised.value.command == f"build questions {root}"
     (root / QUESTIONS_PATH).mkdir()
     with pytest.raises(InterferenceError):
         read_questions(load_split(root))

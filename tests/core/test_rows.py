@@ -16,13 +16,13 @@ from robomme_interference_data.schema.codec import (
     descriptions,
     from_dict,
     from_table,
-    read_header,
     to_dict,
     to_table,
 )
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Rollout
+from robomme_interference_data.storage.headers import read_header
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from robomme_interference_data.evaluate.policies.builtin import (
 )
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.evidence import place_evidence
-from robomme_interference_data.schema.manifest import SessionEntry, place_sessions
+from robomme_interference_data.schema.evidence import map_evidence
+from robomme_interference_data.schema.manifest import SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.schema.sampling import MEMORIES
 from robomme_interference_data.simulators.base import Observation
@@ -188,7 +188,7 @@ class Asked:
 def test_recall_knows_what_its_memory_keeps(memory: str, known: dict[int, str]) -> None:
     entry = SessionEntry("lesson", "A", EpisodeId("A", "test", 0), "d", "r", 0, 0, 300, 1, "s")
     spans = EvidenceSpan(0, "takes peg 2", 11, 20), EvidenceSpan(1, "from the left", 20, 31)
-    evidence = place_evidence(place_sessions([entry]), lambda entry: spans)
+    evidence = map_evidence(layout_sessions([entry]), lambda entry: spans)
     simulator, policy = Asked(), Recall(memory)
     policy.reset(RolloutInfo("goal", 310, 0, simulator, evidence))  # type: ignore[arg-type]
     assert policy.act(seen(0, 0), "goal").shape == (1, 8)

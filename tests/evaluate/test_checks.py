@@ -13,8 +13,11 @@ from support.splits import QUERIES, copy_split
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import CONTRADICTIONS
 from robomme_interference_data.errors import (

@@ -7,7 +7,7 @@ from support.retrieval import made
 
 from robomme_interference_data.retrieval.grade import ALL, Grade, cells, grade, verdict
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.schema.evidence import place_evidence
+from robomme_interference_data.schema.evidence import map_evidence
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.stats.intervals import wilson
 
@@ -44,7 +44,7 @@ def test_a_grade_by_hand() -> None:
 def test_evidence_counts_where_a_frame_of_it_was_chosen() -> None:
     one = made(cuts={4: 0.1, 9: 0.1, 11: 0.1}, high={7: 0.9})  # chosen are 4 to 8
     spans = (EvidenceSpan(0, "first", 0, 4), EvidenceSpan(1, "then", 3, 5))
-    known = replace(one, evidence=place_evidence(one.sessions[:1], lambda entry: spans))
+    known = replace(one, evidence=map_evidence(one.sessions[:1], lambda entry: spans))
     grades = [grade(known, MAX), grade(one, MAX)]
     assert [found.evidence_kept for found in grades] == [0.5, None]
     [*_, both], [*_, none] = cells(grades), cells(grades[1:])

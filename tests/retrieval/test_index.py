@@ -119,7 +119,8 @@ def test_datasets_that_a_buffer_does_not_need_may_lack_an_index(
 ) -> None:
     split = load_split(indexed)
     expected = split.load(QUERIES[0], "k1").embeddings("thumbnail")
-    split.datasets["contradictions"] = load_split(tiny_split).datasets["demonstrations"]
+    other = load_split(tiny_split).datasets["demonstrations"]
+    split.datasets = {**split.datasets, "contradictions": other}  # type: ignore[misc]
     assert np.array_equal(split.load(QUERIES[0], "k1").embeddings("thumbnail"), expected)
 
 

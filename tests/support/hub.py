@@ -15,9 +15,10 @@ from huggingface_hub import constants
 from support.hub_server import HubServer
 
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFEST_PATH
-from robomme_interference_data.schema.codec import read_header, to_dict
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.storage.files import write_json
+from robomme_interference_data.storage.headers import read_header
 
 SPLIT, BASE = "someone/units", "someone/demonstrations"
 

@@ -8,8 +8,11 @@ from support.tabletop import make_tabletop
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.runtime.progress import WorkProgress

@@ -8,8 +8,11 @@ import pytest
 from support.hub_server import HubServer
 
 from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.cards import render
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.publish import Publisher

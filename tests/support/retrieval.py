@@ -23,9 +23,10 @@ from robomme_interference_data.retrieval.segment import (
 )
 from robomme_interference_data.retrieval.select import Similarities
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.schema.codec import read_header, to_dict
-from robomme_interference_data.schema.manifest import place_sessions
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.manifest import layout_sessions
 from robomme_interference_data.storage.files import write_json
+from robomme_interference_data.storage.headers import read_header
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]
@@ -103,7 +104,7 @@ def sessions_of(names: Sequence[str], spans: Sequence[Span], lessons: Sequence[i
         span = (start, stop) if number in lessons else (0, stop - start)
         stored = role, "0" * 64, number_of(name), *span, 1, "0" * 64
         entries.append(SessionEntry(role, source.family, source, *stored))
-    return place_sessions(tuple(entries))
+    return layout_sessions(tuple(entries))
 
 
 def number_of(text: str) -> int:

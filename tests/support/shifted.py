@@ -6,9 +6,12 @@ from pathlib import Path
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
-from robomme_interference_data.build_dataset.cut import cut_demonstration
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.frame_selection import select_demonstration
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.build_dataset.sources import Frame, Recording, SourceEpisode
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SHIFTED
@@ -25,7 +28,7 @@ class ShiftedSample(SampleSource):
         return replace(recording, frames=self._views(recording))
 
     def _views(self, recording: Recording) -> Generator[Frame]:
-        *_, seen = cut_demonstration(recording.frames)
+        *_, seen = select_demonstration(recording.frames)
         for place in range(len(SHIFTS)):
             images = {camera: image >> place for camera, image in seen.images.items()}
             yield Frame(images, seen.state, None, False)

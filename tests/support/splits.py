@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.build_dataset.cut import CUTS
+from robomme_interference_data.build_dataset.frame_selection import FRAME_SELECTORS
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.constants import SUMS_PATH
@@ -49,7 +49,7 @@ def dataset(root: Path, name: str) -> Dataset:
 def _stored(kind: str, episode: EpisodeId) -> tuple[Frame, ...]:
     source = SampleSource(size=32)
     [listed] = [one for one in source.episodes() if one.id == episode]
-    return tuple(CUTS[kind](source.read(listed, None).frames))
+    return tuple(FRAME_SELECTORS[kind](source.read(listed, None).frames))
 
 
 def stored_frames(kind: str, episode: EpisodeId, camera: str) -> NDArray[np.uint8]:

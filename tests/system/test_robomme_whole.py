@@ -9,8 +9,11 @@ import pytest
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildConfig, plan_build
-from robomme_interference_data.build_dataset.manifests import write_manifests
-from robomme_interference_data.build_dataset.material import in_folder, plan_manifests
+from robomme_interference_data.build_dataset.manifests import (
+    in_folder,
+    plan_manifests,
+    write_manifests,
+)
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import InvalidOptionError

@@ -15,9 +15,10 @@ import pyarrow.json as pa_json
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.run.log import MOST_BYTES, RunHeader, whole_lines
-from robomme_interference_data.schema.codec import arrow_schema, read_header
+from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Rollout, Status
 from robomme_interference_data.storage.files import read_bytes
+from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.parquet import open_parquet, read_table, reading
 
 _SCHEMA = arrow_schema(Rollout)

@@ -1,4 +1,4 @@
-"""Cut what a dataset stores out of a recorded episode, while it is read: pure.
+"""Select the frames of a recorded episode that a dataset stores, while they are read: pure.
 
 A demonstration is every raw frame of the demonstration section and then the first live
 observation. A distractor unit is the first 256 raw frames of an episode subsampled at stride 8:
@@ -27,20 +27,14 @@ class NothingToStore(Exception):
     """An episode yields nothing; the text says why."""
 
 
-def cut_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield the frames of the demonstration, and then the first live observation.
-
-    Raises:
-        NothingToStore: There is no demonstration, or no live observation after it.
-        SourceError: The source does not mark which frames are the demonstration.
-    """
+def select_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield the frames of the demonstration, and then the first live observation."""
     for lesson, frame in enumerate(frames):
         if frame.is_demonstration is None:
             raise SourceError(
                 "the source does not mark which frames are the demonstration",
-                "Demonstrations need an is_demo flag or an exec_start_idx column (give its name "
-                "with --columns is_demo=NAME); distractor units can be built without: "
-                "robomme-interference build distractors",
+                "Demonstrations need an is_demo flag or an exec_start_idx column; `columns` gives "
+                "its name, as in is_demo=NAME. Distractor units can be built without.",
             )
         if not frame.is_demonstration and lesson == 0:
             raise NothingToStore("no demonstration frame")
@@ -50,12 +44,8 @@ def cut_demonstration(frames: Iterable[Frame]) -> Iterator[Frame]:
     raise NothingToStore("no live observation after the demonstration")
 
 
-def cut_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
-    """Yield the frames of a unit.
-
-    Raises:
-        NothingToStore: The episode has fewer than 249 raw frames: it is not padded.
-    """
+def select_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
+    """Yield the frames of a unit."""
     count, most = 0, (unit.frames - 1) * unit.stride + 1
     for frame in frames:
         if count % unit.stride == 0:
@@ -67,10 +57,10 @@ def cut_unit(frames: Iterable[Frame], unit: Unit) -> Iterator[Frame]:
         raise NothingToStore(f"{count} raw frames; a unit needs {UNIT_MIN_RAW_FRAMES}")
 
 
-CUTS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
-    DEMONSTRATIONS: cut_demonstration,
-    CONTRADICTIONS: cut_demonstration,
+FRAME_SELECTORS: dict[str, Callable[[Iterable[Frame]], Iterator[Frame]]] = {
+    DEMONSTRATIONS: select_demonstration,
+    CONTRADICTIONS: select_demonstration,
     SHIFTED: iter,
-    **{kind: partial(cut_unit, unit=unit) for kind, unit in UNITS.items()},
+    **{kind: partial(select_unit, unit=unit) for kind, unit in UNITS.items()},
 }
 """Kind of dataset to what it stores of an episode; of views under shifts, all that is streamed."""

@@ -1,0 +1,223 @@
+"""Check LeRobot's own files in a dataset against its episodes and its data.
+
+A file whose SHA-256 is the recorded one can still hold wrong values, if it was written so.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from robomme_interference_data.constants import (
+    CAMERA_PREFIX,
+    EPISODES_DIR,
+    INFO_PATH,
+    RECORDS_PATH,
+    STATS_PATH,
+    TASKS_PATH,
+)
+from robomme_interference_data.data.dataset import Dataset
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.schema.codec import arrow_schema
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.files import read_json
+from robomme_interference_data.storage.lerobot import LeRobotFiles
+
+from .image_stats import STATISTICS, Statistics, episode_statistics, episode_table
+
+_TOLERANCE_S = 1e-4
+"""LeRobot's own tolerance of timestamps, in seconds."""
+
+_FRAME_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+"""Columns that LeRobot adds to every frame, in its order."""
+
+
+def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
+    """Yield the file or episode, and what is not so."""
+    yield from _info(dataset)
+    table = episode_table(dataset)
+    yield from _columns(dataset, table.column_names)
+    statistics = episode_statistics(table)
+    yield from _total_statistics(dataset, statistics)
+    tasks = dataset.lerobot.tasks
+    if list(tasks.values()) != list(range(len(tasks))):
+        yield TASKS_PATH, f"task_index is {list(tasks.values())[:5]}; expected 0, 1, …"
+    used = {record.goal for record in dataset.records()}
+    if set(tasks) != used:
+        yield TASKS_PATH, "does not list the goals of the episodes, each once"
+    first = 0
+    places: dict[str, int] = {}
+    for record in dataset.records():
+        row = dataset.lerobot.row(record.episode_index)
+        expected: dict[str, Any] = {
+            "tasks": [record.goal],
+            "dataset_from_index": first,
+            "dataset_to_index": first + record.length,
+        }
+        for camera in dataset.cameras:
+            key = f"videos/{CAMERA_PREFIX}{camera}/"
+            expected[key + "from_timestamp"] = 0.0
+            expected[key + "to_timestamp"] = record.length / dataset.lerobot.fps
+        for name, value in expected.items():
+            if not _equal(row.get(name), value):
+                what = f"{name} of {record.episode_id} is {row.get(name)}; expected {value}"
+                yield EPISODES_DIR, what
+        place = dataset.lerobot.place(record.episode_index)
+        for path in (place.data, *(path for path, _ in place.videos.values())):
+            other = places.setdefault(path, record.episode_index)
+            if other != record.episode_index:
+                yield path, f"is shared by episodes {other} and {record.episode_index}"
+        try:
+            for path, _ in place.videos.values():
+                dataset.files.path(path)
+            own = statistics[record.episode_index]
+            yield from _rows(dataset, record.episode_index, first, tasks.get(record.goal), own)
+        except InterferenceError as error:
+            yield place.data, error.message
+        first += record.length
+
+
+def _columns(dataset: Dataset, names: list[str]) -> Iterator[tuple[str, str]]:
+    """Check that both episode tables have the declared columns, and the same values."""
+    videos = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+    records = arrow_schema(EpisodeRecord, sorted(dataset.features))
+    lean = {
+        *("tasks", "data/chunk_index", "data/file_index"),
+        *("dataset_from_index", "dataset_to_index"),
+        *(f"videos/{CAMERA_PREFIX}{camera}/{one}" for camera in dataset.cameras for one in videos),
+        *("meta/episodes/chunk_index", "meta/episodes/file_index"),
+        *records.names,
+    }
+    features = (*dataset.features, *_FRAME_COLUMNS)
+    statistics = {f"stats/{feature}/{name}" for feature in features for name in STATISTICS}
+    copy, table = dataset.lerobot.table, LeRobotFiles(dataset.files).table
+    yield from _differing(EPISODES_DIR, names, lean | statistics)
+    yield from _differing(RECORDS_PATH, copy.column_names, lean)
+    for name in lean & {*copy.column_names} & {*table.column_names}:
+        if copy[name] != table[name]:
+            yield RECORDS_PATH, f"column {name} is not that of {EPISODES_DIR}"
+        elif name in records.names and copy.schema.field(name).type != records.field(name).type:
+            kind = records.field(name).type
+            yield RECORDS_PATH, f"column {name} is of type {copy[name].type}; expected {kind}"
+
+
+def _differing(where: str, found: list[str], expected: set[str]) -> Iterator[tuple[str, str]]:
+    for name in sorted(expected.symmetric_difference(found)):
+        yield where, f"column {name} {'is missing' if name in expected else 'is too many'}"
+    if len({*found}) < len(found):
+        yield where, "has two columns of one name"
+
+
+def _info(dataset: Dataset) -> Iterator[tuple[str, str]]:
+    info = dataset.lerobot.info
+    expected = {
+        "total_episodes": len(dataset),
+        "total_frames": sum(record.length for record in dataset.records()),
+        "total_tasks": len({record.goal for record in dataset.records()}),
+        "splits": {"train": f"0:{len(dataset)}"},
+    }
+    for name, value in expected.items():
+        if info.get(name) != value:
+            yield INFO_PATH, f"{name} is {info.get(name)}; expected {value}"
+    yield from _differing(
+        INFO_PATH, [*dataset.lerobot.features], {*dataset.features, *_FRAME_COLUMNS}
+    )
+
+
+def _total_statistics(dataset: Dataset, episodes: list[Statistics]) -> Iterator[tuple[str, str]]:
+    """Check that the statistics of the dataset follow from those of its episodes."""
+    stats = read_json(dataset.files.path(STATS_PATH))
+    features = (*dataset.features, *_FRAME_COLUMNS)
+    for name in sorted({*features}.symmetric_difference(stats)):
+        yield STATS_PATH, f"{name} {'is missing' if name in features else 'is too many'}"
+    for name in {*features} & stats.keys():
+        try:
+            expected = _aggregated([one[name] for one in episodes])
+            same = stats[name].keys() == expected.keys() and all(
+                np.allclose(np.ravel(stats[name][one]), value, 1e-6, 1e-8)
+                for one, value in expected.items()
+            )
+        except (AttributeError, KeyError, TypeError, ValueError):
+            same = False
+        if not same:
+            yield STATS_PATH, f"{name} is not what follows from the statistics of the episodes"
+
+
+def _aggregated(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the statistics of all episodes from those of each, as LeRobot does."""
+    values = {name: np.stack([one[name] for one in episodes]) for name in STATISTICS}
+    counts = values["count"]
+
+    def weighted(parts: Any) -> Any:
+        return (parts * counts).sum(axis=0) / counts.sum(axis=0)
+
+    found = {name: weighted(values[name]) for name in STATISTICS}
+    variances = values["std"] ** 2 + (values["mean"] - found["mean"]) ** 2
+    return found | {
+        "min": values["min"].min(axis=0),
+        "max": values["max"].max(axis=0),
+        "std": np.sqrt(weighted(variances)),
+        "count": counts.sum(axis=0),
+    }
+
+
+def differing_statistics(found: Mapping[str, Any], values: Any) -> list[str]:
+    """Return the names of statistics that are not those of values, `(T, D)`.
+
+    LeRobot computes them with 32 bits, and quantiles from a histogram of 5,000 bins.
+    """
+    lowest, highest = values.min(axis=0), values.max(axis=0)
+    largest = 1 + np.abs(values).max(axis=0)
+    expected = {
+        "min": lowest,
+        "max": highest,
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+    }
+    expected["count"] = np.array([len(values)])
+    for name in STATISTICS[5:]:
+        expected[name] = np.quantile(values, int(name[1:]) / 100, axis=0, method="inverted_cdf")
+    tolerance = {name: 1e-6 * largest for name in expected} | {"count": 0, "std": 1e-3 * largest}
+    tolerance |= {name: 1e-6 * largest + 1e-3 * (highest - lowest) for name in STATISTICS[5:]}
+    return [
+        name
+        for name in STATISTICS
+        if np.shape(found.get(name, ())) != np.shape(expected[name])
+        or not (np.abs(found[name] - expected[name]) <= tolerance[name]).all()
+    ]
+
+
+def _rows(
+    dataset: Dataset, index: int, first: int, task: int | None, statistics: Statistics
+) -> Iterator[tuple[str, str]]:
+    """Check the columns that LeRobot adds to every frame, and the statistics of all."""
+    rows = dataset.lerobot.rows(index)
+    path = dataset.lerobot.place(index).data
+    frames = np.arange(len(rows))
+    vectors = [name for name in dataset.features if not name.startswith(CAMERA_PREFIX)]
+    yield from _differing(path, rows.names, {*vectors, *_FRAME_COLUMNS})
+    values = {name: dataset.lerobot.vectors(index, name).astype(float) for name in vectors}
+    for name, expected in (
+        ("index", first + frames),
+        ("task_index", np.full(len(rows), -1 if task is None else task)),
+    ):
+        values[name] = expected[:, None]
+        if not np.array_equal(rows.scalars(name), expected):
+            yield path, f"{name} of episode {index} is not {expected[0]} to {expected[-1]}"
+    times = rows.table(["timestamp"])["timestamp"]
+    if not pa.types.is_floating(times.type):
+        yield path, f"timestamp of episode {index} is of type {times.type}"
+    elif not np.allclose(times.to_numpy(), frames / dataset.lerobot.fps, 0, _TOLERANCE_S):
+        yield path, f"timestamp of episode {index} is not frame_index / {dataset.lerobot.fps:g}"
+    values |= {"frame_index": frames[:, None], "episode_index": np.full((len(rows), 1), index)}
+    values["timestamp"] = frames[:, None] / dataset.lerobot.fps
+    for name, value in values.items():
+        for one in differing_statistics(statistics.get(name, {}), value):
+            yield EPISODES_DIR, f"stats/{name}/{one} of episode {index} is not that of its data"
+
+
+def _equal(found: Any, expected: Any) -> bool:
+    if isinstance(expected, float):
+        return isinstance(found, float) and abs(found - expected) <= _TOLERANCE_S
+    return bool(found == expected)
