@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from robomme_interference_data.evaluate.systems import SYSTEMS, known_system, na
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import effective_n
+from robomme_interference_data.stats.intervals import effective_n, wilson
 
 from .config import Grid
 from .rows.reading import Rows
@@ -139,32 +140,39 @@ def success(status: Statuses) -> NDArray[np.float64]:
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
 
 
-def rate_of(status: Statuses) -> float:
-    """Return the mean of `success` over the episodes that count, NaN of none.
+class Rate(NamedTuple):
+    """A success rate.
 
-    It is exact: of repeats, too, means that are equal are equal numbers.
-
-    Args:
-        status: The rate's rollouts, `(E, M) int8`.
+    Attributes:
+        n: Episodes that count: at least one rollout that is no error.
+        value: Mean of their `success`, NaN of none; means that are equal are equal numbers.
+        trials: How many independent ones it is worth: n, and with repeats more (see
+            `stats.intervals.effective_n`).
     """
+
+    n: int
+    value: float
+    trials: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its 95% Wilson interval; `(0, 1)` of no episode."""
+        return wilson(self.value * self.trials if self.n else 0, self.trials)
+
+
+def rate_of(status: Statuses) -> Rate:
+    """Return the rate of rollouts, `(E, M) int8`."""
     won, of = (status == _SUCCESS).sum(-1), counting(status).sum(-1)
-    counts, episodes = np.unique(of[of > 0], return_counts=True)
-    total = sum(Fraction(int(won[of == count].sum()), count) for count in counts.tolist())
-    return float(total / int(episodes.sum())) if len(counts) else math.nan
-
-
-def trials(status: Statuses) -> float:
-    """Return how many independent trials a rate is worth: with repeats, more than its episodes.
-
-    Args:
-        status: The rate's rollouts, `(E, M) int8` (see `stats.intervals.effective_n`).
-    """
-    rates = success(status)
-    rates = rates[~np.isnan(rates)]
-    if len(rates) < 2:
-        return len(rates)
-    rollouts = int(counting(status).sum())
-    return effective_n(float(rates.mean()), float(rates.var(ddof=1)), len(rates), rollouts)
+    won, of = won[of > 0], of[of > 0]
+    n, counts = len(of), np.unique(of).tolist()
+    if not n:
+        return Rate(0, math.nan, 0)
+    value = float(sum(Fraction(int(won[of == count].sum()), count) for count in counts) / n)
+    rates = won / of
+    if n < 2:
+        return Rate(n, value, n)
+    spread = float(rates.var(ddof=1))
+    return Rate(n, value, effective_n(float(rates.mean()), spread, n, int(of.sum())))
 
 
 def outcomes_of(rows: Rows, grid: Grid) -> dict[str, Outcomes]:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.evaluate.score.comparisons.effects import retained
 from robomme_interference_data.evaluate.score.comparisons.interaction import changes
 from robomme_interference_data.evaluate.score.comparisons.pairs import pair
-from robomme_interference_data.evaluate.score.outcomes import success, trials
-from robomme_interference_data.stats.intervals import wilson
+from robomme_interference_data.evaluate.score.outcomes import rate_of, success
 
 pytestmark = pytest.mark.slow
 
@@ -59,8 +58,7 @@ def test_differences(n: int, shared: float, rates: tuple[float, float], repeats:
 @pytest.mark.parametrize(("n", "shared"), CELLS)
 def test_rates_with_repeats(n: int, shared: float, rate: float) -> None:
     def bounds(status: NDArray[np.int8]) -> tuple[float, float]:
-        worth = trials(status[0])
-        return wilson(float(success(status[0]).mean()) * worth, worth)
+        return rate_of(status[0]).interval
 
     assert covers(bounds, rate, n, (rate,), shared, 3) >= 0.92
 

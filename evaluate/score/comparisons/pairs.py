@@ -6,7 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Statuses, counting, success, trials
+from robomme_interference_data.evaluate.score.outcomes import (
+    Rate,
+    Statuses,
+    counting,
+    rate_of,
+    success,
+)
 from robomme_interference_data.stats.bootstrap import Floats, Interval
 from robomme_interference_data.stats.intervals import (
     LEVEL,
@@ -128,15 +134,16 @@ def _clusters(first: Statuses, second: Statuses, level: float) -> Interval:
     before, after = (float(side.mean()) for side in values)
     spread = float(values[0].std() * values[1].std())
     phi = (float((values[0] * values[1]).mean()) - before * after) / spread if spread else 0.0
-    worth = [trials(side) for side in (first, second)]
+    worth = [rate_of(side).trials for side in (first, second)]
     old, new = (wilson(r * m, m, level) for r, m in zip((before, after), worth, strict=True))
     return Interval(round(after - before, 12), *mover_interval(after, new, before, old, phi))
 
 
-def compare_unpaired(sides: Sequence[tuple[float, float, int]]) -> Pairs:
-    """Compare two sides that cannot be paired: rate, trials that it is worth, and episodes."""
-    (first, worth, n), (second, other_worth, m) = sides
-    counts = (second * other_worth, other_worth, first * worth, worth)
-    gap, p = round(second - first, 12), two_proportions(*counts)
+def compare_unpaired(first: Rate, second: Rate) -> Pairs:
+    """Compare two sides that cannot be paired."""
+    won = second.value * second.trials, first.value * first.trials
+    counts = (won[0], second.trials, won[1], first.trials)
+    gap, p = round(second.value - first.value, 12), two_proportions(*counts)
     change, within = (Interval(gap, *newcombe(*counts, level)) for level in (LEVEL, WITHIN))
-    return Pairs(min(n, m), first, second, change, within, "unpaired", 0, 0, 0, p, math.nan)
+    n, rates = min(first.n, second.n), (first.value, second.value)
+    return Pairs(n, *rates, change, within, "unpaired", 0, 0, 0, p, math.nan)

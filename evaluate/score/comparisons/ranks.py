@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from robomme_interference_data.evaluate.score.outcomes import (
     Flags,
     Outcomes,
-    counting,
     rate_of,
     success,
-    trials,
 )
 from robomme_interference_data.evaluate.systems import is_bound
 from robomme_interference_data.stats.bootstrap import DRAWS, Floats, drawn_means
@@ -36,10 +34,7 @@ def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flag
     sides = [outcomes.status[outcomes.cell(name, condition)][here] for name in (other, one)]
     if outcomes.pairable(one, other):
         return pair(*sides)
-    counted = [int(counting(side).any(-1).sum()) for side in sides]
-    return compare_unpaired(
-        [(rate_of(s), trials(s), n) for s, n in zip(sides, counted, strict=True)]
-    )
+    return compare_unpaired(*map(rate_of, sides))
 
 
 def to_best(
@@ -56,9 +51,9 @@ def to_best(
     Returns:
         System to its comparison, and the best to None.
     """
-    best = max(
-        systems, key=lambda one: rate_of(outcomes.status[outcomes.cell(one, condition)][here])
-    )
+    cells = [outcomes.status[outcomes.cell(one, condition)][here] for one in systems]
+    rates = [rate_of(cell).value for cell in cells]
+    best = systems[rates.index(max(rates))]
     return {s: None if s == best else against(outcomes, condition, s, best, here) for s in systems}
 
 
@@ -117,7 +112,7 @@ def rank_table(every: Iterable[Outcomes], draws: int = DRAWS) -> Table:
                 outcomes.status[outcomes.cell(s, condition)][outcomes.expected] for s in systems
             ]
             means = drawn_means(np.stack([*map(success, sides)], axis=1), outcomes.simulator, draws)
-            rates = np.array([*map(rate_of, sides)])
+            rates = np.array([rate_of(side).value for side in sides])
             bounds = np.quantile(_ranks(means), (0.025, 0.975), axis=0, method="nearest").T
             rows += [
                 (outcomes.simulator, condition, system, float(rate), int(rank), int(low), int(high))

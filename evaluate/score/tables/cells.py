@@ -14,14 +14,13 @@ from robomme_interference_data.evaluate.score.outcomes import (
     STATUSES,
     Flags,
     Outcomes,
+    Rate,
     rate_of,
-    trials,
 )
 from robomme_interference_data.evaluate.systems import display_name, is_bound
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Table, percent
 
 _ERROR = STATUSES.index(Status.ERROR)
@@ -79,6 +78,11 @@ class Cell:
     best: bool = False
 
     @property
+    def as_rate(self) -> Rate:
+        """Its rate, to be compared with another."""
+        return Rate(self.n, self.rate, self.trials)
+
+    @property
     def complete(self) -> bool:
         """Whether exactly the expected episodes count, with every model seed."""
         return self.n > 0 and not self.missing and not self.other
@@ -110,27 +114,14 @@ def _cells(outcomes: Outcomes) -> list[Cell]:
         for name, (here, wanted) in parts.items():
             if not ((here & outcomes.there[s]) | (wanted & outcomes.expected)).any():
                 continue
-            counted = here & outcomes.counted[s, c]
-            n, counts, status = (
-                int(counted.sum()),
-                outcomes.counts[s, c],
-                outcomes.status[s, c, here],
-            )
-            rate, worth = rate_of(status), trials(status)
+            counted, counts = here & outcomes.counted[s, c], outcomes.counts[s, c]
+            rate = rate_of(outcomes.status[s, c, here])
+            names = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
             cells.append(
                 Cell(
-                    *(
-                        outcomes.simulator,
-                        outcomes.systems[s],
-                        outcomes.conditions[c],
-                        name,
-                        n,
-                        rate,
-                    ),
-                    interval=wilson(rate * worth if n else 0, worth),
-                    trials=worth,
+                    *(*names, rate.n, rate.value, rate.interval, rate.trials),
                     counts=tuple(counts[here].sum(axis=0).tolist()),
-                    chance=float(outcomes.chance[counted].mean()) if n else math.nan,
+                    chance=float(outcomes.chance[counted].mean()) if rate.n else math.nan,
                     expected=int((wanted & outcomes.expected).sum()),
                     missing=outcomes.chosen(wanted & outcomes.missing[s, c]),
                     broken=outcomes.chosen(here & (counts[:, _ERROR] > 0)),

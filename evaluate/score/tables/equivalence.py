@@ -66,7 +66,7 @@ def _with_published(cells: Iterable[Cell], published: Sequence[Cell]) -> Iterato
     for cell in cells:
         start = starts.get((cell.simulator, base_of(cell.system) or ""))
         if start is not None and cell.n and not cell.part:
-            pairs = compare_unpaired([(one.rate, one.trials, one.n) for one in (start, cell)])
+            pairs = compare_unpaired(start.as_rate, cell.as_rate)
             against = (start.system, START)
             names = (cell.simulator, cell.system, cell.condition, against)
             yield Contrast(*names, "equivalence", pairs, cell.complete)

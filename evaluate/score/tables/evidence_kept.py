@@ -9,9 +9,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from robomme_interference_data.evaluate.score.outcomes import Outcomes, counting, rate_of, trials
+from robomme_interference_data.evaluate.score.outcomes import Outcomes, rate_of
 from robomme_interference_data.evaluate.systems import known_system
-from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Table
 
 
@@ -39,10 +38,10 @@ def access_table(every: Iterable[Outcomes]) -> Table:
         for s, c in np.argwhere(outcomes.has_rows).tolist():
             for name, chosen in levels.items():
                 status = np.where(chosen[s, c], outcomes.status[s, c], np.int8(-1))
-                if n := int(counting(status).any(axis=-1).sum()):
+                rate = rate_of(status)
+                if rate.n:
                     cell = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
-                    rate, worth = rate_of(status), trials(status)
-                    rows.append((*cell, n, rate, *wilson(rate * worth, worth)))
+                    rows.append((*cell, rate.n, rate.value, *rate.interval))
     return Table.make(
         "access",
         "Success by the evidence that was kept",

@@ -61,12 +61,10 @@ def _by_condition(cells: Iterable[Cell]) -> list[list[Cell]]:
 
 def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
     """Return system and condition of the published cells that cannot be told from the best."""
-    sides = [(cell.rate, cell.trials, cell.n) for cell in cells]
     best = max(cells, key=lambda cell: cell.rate)
-    first = sides[cells.index(best)]
     compared = {
-        cell.system: None if cell is best else compare_unpaired([first, side])
-        for cell, side in zip(cells, sides, strict=True)
+        cell.system: None if cell is best else compare_unpaired(best.as_rate, cell.as_rate)
+        for cell in cells
     }
     return {(system, best.condition) for system in tied_with_best(compared)}
 
