@@ -31,7 +31,7 @@ class Film:
 
         Raises:
             MissingExtraError: matplotlib is not installed.
-            MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
+            MissingFileError, FormatError: A video cannot be read.
         """
         self.buffer.fetch([self.camera])
         return strip_png(self.buffer)

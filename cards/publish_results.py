@@ -31,7 +31,7 @@ def score_run(run: Path, grid: Grid = Grid.BENCHMARK) -> Score:
 
     Raises:
         PublishError: The folder holds no run that has ended.
-        BadRowsError, FormatError: Its rows cannot be scored.
+        FormatError: Its rows cannot be scored.
     """
     needed = (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
     if lacking := [name for name in needed if not (run / name).is_file()]:

@@ -71,7 +71,7 @@ def demonstrations_files(dataset: Dataset, about: Publication) -> dict[str, byte
         InvalidOptionError: The dataset is one of distractor units, which are published with the
             manifests that name them.
         MissingExtraError: jinja2 or matplotlib is not installed.
-        MissingFileError, FormatError, TruncatedVideoError: The dataset cannot be read.
+        MissingFileError, FormatError: The dataset cannot be read.
     """
     facts = _demonstrations(dataset)
     text, film = _demonstrations_text(facts, about)
@@ -89,7 +89,7 @@ def split_files(split: Split, about: Publication) -> dict[str, bytes]:
 
     Raises:
         MissingExtraError: jinja2 or matplotlib is not installed.
-        MissingFileError, FormatError, TruncatedVideoError: The split cannot be read.
+        MissingFileError, FormatError: The split cannot be read.
     """
     facts = SplitFacts(split)
     about = about.made_for(facts.base)
@@ -111,7 +111,7 @@ def results_files(results: Score | Path, about: Publication) -> dict[str, bytes]
     Raises:
         InvalidOptionError: The score is of several runs.
         MissingExtraError: jinja2 or matplotlib is not installed.
-        BadRowsError, MissingFileError, FormatError: The rows cannot be scored.
+        MissingFileError, FormatError: The rows cannot be scored.
     """
     facts = ResultsFacts.of(results)
     about = about.made_for(facts.base)

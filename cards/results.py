@@ -55,7 +55,7 @@ class ResultsFacts:
 
         Raises:
             InvalidOptionError: The score is of several files.
-            BadRowsError, MissingFileError, FormatError: See `scoring.score`.
+            MissingFileError, FormatError: See `scoring.score`.
         """
         found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
         if len(found.rows.sources) != 1:

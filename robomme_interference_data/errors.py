@@ -145,7 +145,7 @@ class PublishError(InterferenceError, RuntimeError):
 
 
 class FormatError(InterferenceError, ValueError):
-    """A file that cannot be read as what it should be, or of an unknown format version."""
+    """A file that is not what it should be: damaged, inconsistent, or of an unknown version."""
 
     @classmethod
     def damaged(cls, path: object, what: object, command: str | None = None) -> Self:
@@ -158,32 +158,16 @@ class HashMismatchError(InterferenceError, ValueError):
     """Data whose SHA-256 is not the recorded one."""
 
 
-class TruncatedVideoError(InterferenceError, ValueError):
-    """A video that ends before the frames that it should hold, or skips some of them."""
-
-
 class SourceError(InterferenceError, ValueError):
     """Recorded episodes that cannot be used as they are."""
 
 
-class BadRowsError(InterferenceError, ValueError):
-    """Rows of rollouts that contradict themselves, each other or the protocol."""
-
-
 class MissingIndexError(InterferenceError, FileNotFoundError):
-    """A dataset without the embeddings that are asked for."""
-
-
-class StaleIndexError(InterferenceError, ValueError):
-    """Embeddings that were made of other data, or with another encoder, than is asked for."""
+    """A dataset without the embeddings, or with ones of other data or another encoder."""
 
 
 class BuildError(InterferenceError, RuntimeError):
-    """A build that cannot go on."""
-
-
-class PoolTooSmallError(InterferenceError, ValueError):
-    """Fewer eligible distractor units than a buffer needs."""
+    """A build that cannot go on, as where a buffer needs more units than there are."""
 
 
 class HistoryTooLongError(InterferenceError, ValueError):
@@ -192,10 +176,6 @@ class HistoryTooLongError(InterferenceError, ValueError):
 
 class NoRendererError(InterferenceError, RuntimeError):
     """No Vulkan device on this machine can render the simulator's cameras."""
-
-
-class MotionError(InterferenceError, RuntimeError):
-    """A scripted motion asks for a pose that the arm cannot take."""
 
 
 class SimulatorCrashError(InterferenceError, RuntimeError):
@@ -227,7 +207,7 @@ class WireError(InterferenceError, ValueError):
 
 
 class RolloutError(InterferenceError, RuntimeError):
-    """A rollout that cannot be run as planned: simulator and data contradict each other."""
+    """A rollout that cannot be run as planned, as where simulator and data differ."""
 
 
 class RunFolderError(InterferenceError, FileExistsError):
@@ -235,11 +215,7 @@ class RunFolderError(InterferenceError, FileExistsError):
 
 
 class WorkerError(InterferenceError, RuntimeError):
-    """Worker processes that cannot be started."""
-
-
-class ClusterError(InterferenceError, RuntimeError):
-    """A cluster that cannot be reached, or whose nodes are not what they should be."""
+    """Workers that cannot be started, or whose cluster is not there or not as it must be."""
 
 
 class WorkerRetiredError(InterferenceError, RuntimeError):

@@ -117,7 +117,7 @@ class Source(Protocol):
 
         Raises:
             InvalidOptionError: The episode has no such camera.
-            SourceError, MissingFileError, FormatError, TruncatedVideoError, HubError: The
+            SourceError, MissingFileError, FormatError, HubError: The
                 recording cannot be read, or, while it is read, breaks off. Which episode it is
                 need not be said.
         """

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from robomme_interference_data.errors import BadRowsError
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.stats.bootstrap import DRAWS
 from robomme_interference_data.viz.tables import Table
@@ -68,7 +68,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     if not len(rows):
         where = f"in {', '.join(map(str, settings.rows))}"
-        raise BadRowsError(
+        raise FormatError(
             f"all {rows.refused:,} rows {where} are bad; the first is {rows.refusals[0]}"
             if rows.refused
             else f"there are no rows {where}",

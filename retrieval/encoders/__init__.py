@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.data.embeddings import EncoderRecord, encoder_id
-from robomme_interference_data.errors import InvalidOptionError, StaleIndexError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, MissingIndexError, UnknownNameError
 from robomme_interference_data.storage.files import canonical_json
 
 _KINDS = ("siglip", "thumbnail")
@@ -62,7 +62,7 @@ def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: str) -> Non
         remedy: How they are made again.
     """
     if recorded.sha256 != encoder_digest(encoder):
-        raise StaleIndexError(
+        raise MissingIndexError(
             f"the embeddings of {encoder.name!r} beside the data were made with another version "
             "of the encoder: its weights, settings, preprocessing or code differ",
             f"Make them again. {remedy}",

@@ -192,7 +192,7 @@ class Buffer:
 
         Raises:
             UnknownNameError: There is no such camera.
-            MissingFileError, FormatError, TruncatedVideoError: A video cannot be read.
+            MissingFileError, FormatError: A video cannot be read.
         """
         out = room_for(len(self), self.query.dataset.shape(camera))
         self._fetch(*(self._source(one, [camera]) for one in self.sessions))
@@ -209,7 +209,7 @@ class Buffer:
         Raises:
             InvalidOptionError: `index` is no whole number.
             UnknownNameError: There is no such frame or camera.
-            MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
+            MissingFileError, FormatError: As for `frames`.
         """
         index = whole_number("index", index, "a whole number from 0, such as 3")
         self._check_inside(index, index)
@@ -239,7 +239,7 @@ class Buffer:
             InvalidOptionError: `chunk` is not positive, the indices do not ascend, or an argument
                 is of another type.
             UnknownNameError: The buffer has no such frame or camera.
-            MissingFileError, FormatError, TruncatedVideoError: As for `frames`.
+            MissingFileError, FormatError: As for `frames`.
         """
         expected = "a whole number from 1"
         chunk = whole_number("chunk", chunk, expected)
@@ -287,7 +287,7 @@ class Buffer:
             `(T, D) float32`, each of length 1, in the buffer's order; a new array.
 
         Raises:
-            MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
+            MissingIndexError, FormatError: See `SplitIndex`.
         """
         index = self.index(encoder, camera)
         parts: list[NDArray[np.float32]] = [np.empty((0, index.size), np.float32)]
@@ -302,7 +302,7 @@ class Buffer:
         For grading without a simulator: in a rollout, what the robot sees is embedded then.
 
         Raises:
-            MissingIndexError, StaleIndexError, FormatError: See `SplitIndex`.
+            MissingIndexError, FormatError: See `SplitIndex`.
         """
         place = self.query.first_frame
         span = place.dataset, place.episode_index, place.frame, place.frame + 1

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import DISTRACTORS
-from robomme_interference_data.errors import MissingIndexError, StaleIndexError
+from robomme_interference_data.errors import MissingIndexError
 
 from .embeddings import EncoderRecord
 
@@ -59,7 +59,7 @@ class SplitIndex:
         for name, index in self._indexes.items():
             if index.made != units.made:
                 places = (datasets[one].files.describe() for one in (name, DISTRACTORS))
-                raise StaleIndexError(
+                raise MissingIndexError(
                     f"the embeddings of encoder {encoder!r} were made differently in "
                     f"{' and in '.join(places)}",
                     f"Make them again. {index.remedy}",

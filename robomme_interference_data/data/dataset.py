@@ -215,7 +215,7 @@ class Dataset:
         Raises:
             UnknownNameError: There is no such camera.
             MissingIndexError: The dataset has no embeddings of this encoder and camera.
-            StaleIndexError: They were made of other data, or with another encoder.
+            MissingIndexError: They were made of other data, or with another encoder.
             FormatError: They are of an unknown version, or damaged.
         """
         if not isinstance(encoder, str):
@@ -231,7 +231,7 @@ class Dataset:
         """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order.
 
         Raises:
-            MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
+            MissingFileError, FormatError: See `video.iter_frames`.
         """
         return self.lerobot.iter_frames(episode_index, self._camera(camera), start, stop)
 
@@ -241,7 +241,7 @@ class Dataset:
         """Decode frames from `start` on into `out`, `(T, H, W, 3) uint8`.
 
         Raises:
-            MissingFileError, FormatError, TruncatedVideoError: See `video.iter_frames`.
+            MissingFileError, FormatError: See `video.iter_frames`.
         """
         frames = self.iter_frames(episode_index, camera, start, start + len(out))
         for target, frame in zip(out, frames, strict=True):
@@ -253,7 +253,7 @@ class Dataset:
         """Read states or actions of frames `start` to `stop` (excluded), `(T, D) float32`.
 
         Raises:
-            MissingFileError, FormatError, TruncatedVideoError: See `LeRobotFiles.vectors`.
+            MissingFileError, FormatError: See `LeRobotFiles.vectors`.
         """
         self.lerobot.check_span(episode_index, start, stop)
         return self.lerobot.vectors(episode_index, feature)[start:stop]

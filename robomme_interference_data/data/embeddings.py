@@ -28,7 +28,6 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingFileError,
     MissingIndexError,
-    StaleIndexError,
     UnknownNameError,
 )
 from robomme_interference_data.schema.codec import to_dict
@@ -190,13 +189,13 @@ class EmbeddingIndex:
             raise FormatError(error.message, self.remedy) from None
         made = self.header.encoder.name, self.header.camera
         if made != (encoder_id(encoder), camera):
-            raise StaleIndexError(
+            raise MissingIndexError(
                 f"the embeddings in {self._place} are of encoder {made[0]!r} and "
                 f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
                 f"Give the encoder as {made[0]!r}, or make them anew. {self.remedy}",
             )
         if self.header.revision != revision:
-            raise StaleIndexError(
+            raise MissingIndexError(
                 f"the embeddings of {of} in {root} were made of data with "
                 f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
                 f"Make them again. {self.remedy}",

@@ -110,7 +110,7 @@ class Query:
 
         Raises:
             UnknownNameError: There is no such camera.
-            MissingFileError, FormatError, TruncatedVideoError: Its video cannot be read.
+            MissingFileError, FormatError: Its video cannot be read.
         """
         start, index = self.lesson_frames, self.record.episode_index
         [frame] = self.dataset.iter_frames(index, camera, start, start + 1)

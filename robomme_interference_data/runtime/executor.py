@@ -97,7 +97,7 @@ class Executor(ABC):
             function: What to do with each task.
 
         Raises:
-            ClusterError: There is no cluster, it is this machine and has no room, nodes differ
+            WorkerError: There is no cluster, it is this machine and has no room, nodes differ
                 from this process, or workers cannot be made.
         """
 
@@ -120,7 +120,7 @@ class Executor(ABC):
             WorkerError: A worker ended before its first task, as it does when the script that it
                 imports starts work outside `if __name__ == "__main__":`.
             WorkerRetiredError: No worker is left for the remaining tasks; why the last retired.
-            ClusterError: See `session`.
+            WorkerError: See `session`.
         """
         end_if_starting()
         todo = list(tasks)

@@ -24,9 +24,9 @@ from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from robomme_interference_data.errors import (
-    ClusterError,
     InterferenceError,
     InvalidOptionError,
+    WorkerError,
     first_line,
 )
 
@@ -128,7 +128,7 @@ class RayWorkers(Executor):
         One that is lost meanwhile is left out.
 
         Raises:
-            ClusterError: Some differ; or there is none, and none can come.
+            WorkerError: Some differ; or there is none, and none can come.
         """
         asked: dict[str, Any] = {}
         for node in _nodes():
@@ -136,7 +136,7 @@ class RayWorkers(Executor):
             if node["Alive"] and has.get("CPU", 0) >= self.cpus and has.get("GPU", 0) >= self.gpus:
                 asked[node["NodeID"]] = _on_node(_describe, node["NodeID"]).remote(function, folder)
         if not asked and self.address == "local":
-            raise ClusterError(
+            raise WorkerError(
                 f"this machine does not have {self.wanted} for a worker",
                 "Set smaller cpus_per_worker and gpus_per_worker.",
             )
@@ -152,7 +152,7 @@ class RayWorkers(Executor):
                 if any(node["Alive"] for node in _nodes() if node["NodeID"] == node_id):
                     wrong.append(f"{name}: {_cause(error)}")
         if wrong:
-            raise ClusterError(
+            raise WorkerError(
                 "nodes of the cluster are not as this process is:\n  " + "\n  ".join(wrong),
                 "Install the same on all nodes, and give a split that all of them see.",
             )
@@ -217,7 +217,7 @@ class _RayWorker:
         """Take note that it has begun; where it cannot, begin elsewhere.
 
         Raises:
-            ClusterError: It cannot, again and again.
+            WorkerError: It cannot, again and again.
         """
         try:
             self._node, self._home, found = ray.get(self.call)
@@ -226,7 +226,7 @@ class _RayWorker:
         except RayError as error:
             self._failures += 1
             if self._failures == _FAILURES:
-                raise ClusterError(f"a worker cannot begin: {_cause(error)}") from None
+                raise WorkerError(f"a worker cannot begin: {_cause(error)}") from None
             self._begin()
         else:
             wrong = [] if found is None else _differences(_name(self._node), found, self._all.own)
@@ -341,12 +341,12 @@ def _connected(address: str) -> Iterator[None]:
     """Be a driver of a cluster in the block, unless this process is one already.
 
     Raises:
-        ClusterError: There is none at the address.
+        WorkerError: There is none at the address.
     """
     if ray.is_initialized():
         yield
         return
-    unreached = ClusterError(
+    unreached = WorkerError(
         f"no Ray cluster can be reached at {address!r}",
         'Start one with  ray start --head  and give its address, or "local".',
     )
@@ -370,7 +370,7 @@ def _connected(address: str) -> Iterator[None]:
             unreached.hint = f"{unreached.hint}\n{_TOKEN}"
             raise unreached from error
         except (ValueError, RuntimeError, RayError) as error:  # such as another version of Ray
-            raise ClusterError(
+            raise WorkerError(
                 f"the Ray cluster at {address!r} refuses: {first_line(error)}",
                 f"Install the same Ray and Python here and on its nodes.\n{_TOKEN}",
             ) from error

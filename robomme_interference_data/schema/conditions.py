@@ -199,7 +199,7 @@ class Condition:
         """Return the sessions of a query's buffer, in order.
 
         Raises:
-            PoolTooSmallError: The provider does not hold so many units.
+            BuildError: The provider does not hold so many units.
             SourceError: It has no contradicting lesson.
         """
         return self.kind.rule(provider, self.k)

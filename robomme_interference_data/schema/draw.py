@@ -27,7 +27,7 @@ from functools import cache, partial
 from itertools import islice
 
 from robomme_interference_data.constants import FAMILIES, RULE_VERSION
-from robomme_interference_data.errors import InvalidOptionError, PoolTooSmallError
+from robomme_interference_data.errors import BuildError, InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
 
 
@@ -64,7 +64,7 @@ class UnitPool:
         others = {name: units for name, units in self._families.items() if name != query.family}
         count = sum(map(len, others.values()))
         if k > count:
-            raise PoolTooSmallError(
+            raise BuildError(
                 f"{query} needs {k} distractor units of other families; the pool has "
                 f"{count} ({', '.join(others) or 'no family'})",
                 "Build distractors from more episodes or families, or plan a smaller k.",
@@ -78,7 +78,7 @@ class UnitPool:
         """
         units = [one for one in self._families.get(query.family, []) if one != query]
         if k > len(units):
-            raise PoolTooSmallError(
+            raise BuildError(
                 f"{query} needs {k} units of its own family; the pool has {len(units)} others",
                 f"Build distractors from more episodes of {query.family}, or plan a smaller k.",
             )

@@ -13,12 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import EPISODES_DIR, INFO_PATH, TASKS_PATH
-from robomme_interference_data.errors import (
-    FormatError,
-    MissingFileError,
-    TruncatedVideoError,
-    UnknownNameError,
-)
+from robomme_interference_data.errors import FormatError, MissingFileError, UnknownNameError
 
 from . import video
 from .files import Files, parse_json, read_bytes, read_json
@@ -157,7 +152,7 @@ class LeRobotFiles:
             or (found != start + numbers).any()
             or (rows.scalars("frame_index") != numbers).any()
         ):
-            raise TruncatedVideoError(
+            raise FormatError(
                 f"{path} holds {len(found)} rows of episode {index}; {place.length}, one after the "
                 "other and counted from 0, are expected",
                 "The dataset is damaged: download or build it again.",
@@ -189,7 +184,7 @@ class LeRobotFiles:
         """Check that an episode has frames `start` to `stop` (excluded)."""
         length = self.row(index)["length"]
         if not 0 <= start <= stop <= length:
-            raise TruncatedVideoError(
+            raise FormatError(
                 f"episode {index} of {self.files.describe()} has {length} stored frames; frames "
                 f"{start} to {stop - 1} were asked for"
             )

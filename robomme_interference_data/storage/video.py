@@ -12,7 +12,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.errors import FormatError, MissingFileError, TruncatedVideoError
+from robomme_interference_data.errors import FormatError, MissingFileError
 
 from .untrusted.video_boxes import find_container, unreadable
 
@@ -57,7 +57,7 @@ def iter_frames(
             return
         for number, frame in frames:
             if number != expected:
-                raise TruncatedVideoError(
+                raise FormatError(
                     f"{path}: frame {expected} is missing (the next one found is {number})",
                     "The file is damaged: download or build it again.",
                 )
@@ -69,7 +69,7 @@ def iter_frames(
                 return
     if stop is not None or expected == start:
         wanted = "at least one frame" if stop is None else f"frames {start} to {stop - 1}"
-        raise TruncatedVideoError(
+        raise FormatError(
             f"{path}: the video ends before frame {expected}; expected {wanted}",
             "The file is damaged or incomplete: download or build it again.",
         )
@@ -145,7 +145,7 @@ def _indexed_frames(
                 if number >= start:
                     yield number, frame
         except av.error.FFmpegError as error:
-            raise TruncatedVideoError(
+            raise FormatError(
                 f"{path}: decoding stopped: {error}",
                 "The file is damaged or incomplete: download or build it again.",
             ) from error

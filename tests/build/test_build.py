@@ -27,7 +27,6 @@ from robomme_interference_data.errors import (
     InterferenceError,
     InvalidIdError,
     InvalidOptionError,
-    PoolTooSmallError,
     SourceError,
 )
 from robomme_interference_data.runtime.executor import Serial
@@ -278,10 +277,10 @@ def test_views_under_shifts_are_of_the_queries(tmp_path: Path) -> None:
         ({}, {"conditions": ("k0", "k0")}, InvalidOptionError),
         ({}, {"conditions": ("x3",)}, InvalidIdError),
         ({}, {"position_limit": "many"}, InvalidOptionError),
-        ({}, {"conditions": ("k63",)}, PoolTooSmallError),
+        ({}, {"conditions": ("k63",)}, BuildError),
         ({"source": ("robomme",)}, {}, InvalidOptionError),
         ({"shifted": True}, {}, InvalidOptionError),  # the sample has no lamps
-        ({"source": ("sample:MoveCube",)}, {}, PoolTooSmallError),
+        ({"source": ("sample:MoveCube",)}, {}, BuildError),
     ],
 )
 def test_build_all_refuses_before_it_reads(

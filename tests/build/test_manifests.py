@@ -23,7 +23,6 @@ from robomme_interference_data.errors import (
     HistoryTooLongError,
     InvalidOptionError,
     MissingFileError,
-    PoolTooSmallError,
     SourceError,
 )
 from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
@@ -179,18 +178,18 @@ def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.Monkey
     found = {one.condition: one.sessions for one in list(planned_buffers(plan))[:3]}
     assert [len(sessions) for sessions in found.values()] == [2, 2, 9]
     assert found["more-k1"] == found["more-k8"][:2]
-    with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):
+    with pytest.raises(BuildError, match="needs 10 distractor units"):
         list(planned_buffers(plan_manifests(in_folder(root), ("more-k9",))))
     split = tmp_path / "split"
     asked = AllConfig(source=("sample:MoveCube,PatternLock",), out=split, split="test")
     assert plan_all(asked, PlanConfig(conditions=("more-k1",)))
-    with pytest.raises(PoolTooSmallError, match="needs 4 distractor units"):
+    with pytest.raises(BuildError, match="needs 4 distractor units"):
         plan_all(asked, PlanConfig(conditions=("more-k3",)))
 
 
 def test_a_pool_too_small(tmp_path: Path) -> None:
     root = made_up(tmp_path)
-    with pytest.raises(PoolTooSmallError, match="needs 10 distractor units"):
+    with pytest.raises(BuildError, match="needs 10 distractor units"):
         list(write_manifests(plan_manifests(in_folder(root), ("k10",)), root))
     assert list((root / "manifests").iterdir()) == []
 

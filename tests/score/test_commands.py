@@ -16,7 +16,7 @@ from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, run
 
 from robomme_interference_data.errors import (
-    BadRowsError,
+    FormatError,
     InvalidIdError,
     InvalidOptionError,
     MissingExtraError,
@@ -100,7 +100,7 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,MoveCub,k0,1,8,easy,fail,0,9"]
     path = made.released(tmp_path / "a.csv", lines)
     common = ("score", path, "--grid", "given", "--out", tmp_path / "out")
-    assert isinstance(run(*common).exception, BadRowsError)
+    assert isinstance(run(*common).exception, FormatError)
     assert not (tmp_path / "out").exists()
     done = run(*common, "--lenient")
     assert done.exit_code == 0, done.output
@@ -108,7 +108,7 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     assert "1 bad rows left out" in done.stderr
     assert "my-memory  100.0% [20.7, 100.0]\n" in done.stdout
     assert "family &#39;MoveCub&#39;" in (tmp_path / "out" / "report.html").read_text()
-    assert isinstance(run("compare", path, again(path)).exception, BadRowsError)
+    assert isinstance(run("compare", path, again(path)).exception, FormatError)
     done = run("compare", path, again(path), "--lenient", "--json")
     assert json.loads(done.stdout)["bad_rows"] == [1, 1]
     assert done.stderr.count("family 'MoveCub'") == 2

@@ -14,12 +14,7 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import GOOD
 
-from robomme_interference_data.errors import (
-    BadRowsError,
-    FormatError,
-    InvalidOptionError,
-    MissingFileError,
-)
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.comparisons.compare import compare
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows
@@ -100,7 +95,7 @@ def test_a_record_holds_what_came_last(tmp_path: Path) -> None:
     assert len(read_rows([folder])) == 0
     # What did not break is not run again: two rows contradict each other.
     made.write_run(folder, [good, broken])
-    with pytest.raises(BadRowsError, match="line 2: the same rollout as"):
+    with pytest.raises(FormatError, match="line 2: the same rollout as"):
         read_rows([folder])
 
 
@@ -153,7 +148,7 @@ def test_a_scene_may_lack_its_seed_but_no_rollout_the_models(tmp_path: Path, gap
     assert 1000 in read_rows([tmp_path / "b.csv"]).names("seed")
     models = pa.array([0.0, gap, *([5.0] * 105)], from_pandas=False)
     path = write(tmp_path / "c.parquet", model_seed=models)
-    with pytest.raises(BadRowsError, match=r"1 bad row:\n.*row 2: model_seed .*; expected"):
+    with pytest.raises(FormatError, match=r"1 bad row:\n.*row 2: model_seed .*; expected"):
         read_rows([path])
     found = read_rows([path], lenient=True)
     assert (len(found), found.refused, found.names("model_seed")) == (106, 1, [0, 5])
@@ -182,7 +177,7 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
     tmp_path: Path, line: str, reason: str
 ) -> None:
     path = made.released(tmp_path / "rows.csv", [GOOD, line, GOOD.replace("k0", "k3")])
-    with pytest.raises(BadRowsError) as raised:
+    with pytest.raises(FormatError) as raised:
         read_rows([path])
     assert raised.value.message.startswith(f"1 bad row:\n{path}, line 3: ")
     assert reason in raised.value.message
@@ -208,7 +203,7 @@ def test_bad_rows_of_runs_are_refused(tmp_path: Path, change: dict[str, Any], re
     rows = made.rows()
     rows[20] = replace(rows[20], **change)
     path = made.write_csv(tmp_path / "a.csv", rows)
-    with pytest.raises(BadRowsError) as raised:
+    with pytest.raises(FormatError) as raised:
         read_rows([path])
     first = raised.value.message.splitlines()[1]
     assert first.startswith(f"{path}, line 22: ") and reason in first
@@ -237,7 +232,7 @@ def test_lines_are_right_after_quoted_line_breaks(tmp_path: Path) -> None:
 def test_many_bad_rows_are_counted_and_ten_are_named(tmp_path: Path) -> None:
     lines = [f"my-memory,MoveCube,k0,{n},{n},easy,fail,1,9" for n in range(25)]
     path = made.released(tmp_path / "rows.csv", lines)
-    with pytest.raises(BadRowsError) as raised:
+    with pytest.raises(FormatError) as raised:
         read_rows([path])
     shown = raised.value.message.splitlines()
     assert (shown[0], len(shown), shown[-1]) == ("25 bad rows:", 12, "… and 15 more")
@@ -250,7 +245,7 @@ def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -
     one = made.write_csv(tmp_path / "one.csv", rows[:50])
     two = made.write_csv(tmp_path / "two.csv", [other, rows[60]])
     three = made.write_csv(tmp_path / "three.csv", [rows[3], rows[8]])
-    with pytest.raises(BadRowsError) as raised:
+    with pytest.raises(FormatError) as raised:
         read_rows([one, two, three])
     more = "; its rows contradict each other"
     assert raised.value.message.splitlines() == [
@@ -269,9 +264,9 @@ def test_rows_of_one_rollout_that_contradict_each_other_all_go(tmp_path: Path) -
 
 def test_nothing_but_bad_rows_and_no_rows_are_no_score(tmp_path: Path) -> None:
     path = made.write_csv(tmp_path / "a.csv", made.changed(made.rows()[:3], family="X"))
-    with pytest.raises(BadRowsError, match=r"all 3 rows .* are bad; the first is .*line 2: family"):
+    with pytest.raises(FormatError, match=r"all 3 rows .* are bad; the first is .*line 2: family"):
         made.score(path, lenient=True)
-    with pytest.raises(BadRowsError, match="no rows"):
+    with pytest.raises(FormatError, match="no rows"):
         made.score(made.write_csv(tmp_path / "b.csv", []))
 
 
@@ -303,7 +298,7 @@ def test_rows_under_several_shifts_never_mix(tmp_path: Path) -> None:
 )
 def test_what_is_no_shift_is_a_bad_row(tmp_path: Path, column: str, value: str) -> None:
     path = write(tmp_path / "a.parquet", **{column: pa.array([value, *["none"] * 106])})
-    with pytest.raises(BadRowsError, match=r"row 1: shift .*; expected none, or light"):
+    with pytest.raises(FormatError, match=r"row 1: shift .*; expected none, or light"):
         read_rows([path])
 
 

@@ -25,7 +25,7 @@ from support.worker_calls import Marked, Placed, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan
-from robomme_interference_data.errors import ClusterError
+from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
@@ -139,7 +139,7 @@ def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -
 
 
 def test_nodes_that_differ_are_refused_before_the_first_task(cluster: Any) -> None:
-    with pytest.raises(ClusterError) as raised:
+    with pytest.raises(WorkerError) as raised:
         list(RayWorkers(3, cluster.address).run(Placed(), range(3)))
     assert raised.value.message.count("node is ") == 3  # the driver is on the head
 
@@ -163,12 +163,12 @@ def connect(address: str, **environment: str) -> str:
 
 
 def test_a_cluster_that_is_not_there() -> None:
-    assert "ClusterError: no Ray cluster can be reached at '127.0.0.1:1'" in connect("127.0.0.1:1")
+    assert "WorkerError: no Ray cluster can be reached at '127.0.0.1:1'" in connect("127.0.0.1:1")
 
 
 def test_a_token_that_is_missing(cluster: Any, tmp_path: Path) -> None:
     said = connect(cluster.address, RAY_AUTH_MODE="token", HOME=str(tmp_path))
-    assert "ClusterError" in said and "~/.ray/auth_token" in said
+    assert "WorkerError" in said and "~/.ray/auth_token" in said
 
 
 def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.errors import BadRowsError, InterferenceError, InvalidOptionError
+from robomme_interference_data.errors import FormatError, InterferenceError, InvalidOptionError
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.schema.rollouts import FINAL, Status
@@ -88,7 +88,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
         lines = [f"{len(refusals):,} bad row{'s' * (len(refusals) > 1)}:", *refusals[:_SHOWN]]
         if more := len(refusals) - _SHOWN:
             lines += [f"… and {more:,} more"] * (more > 0)
-        raise BadRowsError("\n".join(lines), "Mend them, or leave them out with lenient=True.")
+        raise FormatError("\n".join(lines), "Mend them, or leave them out with lenient=True.")
     rows = tuple(checks.sound.values())
     cells = {(row.simulator, row.system, row.revision) for row in rows}
     unpinned = frozenset((simulator, one) for simulator, one, revision in cells if revision is None)
