@@ -20,8 +20,9 @@ from made_split import write_split
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
-from robomme_interference_data.cards.publish import Publisher
-from robomme_interference_data.cards.publish_config import PublishConfig
+from robomme_interference_data.cards.publication import PublishConfig
+from robomme_interference_data.cards.publish import SplitContent, plan_split, publish_split
+from robomme_interference_data.cards.publisher import Publisher
 from robomme_interference_data.constants import ACTION, RECORDS_PATH, STATE
 from robomme_interference_data.data.fetch import FetchConfig, fetch, plan_fetch
 from robomme_interference_data.errors import InterferenceError
@@ -216,8 +217,9 @@ def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
 
 def publish(root: Path, repo: str) -> None:
     """Publish a split as the command does, without its checks."""
-    publisher = Publisher(load_split(root), PublishConfig(repo))
-    publisher.run(publisher.plan())
+    config = PublishConfig(repo)
+    content, publisher = SplitContent(load_split(root), config), Publisher(config)
+    publish_split(content, publisher, plan_split(content, publisher))
 
 
 def upload_plainly(root: Path, repo: str) -> None:

@@ -25,6 +25,7 @@ from robomme_interference_data.constants import (
     IDENTITY_PATH,
     INDEX_DIR,
     MANIFESTS,
+    PARTS_PATH,
     QUESTIONS_PATH,
     RECORDS_PATH,
     REPORT_PATH,
@@ -54,11 +55,12 @@ def listed_files(root: Path) -> list[str]:
 
     An index has a list of its own; so have the manifests, which a published split has beside its
     units, and the questions, which are made anew to be checked. What people put beside a dataset
-    has none: README, LICENSE, cards and hidden files.
+    has none: README, LICENSE, cards with `parts.json`, and hidden files.
     """
     own = (IDENTITY_PATH, SUMS_PATH)
     beside = re.compile(
-        rf"(README|LICENSE|croissant)[^/]*|{QUESTIONS_PATH}|\..*|({INDEX_DIR}|{MANIFESTS})/.*"
+        rf"(README|LICENSE|croissant)[^/]*|{QUESTIONS_PATH}|{PARTS_PATH}|\..*"
+        rf"|({INDEX_DIR}|{MANIFESTS})/.*"
     )
     return [path for path in all_files(root) if path not in own and not beside.fullmatch(path)]
 

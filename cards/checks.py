@@ -14,14 +14,7 @@ from robomme_interference_data.storage.files import LocalFiles, with_filename
 
 
 def check_split(split: Split, progress: WorkProgress | None = None) -> None:
-    """Check that a split is fit to be published.
-
-    Raises:
-        PublishError: Something is not as recorded or as the rules say, something leaks, or LeRobot
-            cannot open a dataset.
-        MissingExtraError: lerobot is not installed.
-        InterferenceError: The split cannot be read.
-    """
+    """Check that a split is fit to be published; raise a `PublishError` if it is not."""
     require_lerobot()
     violations = list(verify_split(split, progress=progress))
     if violations:
@@ -29,14 +22,16 @@ def check_split(split: Split, progress: WorkProgress | None = None) -> None:
         raise PublishError(
             f"{split.location} is not as recorded: {_number(violations, 'violation')}, such as "
             f"{first.where}: {first.what}",
-            f"List all of them: robomme-interference verify {split.location}",
+            "List all of them.",
+            f"verify {split.location}",
         )
     leaks = audit_split(split).leaks
     if leaks:
         raise PublishError(
             f"{split.location} leaks: {_number(leaks, 'leak')}, such as {leaks[0].kind}: "
             f"{leaks[0].where}",
-            f"List all of them: robomme-interference audit {split.location}",
+            "List all of them.",
+            f"audit {split.location}",
         )
     for name in split.header.datasets:
         place = split.place(name)
@@ -45,12 +40,7 @@ def check_split(split: Split, progress: WorkProgress | None = None) -> None:
 
 
 def open_with_lerobot(name: str, root: Path) -> None:
-    """Open a dataset as its users will, and read its first and last frame.
-
-    Raises:
-        PublishError: LeRobot cannot.
-        OSError: The disk is full, or a folder cannot be written to.
-    """
+    """Open a dataset as its users will, and read its first and last frame."""
     from datasets import config
 
     before = logging.root.manager.disable
@@ -62,16 +52,16 @@ def open_with_lerobot(name: str, root: Path) -> None:
         for index in (0, len(dataset) - 1):
             dataset[index]
     except Exception as error:
-        told: BaseException | None = error
-        while told is not None:  # LeRobot copies tables to a cache, and that disk may be full
-            if isinstance(told, OSError) and told.errno is not None:
+        cause: BaseException | None = error
+        while cause is not None:  # LeRobot copies tables to a cache, and that disk may be full
+            if isinstance(cause, OSError) and cause.errno is not None:
                 with with_filename(config.HF_DATASETS_CACHE):
-                    raise told from None
-            told = told.__cause__
+                    raise cause from None
+            cause = cause.__cause__
         raise PublishError(
             f"LeRobot cannot open {root}: {type(error).__name__}: {error}",
-            "Its files are as recorded: look whether lerobot is of a version that this package "
-            "knows, with robomme-interference doctor",
+            "Its files are as recorded: check the version of lerobot.",
+            "doctor",
         ) from error
     finally:
         logging.disable(before)

@@ -12,18 +12,21 @@ from robomme_interference_data.cli.options import AsJson, SplitFolder, with_sett
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.config import Grid
 
-from .publish_config import PublishConfig, VersionConfig
+from .publication import Publication, PublishConfig, VersionConfig
 
 if TYPE_CHECKING:
-    from robomme_interference_data.data.buffer_set import Split
     from robomme_interference_data.storage.files import Files
 
-    from .publication import Publication
-    from .publishing import Publishing
-    from .step import Step
+    from .facts import Facts
+    from .publisher import Publisher, RepoPlan
+    from .repo import RepoFiles
 
 Private = Annotated[bool, typer.Option("--private", help="New repositories are private.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only tell what would be sent.")]
+To = Annotated[
+    Path | None,
+    typer.Option(help="Folder to write the same files into, instead of publishing them."),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only show what would be sent.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 
 
@@ -38,9 +41,8 @@ def card(
         str, typer.Option(help="Repository that the card is for.")
     ] = "namespace/name",
     version: Annotated[str, typer.Option(help="Version that it is of.")] = "1.0.0",
-    licence: Annotated[
-        str,
-        typer.Option("--license", help="Its licence, such as cc-by-4.0; other: the recordings'."),
+    license: Annotated[
+        str, typer.Option(help="Its license, such as cc-by-4.0; other: the recordings'.")
     ] = "other",
 ) -> None:
     """Print the card of a split, of demonstrations or of a run: README.md, all of it from data.
@@ -52,20 +54,14 @@ def card(
     robomme-interference card my-run --repo-id my-name/my-results
     ```
     """
-    from .publication import Publication
+    from .render import card_text
 
-    echo(card_text(source, Publication(repo_id, version, licence)), nl=False)
+    about = Publication(repo_id, version, license)
+    echo(card_text(facts_of(source), about), nl=False)
 
 
-def card_text(source: str, about: "Publication") -> str:
-    """Return the card of whatever lies in a folder, or on the Hub under a name.
-
-    Raises:
-        MissingFileError: There is no split, no dataset and no run.
-        InvalidOptionError: It is neither a folder nor the name of a repository.
-        MissingExtraError: jinja2 is not installed.
-        InterferenceError: It cannot be read.
-    """
+def facts_of(source: str) -> "Facts":
+    """Return what there is to say of what lies in a folder, or on the Hub under a name."""
     from robomme_interference_data.constants import (
         IDENTITY_PATH,
         MANIFEST_PATH,
@@ -77,21 +73,22 @@ def card_text(source: str, about: "Publication") -> str:
     from robomme_interference_data.data.loading import load_split
     from robomme_interference_data.storage.hub import locate
 
-    from . import render
+    from .facts import demonstrations_facts, split_facts
+    from .results import results_facts
 
     if Path(source).is_file():
-        return render.results_text(Path(source), about)
+        return results_facts(Path(source))
     files = locate(source)
     if _has(files, MANIFEST_PATH):
-        return render.split_text(load_split(files.location), about)
+        return split_facts(load_split(files.location))
     if _has(files, IDENTITY_PATH):
-        return render.demonstrations_text(Dataset(files), about)
+        return demonstrations_facts(Dataset(files))
     if _has(files, RUN_HEADER):
-        return render.results_text(files.snapshot(RUN_HEADER, RUN_RECORD, *RUN_TABLES), about)
+        return results_facts(files.snapshot(RUN_HEADER, RUN_RECORD, *RUN_TABLES))
     raise MissingFileError(
         f"{files.describe()} holds no split, no demonstrations and no run: {MANIFEST_PATH}, "
         f"{IDENTITY_PATH} and {RUN_HEADER} are missing",
-        "Point to the folder that robomme-interference build or evaluate wrote.",
+        "Give the folder of a split or of a run.",
     )
 
 
@@ -107,10 +104,7 @@ def publish(
     split: SplitFolder,
     config: PublishConfig,
     private: Private = False,
-    to: Annotated[
-        Path | None,
-        typer.Option(help="Folder to write the repositories into, instead of publishing them."),
-    ] = None,
+    to: To = None,
     dry_run: DryRun = False,
     yes: Yes = False,
     as_json: AsJson = False,
@@ -118,7 +112,7 @@ def publish(
     """Publish a split on the Hub: its demonstrations, then its units and manifests, with cards.
 
     All hashes and rules are checked first. A version never changes: its tag, such as data-1.0.0,
-    comes last, and is never moved. Stopped at any time, the same command goes on and sends what is
+    comes last, and is never moved. Re-run the same command after an interruption to send what is
     missing.
 
     Examples:
@@ -134,87 +128,40 @@ def publish(
     from robomme_interference_data.runtime.progress import WorkProgress
 
     from .checks import check_split
-    from .upload import HubRepository
+    from .publish import SplitContent, plan_split, publish_split
+    from .publisher import Publisher
+    from .repo import HubRepository
 
     opened = load_split(split)
-    here = opened.header.datasets[DEMONSTRATIONS].place is None  # else they are published already
-    if here and not opened.place(DEMONSTRATIONS).list(INDEX_DIR):
+    unpublished = opened.header.datasets[DEMONSTRATIONS].place is None
+    if unpublished and not opened.place(DEMONSTRATIONS).list(INDEX_DIR):
         say(
-            "The demonstrations go without embeddings; for some, type before: "
+            "The demonstrations are published without embeddings. To add some first: "
             f"robomme-interference index {split}"
         )
     if to is not None:
         check_output(to.resolve().parent)
     elif not dry_run:
-        HubRepository(config.repo_id, say).check_rights(there=False)  # checks may take hours
+        HubRepository(config.repo_id).check_rights(exists=False)  # checks may take hours
     with WorkProgress(quiet=as_json) as progress:
         check_split(opened, progress)
+    content = SplitContent(opened, config)
     if to is not None:
-        _export(opened, config, to, dry_run=dry_run, as_json=as_json)
-    else:
-        _publish(opened, config, private=private, dry_run=dry_run, yes=yes, as_json=as_json)
-
-
-def _export(
-    split: "Split", config: PublishConfig, to: Path, *, dry_run: bool, as_json: bool
-) -> None:
-    from .export import exported_tree, write_tree
-    from .tree import total_size
-
-    tree = exported_tree(split, config)
-    written = not dry_run and write_tree(tree, to)
-    told = {"to": str(to), "files": len(tree), "bytes": total_size(tree), "written": written}
-    if as_json:
-        print_json(told)
-    else:
-        done = "would be written" if dry_run else "written" if written else "was there"
-        say(f"{to}: {len(tree):,} files, {total_size(tree):,} bytes; {done}")
-
-
-def _publish(
-    split: "Split",
-    config: PublishConfig,
-    *,
-    private: bool,
-    dry_run: bool,
-    yes: bool,
-    as_json: bool,
-) -> None:
-    from .publish import Publisher
-
-    publisher = Publisher(split, config, private=private, tell=say)
-    steps = publisher.plan()
+        _export(content.folder(), to, dry_run=dry_run, as_json=as_json)
+        return
+    publisher = Publisher(config, private=private)
+    plans = plan_split(content, publisher)
     done = _carry_out(
-        publisher, steps, lambda: publisher.run(steps), dry_run=dry_run, yes=yes, as_json=as_json
+        publisher,
+        plans,
+        lambda: publish_split(content, publisher, plans),
+        dry_run=dry_run,
+        yes=yes,
+        as_json=as_json,
     )
     if done and not as_json:
         last = done[-1]
         say(f'load_split("{last.repository.repo_id}", revision="{last.version.tag}")')
-
-
-def _carry_out(
-    publishing: "Publishing",
-    steps: "list[Step]",
-    run: "Callable[[], list[Step]]",
-    *,
-    dry_run: bool,
-    yes: bool,
-    as_json: bool,
-) -> "list[Step]":
-    """Show what is to be done, ask, do it, and tell; return what was done."""
-    from .step import step_table
-
-    say(step_table(steps).text())
-    if not dry_run and any(step.published is None for step in steps):
-        publishing.check_rights(steps)
-        _ask(yes)
-        with stoppable("What was sent is kept; nothing is a version before its tag is there"):
-            steps = run()
-    if as_json:
-        print_json([step.as_dict() for step in steps])
-    elif not dry_run:
-        say(f"{steps[-1].repository.page}/tree/{steps[-1].version.tag}")
-    return [] if dry_run else steps
 
 
 @with_settings
@@ -225,13 +172,14 @@ def publish_results(
         Grid, typer.Option(help="Episodes of a complete cell, as for score.")
     ] = Grid.BENCHMARK,
     private: Private = False,
+    to: To = None,
     dry_run: DryRun = False,
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Publish the results of a run on the Hub: rows, scores, report and a card.
 
-    Versions are kept as those of a split are. Videos of rollouts stay here.
+    Versions are kept as those of a split are. Videos of rollouts are not published.
 
     Examples:
     ```
@@ -239,33 +187,65 @@ def publish_results(
     robomme-interference publish-results my-run --repo-id my-name/my-results --yes
     ```
     """
-    from .publish_results import results_of, score_run
-    from .publishing import Publishing
+    from .publisher import Publisher
+    from .results import results_content, score_run
 
-    goods = results_of(score_run(run, grid), run, config)
-    publishing = Publishing(config, private=private, tell=say)
-    steps = [publishing.step(goods)]
+    content = results_content(score_run(run, grid), run, config)
+    if to is not None:
+        _export(content.files(config.wanted or content.first), to, dry_run=dry_run, as_json=as_json)
+        return
+    publisher = Publisher(config, private=private)
+    plan = publisher.plan(content)
     _carry_out(
-        publishing,
-        steps,
-        lambda: [publishing.put(steps[0])],
-        dry_run=dry_run,
-        yes=yes,
-        as_json=as_json,
+        publisher, [plan], lambda: [publisher.put(plan)], dry_run=dry_run, yes=yes, as_json=as_json
     )
 
 
-def _ask(yes: bool) -> None:
-    """Ask whether to go on.
+def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> None:
+    """Write files into a folder, and say so."""
+    from .repo import total_size, write_folder
 
-    Raises:
-        InvalidOptionError: Nobody is there to answer.
-    """
+    written = not dry_run and write_folder(files, to)
+    if as_json:
+        size = total_size(files)
+        print_json({"to": str(to), "files": len(files), "bytes": size, "written": written})
+    else:
+        done = "would be written" if dry_run else "written" if written else "already there"
+        say(f"{to}: {len(files):,} files, {total_size(files):,} bytes; {done}")
+
+
+def _carry_out(
+    publisher: "Publisher",
+    plans: "list[RepoPlan]",
+    run: "Callable[[], list[RepoPlan]]",
+    *,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
+) -> "list[RepoPlan]":
+    """Show what is to be done, ask, do it, and report; return what was done."""
+    from .publisher import plan_table
+
+    say(plan_table(plans).text())
+    if not dry_run and any(plan.published is None for plan in plans):
+        publisher.check_rights(plans)
+        _ask(yes)
+        with stoppable("What was sent is kept; nothing is a version before its tag is there"):
+            plans = run()
+    if as_json:
+        print_json([plan.to_dict() for plan in plans])
+    elif not dry_run:
+        say(f"{plans[-1].repository.page}/tree/{plans[-1].version.tag}")
+    return [] if dry_run else plans
+
+
+def _ask(yes: bool) -> None:
+    """Ask whether to go on; where nobody can answer, an `InvalidOptionError` names the option."""
     if yes:
         return
     if not sys.stdin.isatty():
         raise InvalidOptionError(
-            "nobody is there to be asked whether this is to be published",
-            "If it is, type the same command with --yes.",
+            "publishing has to be confirmed, and there is no terminal to ask on",
+            "To confirm, type the same command with --yes.",
         )
     typer.confirm("Publish this?", abort=True, err=True)

@@ -1,287 +1,324 @@
-"""What cards tell of data, computed from it: counts, exactness, provenance, limits."""
+"""What cards say of data, computed from it: counts, exactness, sources, limits."""
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
-from statistics import mean, median
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
-    DIFFICULTIES,
-    FAMILIES,
     IDENTITY_PATH,
+    MANIFEST_ROWS,
+    MANIFESTS,
+    QUESTIONS_PATH,
+    RECORDS_PATH,
     REPORT_PATH,
+    SUMS_PATH,
 )
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
+from robomme_interference_data.data.questions import Question
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json, sha256_file
-from robomme_interference_data.viz.tables import Table
 
-from .contents import questions_of
-from .limits import limits
-from .markdown import escape
-from .publication import check_repo_id, is_commit
+from .film import film_of_lesson, film_of_split
+from .limits import data_limits
+from .markdown import code, escape
+from .publication import Publication, check_repo_id, is_commit
+from .tables import condition_table, count_table, goal_table, unit_table
 
-LOSSY_SOURCE = "lerobot/robomme"
+_LOSSY_SOURCE = "lerobot/robomme"
 """A published dataset of the same episodes whose pictures are lossily compressed."""
 
+_BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
+_FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
 
-@dataclass(frozen=True)
-class DatasetFacts:
-    """What there is to say of a dataset.
-
-    Attributes:
-        dataset: The dataset.
-    """
-
-    dataset: Dataset
-
-    @cached_property
-    def records(self) -> tuple[EpisodeRecord, ...]:
-        """Its episodes, in canonical order."""
-        return tuple(sorted(self.dataset.records(), key=lambda one: one.episode_id.sort_key))
-
-    @cached_property
-    def identity_sha256(self) -> str:
-        """SHA-256 of `meta/interference.json`, under which every file of it lies."""
-        return sha256_file(self.dataset.files.path(IDENTITY_PATH))
-
-    @cached_property
-    def skipped(self) -> int:
-        """Recorded episodes that yielded nothing."""
-        told = read_json(self.dataset.files.path(REPORT_PATH)).get("skipped")
-        return len(told) if isinstance(told, list) else 0
-
-    @property
-    def limits(self) -> list[str]:
-        """What demonstrations are not good for; see `limits`."""
-        more = (
-            f"{self.skipped:,} recorded episodes yielded no demonstration, or were of no use: "
-            f"{REPORT_PATH} names each and says why."
-        )
-        simulators = self.dataset.identity.simulators
-        return limits(self.records, simulators, [more] * bool(self.skipped))
-
-    @property
-    def frames(self) -> int:
-        """Stored frames."""
-        return sum(record.length for record in self.records)
-
-    @property
-    def families(self) -> tuple[str, ...]:
-        """Families of its episodes, in canonical order."""
-        return tuple(dict.fromkeys(record.episode_id.family for record in self.records))
-
-    @property
-    def inexact(self) -> int:
-        """Episodes of which a frame was ever lossily compressed."""
-        return sum(not record.exact for record in self.records)
-
-    @property
-    def split_name(self) -> str:
-        """`test` if all of its episodes are of that split, and so on; `mixed` if they differ."""
-        return one_split(record.episode_id.split for record in self.records)
-
-    @property
-    def repositories(self) -> dict[str, str | None]:
-        """Repositories on the Hub that it was built from, and the commit of each."""
-        found: dict[str, str | None] = {}
-        for one in self.dataset.identity.sources:
-            repo, revision = one.get("repo"), one.get("revision")
-            with suppress(InvalidOptionError):  # whoever wrote the data may have written anything
-                found[check_repo_id(repo)] = revision if is_commit(revision) else None
-        return found
-
-    def counts(self) -> Table:
-        """Return how many episodes there are by family and difficulty, and their frames."""
-        groups = by_family(self.records)
-        rows = [
-            (escape(name), len(found), *_difficulties(found), sum(one.length for one in found))
-            for name, found in groups.items()
-        ]
-        rows.append(_total("all", rows))
-        columns = "family episodes:count easy:count medium:count hard:count other:count"
-        return Table.make("counts", "Episodes", f"{columns} frames:count", rows)
-
-    def goals(self) -> Table:
-        """Return the goal of the first episode of each family."""
-        rows = [
-            (escape(found[0].episode_id), escape(found[0].difficulty or ""), escape(found[0].goal))
-            for found in by_family(self.records).values()
-        ]
-        return Table.make("goals", "Goals", "episode difficulty goal", rows)
+Rows = list[tuple[str, Any]]
 
 
 @dataclass(frozen=True)
-class SplitFacts:
-    """What there is to say of a split.
+class CardTable:
+    """A table of a repository that `datasets.load_dataset` finds.
 
     Attributes:
-        split: The split.
+        name: Its name there.
+        record: What a row is.
+        path: Its file.
+        sha256: SHA-256 of the file.
+        split: Name under which its rows load: the split that all of their episodes are of, such as
+            `test`, or `mixed`.
     """
 
-    split: Split
+    name: str
+    record: type
+    path: str
+    sha256: str
+    split: str
 
-    @cached_property
-    def datasets(self) -> dict[str, DatasetFacts]:
-        """Its datasets by name."""
-        return {name: DatasetFacts(one) for name, one in self.split.datasets.items()}
 
-    @property
-    def demonstrations(self) -> DatasetFacts:
-        """The query episodes and their lessons."""
-        return self.datasets[DEMONSTRATIONS]
+@dataclass(frozen=True)
+class Facts:
+    """What a card says of what is published: values computed from data.
 
-    @property
-    def base(self) -> str | None:
-        """Where the demonstrations lie on the Hub, `namespace/name@commit`, if they do."""
-        return self.split.header.datasets[DEMONSTRATIONS].place
+    Attributes:
+        kind: Name of its template.
+        title: What it is, for readers.
+        description: The same in a sentence.
+        origin: How it was made, in a sentence.
+        examples: How many examples it has: stored frames, or rollouts.
+        tables: Its tables; the first is the one that loads by default.
+        families: Families of its query episodes.
+        simulators: Simulators that its episodes come from.
+        limits: What it is not good for, as plain text, a sentence or two each.
+        provenance: Returns names and values of where it comes from, which are Markdown.
+        pictures: Draws the pictures of the card: bytes by path.
+        values: What else its template names.
+        base: Where what it was made for lies; `namespace/name@commit` if on the Hub.
+        repositories: Repositories on the Hub that it was built from, and the commit of each.
+        source_kinds: Kinds of the sources that it was built from, such as `robomme-h5`.
+        details: Plain values that are shown as JSON, by their titles.
+        file_sets: Patterns of its files that are no tables, by name.
+        tags: Tags on the Hub beside those of every card.
+    """
 
-    @property
-    def units(self) -> dict[str, DatasetFacts]:
-        """The datasets of units by name."""
-        return {name: one for name, one in self.datasets.items() if name != DEMONSTRATIONS}
+    kind: str
+    title: str
+    description: str
+    origin: str
+    examples: int
+    tables: Sequence[CardTable]
+    families: Sequence[str]
+    simulators: Sequence[str]
+    limits: Sequence[str]
+    provenance: Callable[[Publication], Rows]
+    pictures: Callable[[], Mapping[str, bytes]]
+    values: Mapping[str, Any]
+    base: object = None
+    repositories: Mapping[str, str | None] = field(default_factory=dict)
+    source_kinds: Sequence[str] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    file_sets: Mapping[str, str] = field(default_factory=dict)
+    tags: Sequence[str] = ("LeRobot",)
 
-    @cached_property
-    def queries(self) -> tuple[EpisodeRecord, ...]:
-        """The query episodes, in canonical order."""
-        wanted = {*self.split.episode_ids}
-        return tuple(one for one in self.demonstrations.records if one.episode_id in wanted)
 
-    @cached_property
-    def manifests(self) -> tuple[BufferManifest, ...]:
-        """All buffers."""
-        return tuple(self.split.manifests())
-
-    @property
-    def questions(self) -> bool:
-        """Whether it has questions about the past."""
-        return bool(questions_of(self.split))
-
-    @property
-    def split_name(self) -> str:
-        """`test` if all queries are of that split, and so on; `mixed` if they differ."""
-        return one_split(record.episode_id.split for record in self.queries)
-
-    @property
-    def units_split(self) -> str:
-        """The same of the units."""
-        every = (record for one in self.units.values() for record in one.records)
-        return one_split(record.episode_id.split for record in every)
-
-    @property
-    def inexact(self) -> int:
-        """Buffers that hold a lossily compressed frame."""
-        return sum(not one.exact for one in self.manifests)
-
-    @property
-    def repositories(self) -> dict[str, str | None]:
-        """See `DatasetFacts.repositories`."""
-        found: dict[str, str | None] = {}
-        for one in self.datasets.values():
-            found |= one.repositories
-        return found
-
-    @property
-    def simulators(self) -> tuple[str, ...]:
-        """Simulators that episodes come from."""
-        every = (name for one in self.datasets.values() for name in one.dataset.identity.simulators)
-        return tuple(sorted(set(every)))
-
-    @property
-    def limits(self) -> list[str]:
-        """What the split is not good for; see `limits`."""
-        more = (
-            f"{self.same_family:,} buffers hold distractors of the query's own family, which the "
-            "paper's protocol rules out: results stand beside none of the benchmark."
+def demonstrations_facts(dataset: Dataset) -> Facts:
+    """Return what there is to say of a dataset of demonstrations."""
+    if dataset.kind != DEMONSTRATIONS:
+        raise InvalidOptionError(
+            f"{dataset.files.describe()} is a dataset of {dataset.kind}, not of {DEMONSTRATIONS}",
+            "Units are published with the manifests that name them: give the split.",
         )
-        return limits(self.queries, self.simulators, [more] * bool(self.same_family))
-
-    @cached_property
-    def same_family(self) -> int:
-        """Buffers with a session that is no lesson, and yet of the query's own family."""
-        return sum(
-            any(
-                session.role == "distractor" and session.source.family == one.episode_id.family
-                for session in one.sessions
-            )
-            for one in self.manifests
-        )
-
-    def counts(self) -> Table:
-        """Return how many queries there are by family and difficulty, and units by family."""
-        queries, units = by_family(self.queries), self._units()
-        names = sorted({*queries, *units}, key=_family_rank)
-        rows = []
-        for name in names:
-            found = queries.get(name, [])
-            rows.append((escape(name), len(found), *_difficulties(found), units[name]))
-        rows.append(_total("all", rows))
-        columns = "family queries:count easy:count medium:count hard:count other:count units:count"
-        return Table.make("counts", "Queries and units", columns, rows)
-
-    def conditions(self) -> Table:
-        """Return what the buffers of each condition hold."""
-        groups: dict[str, list[BufferManifest]] = {name: [] for name in self.split.conditions}
-        for one in self.manifests:
-            groups.setdefault(one.condition, []).append(one)
-        rows = []
-        for name, found in groups.items():
-            frames = [one.history_frames for one in found] or [0]
-            rows.append(
-                (
-                    *(escape(name), "paper" if name in DEFAULT_CONDITIONS else "ours"),
-                    *(len(found), max((len(one.sessions) for one in found), default=0)),
-                    *(min(frames), round(median(frames)), max(frames)),
-                    mean(one.lesson_share for one in found) if found else None,
-                )
-            )
-        columns = "condition whose buffers:count sessions:count min:count median:count max:count"
-        return Table.make("conditions", "Conditions", f"{columns} lesson_share:rate", rows)
-
-    def _units(self) -> Counter[str]:
-        families = (
-            record.episode_id.family for one in self.units.values() for record in one.records
-        )
-        return Counter(families)
+    records = records_of(dataset)
+    film = film_of_lesson(dataset, records)
+    frames, skipped = sum(record.length for record in records), _skipped(dataset)
+    families, repositories = _families(records), _repositories(dataset)
+    more = (
+        f"{skipped:,} recorded episodes yielded no demonstration, or were of no use: "
+        f"{REPORT_PATH} names each and says why."
+    )
+    return Facts(
+        kind=DEMONSTRATIONS,
+        title="RoboMME-Interference demonstrations",
+        description=f"Demonstrations of RoboMME-Interference: {len(records):,} query episodes, "
+        f"{frames:,} frames, families {', '.join(families)}.",
+        origin="Recorded episodes were cut, encoded, decoded again and compared.",
+        examples=frames,
+        tables=[_episodes(dataset, records)],
+        families=families,
+        simulators=dataset.identity.simulators,
+        limits=data_limits(records, dataset.identity.simulators, [more] * bool(skipped)),
+        provenance=lambda about: _dataset_rows(dataset),
+        pictures=film.pictures,
+        values={
+            "film": film,
+            "cameras": dataset.cameras,
+            "episodes": len(records),
+            "counts": count_table(records),
+            "goals": goal_table(records),
+            "first": records[0].episode_id,
+            "header": None,
+            "other_conditions": [],
+            "same_family": 0,
+            "skipped": skipped,
+            "inexact": sum(not record.exact for record in records),
+            "exact_of": len(records),
+            "exact_what": "episodes",
+            "lossy_source": _LOSSY_SOURCE in repositories,
+            "lossy_name": _LOSSY_SOURCE,
+        },
+        repositories=repositories,
+        source_kinds=_source_kinds([dataset]),
+        details=_sources({DEMONSTRATIONS: dataset}),
+        file_sets=_FILE_SETS,
+    )
 
 
-def one_split(splits: Iterable[str]) -> str:
+def split_facts(split: Split) -> Facts:
+    """Return what there is to say of a split."""
+    header, datasets = split.header, {name: split.datasets[name] for name in split.datasets}
+    records = {name: records_of(dataset) for name, dataset in datasets.items()}
+    lessons, units = records[DEMONSTRATIONS], {**records}
+    del units[DEMONSTRATIONS]
+    every_unit = [record for found in units.values() for record in found]
+    ids = {*split.episode_ids}
+    queries = tuple(one for one in lessons if one.episode_id in ids)
+    manifests = tuple(split.manifests())
+    film = film_of_split(split, queries, manifests)
+    same_family = count_same_family(manifests)
+    simulators = sorted({name for one in datasets.values() for name in one.identity.simulators})
+    repositories = {k: v for one in datasets.values() for k, v in _repositories(one).items()}
+    more = (
+        f"{same_family:,} buffers hold distractors of the query's own family, which the "
+        "paper's protocol rules out: results stand beside none of the benchmark."
+    )
+    split_name, questions = one_split(queries), _questions(split)
+    tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
+    for name in [*units][:1]:
+        own = _episodes(datasets[name], units[name])
+        tables.append(replace(own, split=one_split(every_unit)))
+    if questions is not None:
+        tables.append(CardTable("questions", Question, QUESTIONS_PATH, questions, split_name))
+
+    def provenance(about: Publication) -> Rows:
+        rows = [
+            ("demonstrations", code(about.base) if about.base else "not published"),
+            ("revision of the split", code(split.revision)),
+            (f"SHA-256 of `{_BUFFERS}`", code(header.rows)),
+        ]
+        rows += [row for name, one in datasets.items() for row in _dataset_rows(one, name)]
+        return [*rows, ("version of the draw", code(header.rule_version))]
+
+    return Facts(
+        kind="split",
+        title="RoboMME-Interference buffers",
+        description=f"History buffers of RoboMME-Interference: {len(manifests):,} buffers of "
+        f"{len(queries):,} query episodes under {', '.join(split.conditions)}, and the distractor "
+        "units that they hold.",
+        origin="The sessions of every buffer were drawn by SHA-256, rule version "
+        f"{header.rule_version}, seed {header.seed}.",
+        examples=sum(record.length for record in every_unit),
+        tables=tables,
+        families=_families(queries),
+        simulators=simulators,
+        limits=data_limits(queries, simulators, [more] * bool(same_family)),
+        provenance=provenance,
+        pictures=film.pictures,
+        values={
+            "film": film,
+            "cameras": split.cameras,
+            "buffers": len(manifests),
+            "queries": len(queries),
+            "units": len(every_unit),
+            "units_split": one_split(every_unit),
+            "conditions": split.conditions,
+            "condition_table": condition_table(split.conditions, manifests),
+            "counts": unit_table(queries, every_unit),
+            "goals": goal_table(lessons),
+            "questions": questions is not None,
+            "first": queries[0].episode_id,
+            "header": header,
+            "other_conditions": _beyond_paper(split.conditions),
+            "same_family": same_family,
+            "skipped": sum(_skipped(datasets[name]) for name in units),
+            "inexact": sum(not one.exact for one in manifests),
+            "exact_of": len(manifests),
+            "exact_what": "buffers",
+            "lossy_source": _LOSSY_SOURCE in repositories,
+            "lossy_name": _LOSSY_SOURCE,
+        },
+        base=header.datasets[DEMONSTRATIONS].place,
+        repositories=repositories,
+        source_kinds=_source_kinds(datasets.values()),
+        details=_sources(datasets),
+        file_sets={**_FILE_SETS, "manifest": f"{MANIFESTS}/*.json"},
+    )
+
+
+def records_of(dataset: Dataset) -> tuple[EpisodeRecord, ...]:
+    """Return the episodes of a dataset, in canonical order."""
+    return tuple(sorted(dataset.records(), key=lambda one: one.episode_id.sort_key))
+
+
+def one_split(records: Iterable[EpisodeRecord]) -> str:
     """Return the one split that episodes are of, or `mixed`: the name under which rows load."""
-    found = {*splits}
+    found = {record.episode_id.split for record in records}
     return found.pop() if len(found) == 1 else "mixed"
 
 
-def by_family(records: Iterable[EpisodeRecord]) -> dict[str, list[EpisodeRecord]]:
-    """Return records by family, in canonical order."""
-    groups = defaultdict[str, list[EpisodeRecord]](list)
-    for record in records:
-        groups[record.episode_id.family].append(record)
-    return {name: groups[name] for name in sorted(groups, key=_family_rank)}
+def count_same_family(manifests: Iterable[BufferManifest]) -> int:
+    """Return how many buffers have a distractor of the query's own family."""
+    return sum(
+        any(
+            session.role == "distractor" and session.source.family == one.episode_id.family
+            for session in one.sessions
+        )
+        for one in manifests
+    )
 
 
-def _difficulties(records: Sequence[EpisodeRecord]) -> tuple[int, ...]:
-    counts = Counter(record.difficulty for record in records)
-    known = [counts[name] for name in DIFFICULTIES]
-    return (*known, len(records) - sum(known))
+def _families(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(record.episode_id.family for record in records))
 
 
-def _total(name: str, rows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
-    return (name, *(sum(column) for column in list(zip(*rows, strict=True))[1:]))
+def _episodes(dataset: Dataset, records: Iterable[EpisodeRecord]) -> CardTable:
+    digest = dataset.sums().get(RECORDS_PATH)
+    if digest is None:
+        where = dataset.files.describe()
+        raise FormatError.damaged(where, f"{RECORDS_PATH} is not in {SUMS_PATH}")
+    return CardTable("episodes", EpisodeRecord, RECORDS_PATH, digest, one_split(records))
 
 
-def _family_rank(name: str) -> tuple[int, str]:
-    return (FAMILIES.index(name) if name in FAMILIES else len(FAMILIES), name)
+def _questions(split: Split) -> str | None:
+    """Return the SHA-256 of the questions of a split, or None if it has none."""
+    with suppress(MissingFileError):
+        return sha256_file(split.files.path(QUESTIONS_PATH))
+    return None
 
 
-def kinds_of_sources(facts: Iterable[DatasetFacts]) -> list[str]:
-    """Return the kinds of the sources that datasets were built from, such as `robomme-h5`."""
-    every = (one.get("kind") for own in facts for one in own.dataset.identity.sources)
-    return sorted({kind for kind in every if isinstance(kind, str)})
+def _skipped(dataset: Dataset) -> int:
+    """Return how many recorded episodes yielded nothing."""
+    skipped = read_json(dataset.files.path(REPORT_PATH)).get("skipped")
+    return len(skipped) if isinstance(skipped, list) else 0
+
+
+def _repositories(dataset: Dataset) -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for one in dataset.identity.sources:
+        repo, revision = one.get("repo"), one.get("revision")
+        with suppress(InvalidOptionError):  # whoever wrote the data may have written anything
+            found[check_repo_id(repo)] = str(revision) if is_commit(revision) else None
+    return found
+
+
+def _source_kinds(datasets: Iterable[Dataset]) -> list[str]:
+    kinds = {one.get("kind") for dataset in datasets for one in dataset.identity.sources}
+    return sorted(kind for kind in kinds if isinstance(kind, str))
+
+
+def _sources(datasets: Mapping[str, Dataset]) -> dict[str, Any]:
+    found = {name: list(dataset.identity.sources) for name, dataset in datasets.items()}
+    return {f"Sources of the {name}": sources for name, sources in found.items() if sources}
+
+
+def _dataset_rows(dataset: Dataset, name: str = "") -> Rows:
+    identity, of = dataset.identity, f" of the {escape(name)}" if name else ""
+    digest = sha256_file(dataset.files.path(IDENTITY_PATH))
+    return [
+        (f"revision of the content{of}", code(identity.revision)),
+        (f"SHA-256 of `{IDENTITY_PATH}`{of}", code(digest)),
+        (f"codec{of}", code(identity.codec)),
+        *(
+            (f"source{of}", code(f"{repo}@{commit}" if commit else repo))
+            for repo, commit in _repositories(dataset).items()
+        ),
+    ]
+
+
+def _beyond_paper(conditions: Iterable[str]) -> list[tuple[list[str], str]]:
+    """Return the conditions beyond the paper's, kind by kind, with what they hold in words."""
+    named = {one: parse_condition(one).kind for one in conditions if one not in DEFAULT_CONDITIONS}
+    kinds = dict.fromkeys(named.values())
+    return [([f"`{one}`" for one in named if named[one] == kind], kind.holds) for kind in kinds]

@@ -14,21 +14,21 @@ def is_whole_grid(records: Sequence[EpisodeRecord]) -> bool:
     return ids == {(f, "test", n) for f in FAMILIES for n in range(TEST_EPISODES)}
 
 
-def simulated(simulators: Sequence[str]) -> str:
+def origin_limit(simulators: Sequence[str]) -> str:
     """Return where episodes come from, in a sentence."""
-    told = {name: simulator_class(name).about for name in SIMULATORS}
-    told["sample"] = "sample, made-up pictures without content, for trying the tools out"
-    named = [told.get(name, f"the simulator {name}") for name in simulators]
+    known = {name: simulator_class(name).about for name in SIMULATORS}
+    known["sample"] = "sample, made-up pictures without content, for trying the tools out"
+    named = [known.get(name, f"the simulator {name}") for name in simulators]
     if not named:
         return "The recordings name no simulator."
     return f"The episodes come from {'; and from '.join(named)}."
 
 
-def limits(
-    queries: Sequence[EpisodeRecord], simulators: Sequence[str], more: Iterable[str] = ()
+def data_limits(
+    queries: Sequence[EpisodeRecord], simulators: Sequence[str], more: Iterable[str]
 ) -> list[str]:
-    """Return what the data is not good for, as plain text, a sentence or two each."""
-    found = [simulated(simulators)]
+    """Return what data is not good for, as plain text, a sentence or two each."""
+    found = [origin_limit(simulators)]
     if not is_whole_grid(queries):
         found.append(
             f"{len(queries):,} query episode{'s' * (len(queries) != 1)}, not the paper's grid of "

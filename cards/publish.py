@@ -1,137 +1,223 @@
-"""Publish a split: its demonstrations, and itself."""
+"""Publish a split: its demonstrations, then its units with the manifests that name them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from hashlib import sha256
+from pathlib import PurePosixPath
 
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, IDENTITY_PATH
+from robomme_interference_data.constants import (
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    IDENTITY_PATH,
+    INDEX_DIR,
+    MANIFEST_PATH,
+    MANIFEST_ROWS,
+    MANIFESTS,
+    OPTIONAL_DATASETS,
+    QUESTIONS_PATH,
+    SUMS_PATH,
+)
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.loading import load_split
-from robomme_interference_data.errors import PublishError
+from robomme_interference_data.data.questions import read_questions
+from robomme_interference_data.errors import MissingFileError, PublishError
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.manifest import BufferManifest, ManifestHeader
+from robomme_interference_data.storage.files import LocalFiles, indented_json
 from robomme_interference_data.storage.hub import HubFiles
 
-from . import render
-from .contents import (
-    dataset_tree,
-    parts_of_buffers,
-    parts_of_dataset,
-    parts_of_questions,
-    split_tree,
-)
-from .publish_config import PublishConfig
-from .publishing import Card, Goods, Parts, Publishing
-from .step import Step
-from .tree import Tree
-from .versions import Version
+from .facts import Facts, demonstrations_facts, split_facts
+from .publication import Publication, PublishConfig, Version
+from .publisher import Publisher, RepoContent, RepoPlan, digest
+from .render import card_files
+from .repo import LocalFile, RepoFiles
 
 _UNKNOWN = "0" * 40
 """Stands for the commit of demonstrations that are not published yet."""
 
 
-def published_base(split: Split, config: PublishConfig) -> str | None:
-    """Return the published demonstrations that a split is for, `namespace/name@commit`, or None.
-
-    Raises:
-        HubError: They are not there.
-        PublishError: They are others.
-    """
-    recorded = split.header.datasets[DEMONSTRATIONS]
-    place, wanted = recorded.place or "", config.demonstrations_id
-    if "@" not in place or wanted not in (None, place.split("@")[0]):
-        return None
-    if Dataset(HubFiles.parse(place)).revision != recorded.revision:
-        raise PublishError(
-            f"{place} holds other demonstrations than those that {split.location} is for",
-            split.mend,
-        )
-    return place
-
-
-def demonstrations_of(split: Split, config: PublishConfig) -> Goods:
-    """Return what the repository of the demonstrations holds."""
-    dataset, repo_id = split.datasets[DEMONSTRATIONS], config.demonstrations
-
-    def card(version: Version) -> dict[str, bytes]:
-        return render.demonstrations_files(dataset, config.about(repo_id, str(version)))
-
-    def parts(earlier: HubFiles | None) -> dict[str, str]:
-        return parts_of_dataset(Dataset(earlier) if earlier else dataset)
-
-    return _goods(repo_id, dataset, dataset_tree(dataset), card, parts)
-
-
-def units_of(split: Split, config: PublishConfig, base: str | None) -> Goods:
-    """Return what the split's own repository holds: units and manifests."""
-    dataset, repo_id = split.datasets[DISTRACTORS], config.repo_id
-
-    def card(version: Version) -> dict[str, bytes]:
-        return render.split_files(split, config.about(repo_id, str(version), base))
-
-    def parts(earlier: HubFiles | None) -> dict[str, str]:
-        there = load_split(earlier.location) if earlier else split
-        found = parts_of_buffers(there.manifests()) | parts_of_questions(there)
-        for name, one in there.datasets.items():
-            found |= parts_of_dataset(one) if name != DEMONSTRATIONS else {}
-        return found
-
-    return _goods(repo_id, dataset, split_tree(split, base), card, parts)
-
-
-def _goods(repo_id: str, dataset: Dataset, files: Tree, card: Card, parts: Parts) -> Goods:
-    first = Version.parse(dataset.identity.version) or Version(1, 0, 0)
-    lerobot = str(dataset.lerobot.version)
-    return Goods(repo_id, first, files, card, parts, IDENTITY_PATH, lerobot)
-
-
-class Publisher(Publishing):
-    """Publishes a split whose checks have passed; see `Publishing` for the other arguments.
+class SplitContent:
+    """What the repositories of a split hold.
 
     Args:
-        split: The split.
-        config: As what.
+        split: The split, whose checks have passed.
+        config: As what it is published.
     """
 
-    def __init__(self, split: Split, config: PublishConfig, **options: Any):
-        super().__init__(config, **options)
+    def __init__(self, split: Split, config: PublishConfig):
         self.split = split
-        self.config: PublishConfig = config
+        self.config = config
 
     @cached_property
     def base(self) -> str | None:
-        """See `published_base`."""
-        return published_base(self.split, self.config)
+        """The published demonstrations that the split is for, `namespace/name@commit`, or None."""
+        recorded = self.split.header.datasets[DEMONSTRATIONS]
+        repo_id, _, commit = (recorded.place or "").partition("@")
+        if not commit or self.config.demonstrations_id not in (None, repo_id):
+            return None
+        if Dataset(HubFiles(repo_id, commit)).revision != recorded.revision:
+            raise PublishError(
+                f"{recorded.place} holds other demonstrations than those that "
+                f"{self.split.location} is for",
+                self.split.mend,
+            )
+        return recorded.place
 
-    def plan(self) -> list[Step]:
-        """Look at what is there; return what is to be done: the demonstrations, then the split.
+    @cached_property
+    def demonstrations(self) -> RepoContent:
+        """What the repository of the demonstrations holds."""
+        dataset = self.split.datasets[DEMONSTRATIONS]
+        facts, files = demonstrations_facts(dataset), dataset_files(dataset)
+        parts = parts_of_dataset(dataset)
+        return self._content(self.config.demonstrations, dataset, facts, files, parts)
 
-        Raises:
-            PublishError: The version is there already, and is another one; or it does not say how
-                much has changed; or a repository holds something else.
-            HubError: A repository cannot be reached.
-            InterferenceError: The split cannot be read.
+    @cached_property
+    def _facts(self) -> Facts:
+        return split_facts(self.split)
+
+    def units(self, base: str | None) -> RepoContent:
+        """Return what the split's own repository holds: units at its root, and the manifests.
+
+        Args:
+            base: Where the demonstrations are, `namespace/name@commit`; None for a folder beside.
         """
-        if self.base is not None:
-            return [self._split_step(self.base)]
-        first = self.step(demonstrations_of(self.split, self.config), follows=True)
-        return [first, self._split_step(_place(first))]
+        split, datasets = self.split, self.split.header.datasets
+        names = [DISTRACTORS, *(name for name in OPTIONAL_DATASETS if name in datasets)]
+        files: RepoFiles = {}
+        parts = parts_of_buffers(split.manifests()) | parts_of_questions(split)
+        for name in names:
+            folder = "" if name == DISTRACTORS else f"{name}/"
+            dataset = split.datasets[name]
+            files |= {folder + path: file for path, file in dataset_files(dataset).items()}
+            parts |= parts_of_dataset(dataset)
+        header = indented_json(to_dict(with_locations(split.header, base))).encode()
+        files[MANIFEST_PATH] = LocalFile(header)
+        for path in (f"{MANIFESTS}/{MANIFEST_ROWS}", *[QUESTIONS_PATH] * has_questions(split)):
+            files[path] = LocalFile(split.files.path(path))
+        units, repo_id = split.datasets[DISTRACTORS], self.config.repo_id
+        return self._content(repo_id, units, self._facts, files, parts, base)
 
-    def run(self, steps: Iterable[Step]) -> list[Step]:
-        """Do what was planned; return the steps with their commits.
+    def folder(self) -> RepoFiles:
+        """Return the files of the split's repository, with the other one in `demonstrations/`.
 
-        Raises:
-            HubError: The Hub refuses something. The same command goes on where this one stopped.
+        Demonstrations that are only on the Hub stay there.
         """
-        *first, last = steps
-        done = [self.put(step) for step in first]
-        if [*map(_place, done)] != [*map(_place, first)]:
-            last = self._split_step(_place(done[0]))
-        return [*done, self.put(last)]
+        base = self.split.header.datasets[DEMONSTRATIONS].place
+        own = self.units(base if base and "@" in base else None)
+        files = own.files(self.config.wanted or own.first)
+        if isinstance(self.split.place(DEMONSTRATIONS), LocalFiles):
+            other = self.demonstrations
+            lessons = other.files(self.config.wanted or other.first)
+            files |= {f"{DEMONSTRATIONS}/{path}": file for path, file in lessons.items()}
+        return files
 
-    def _split_step(self, base: str) -> Step:
-        return self.step(units_of(self.split, self.config, base))
+    def _content(
+        self,
+        repo_id: str,
+        dataset: Dataset,
+        facts: Facts,
+        files: RepoFiles,
+        parts: dict[str, str],
+        base: str | None = None,
+    ) -> RepoContent:
+        # No paths of this machine: the same data gives the same card.
+        command = f"robomme-interference publish SPLIT --repo-id {self.config.repo_id}"
+
+        def card(version: Version) -> dict[str, bytes]:
+            license = self.config.license
+            return card_files(facts, Publication(repo_id, str(version), license, base, command))
+
+        first = Version.parse(dataset.identity.version) or Version(1, 0, 0)
+        lerobot = str(dataset.lerobot.version)
+        return RepoContent(repo_id, first, files, parts, card, IDENTITY_PATH, lerobot)
 
 
-def _place(step: Step) -> str:
-    """Return what a split names of its demonstrations: it stays, whatever becomes of their card."""
-    return f"{step.repository.repo_id}@{step.same or step.published or _UNKNOWN}"
+def plan_split(content: SplitContent, publisher: Publisher) -> list[RepoPlan]:
+    """Return what is to be done: the demonstrations, unless they are published, then the split."""
+    if content.base is not None:
+        return [publisher.plan(content.units(content.base))]
+    first = publisher.plan(content.demonstrations, follows=True)
+    return [first, publisher.plan(content.units(_location(first)))]
+
+
+def publish_split(
+    content: SplitContent, publisher: Publisher, plans: Sequence[RepoPlan]
+) -> list[RepoPlan]:
+    """Do what was planned; return the plans with their commits."""
+    *first, last = plans
+    done = [publisher.put(plan) for plan in first]
+    if [*map(_location, done)] != [*map(_location, first)]:  # their commit is known only now
+        last = publisher.plan(content.units(_location(done[0])))
+    return [*done, publisher.put(last)]
+
+
+def _location(plan: RepoPlan) -> str:
+    """Return what a split names of its demonstrations: it stays when only their card changes."""
+    return f"{plan.repository.repo_id}@{plan.same or plan.published or _UNKNOWN}"
+
+
+def with_locations(header: ManifestHeader, base: str | None) -> ManifestHeader:
+    """Return a header that says where the datasets of a published split lie."""
+    places = {DEMONSTRATIONS: base, DISTRACTORS: "."}
+    datasets = {
+        name: replace(one, place=places.get(name, one.place))
+        for name, one in header.datasets.items()
+    }
+    return replace(header, datasets=datasets)
+
+
+def dataset_files(dataset: Dataset) -> RepoFiles:
+    """Return the files of a dataset: those that its list names, the list, and embeddings."""
+    index = [
+        path
+        for path in dataset.files.list(INDEX_DIR)
+        if not any(part.startswith(".") for part in PurePosixPath(path).parts)  # being made
+    ]
+    paths = [*dataset.sums(), SUMS_PATH, IDENTITY_PATH, *index]
+    dataset.files.fetch(paths)
+    return {path: LocalFile(dataset.files.path(path)) for path in paths}
+
+
+# --- digests of parts ----------------------------------------------------------------------------
+
+
+def parts_of_dataset(dataset: Dataset) -> dict[str, str]:
+    """Return a digest of each episode of a dataset, wherever it stands in it."""
+    records = ((record, to_dict(record)) for record in dataset.records())
+    return {
+        f"{dataset.kind} {record.episode_id}": digest(row | {"episode_index": None})
+        for record, row in records
+    }
+
+
+def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
+    """Return a digest of each buffer, wherever the datasets keep its sessions."""
+    parts = {}
+    for manifest in manifests:
+        row = to_dict(manifest)
+        sessions = row.pop("sessions")
+        del row["query"]
+        held = [[one[name] for name in ("role", "source", "repeat", "sha256")] for one in sessions]
+        parts[str(manifest)] = digest([row, held])
+    return parts
+
+
+def has_questions(split: Split) -> bool:
+    """Tell whether a split has questions about the past."""
+    with suppress(MissingFileError):
+        return split.files.path(QUESTIONS_PATH).is_file()
+    return False
+
+
+def parts_of_questions(split: Split) -> dict[str, str]:
+    """Return a digest of each question with its picture; of a split without questions, none."""
+    if not has_questions(split):
+        return {}
+    return {
+        f"question {one.episode_id}": digest(
+            to_dict(one) | {"picture": sha256(one.picture).hexdigest()}
+        )
+        for one in read_questions(split).values()
+    }

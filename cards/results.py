@@ -1,33 +1,40 @@
-"""What a card of results tells, computed from the rows of a run."""
+"""The results of a run: what their card says, and what their repository holds."""
 
 import re
 from collections import Counter
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from robomme_interference_data.constants import PROTOCOL_VERSION, RUN_TABLES
-from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.run.log import RunHeader
+from robomme_interference_data.constants import (
+    PROTOCOL_VERSION,
+    RUN_HEADER,
+    RUN_RECORD,
+    RUN_TABLES,
+)
+from robomme_interference_data.errors import InvalidOptionError, PublishError
+from robomme_interference_data.evaluate.run.log import RunHeader, read_record
 from robomme_interference_data.evaluate.score.config import Grid, Settings
 from robomme_interference_data.evaluate.score.plots.curves import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score, score
+from robomme_interference_data.evaluate.score.writing import write_score
 from robomme_interference_data.evaluate.systems import display_name
-from robomme_interference_data.schema.rollouts import FINAL, Rollout
+from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.schema.rollouts import FINAL, TIMING_COLUMNS, Rollout
 from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
 
-from .columns import Column, columns_of
-from .facts import one_split
-from .limits import simulated
+from .facts import CardTable, Facts, Rows
+from .limits import origin_limit
 from .markdown import Raw, code, escape
-from .metadata import ROLLOUTS, config
-from .publication import Publication
+from .publication import Publication, Version, VersionConfig
+from .publisher import RepoContent, digest
+from .render import card_files
+from .repo import LocalFile, RepoFiles
 
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
@@ -35,175 +42,143 @@ _GRIDS = {
 }
 
 
-@dataclass(frozen=True)
-class ResultsFacts:
-    """What there is to say of results.
+# --- the card ------------------------------------------------------------------------------------
 
-    Attributes:
-        score: What came of the rollouts.
-        source: The file of rows that was scored.
-        run: What `run.json` beside it says, or None.
+
+def results_facts(results: Score | Path) -> Facts:
+    """Return what there is to say of results.
+
+    The repository holds the files of the run's folder at its root.
+
+    Args:
+        results: The folder of a run, a file of rows, or what either scored.
     """
-
-    score: Score
-    source: Path
-    run: RunHeader | None
-
-    @classmethod
-    def of(cls, results: Score | Path) -> "ResultsFacts":
-        """Return the facts of a score, or of a run's folder or file of rows.
-
-        Raises:
-            InvalidOptionError: The score is of several files.
-            MissingFileError, FormatError: See `scoring.score`.
-        """
-        found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
-        if len(found.rows.sources) != 1:
-            raise InvalidOptionError(
-                f"the score is of {len(found.rows.sources)} files; expected those of one run",
-                "Shards of a run become one with: robomme-interference merge",
-            )
-        [(source, run)] = found.rows.sources.items()
-        return cls(found, source, run)
-
-    @property
-    def base(self) -> object:
-        """What the run says of where its split lies: `namespace/name@commit` on the Hub."""
-        starts = self.run.starts if self.run is not None else ()
-        return starts[-1].settings.get("split") if starts else None
-
-    @cached_property
-    def rows_file(self) -> Path:
-        """The file of rows that tables are loaded from: the exported one if it is there."""
-        exported = self.source.parent / RUN_TABLES[0]
-        return exported if self.run is not None and exported.is_file() else self.source
-
-    @property
-    def split_name(self) -> str:
-        """`test` if all rows are of that split, and so on; `mixed` if they differ."""
-        return one_split(self.score.rows.names("episode_split"))
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The table of rows as `load_dataset` finds it."""
-        return config(ROLLOUTS, self.split_name, self.rows_file.name, default=True)
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """The columns of a row."""
-        return columns_of(Rollout)
-
-    @property
-    def systems(self) -> list[str]:
-        """The systems, as tables name them."""
-        names = (name for cube in self.score.outcomes.values() for name in cube.systems)
-        return list(map(display_name, dict.fromkeys(names)))
-
-    @property
-    def limits(self) -> list[str]:
-        """What the results do not tell, as plain text, a sentence or two each."""
-        found = [simulated(tuple(self.score.outcomes)), *self.score.notes]
-        if not all(cell.complete for cell in self.score.cells if not cell.part):
-            found.append(
-                "Not every cell is complete: rates over parts of the grid cannot be compared with "
-                "rates over all of it."
-            )
-        found.append(
-            "The same episode, repeated on a GPU, may come out otherwise: small differences need "
-            "the paired tests, or repeats with other model seeds."
+    found = results if isinstance(results, Score) else score(Settings(rows=(results,)))
+    if len(found.rows.sources) != 1:
+        raise InvalidOptionError(
+            f"the score is of {len(found.rows.sources)} files; expected those of one run",
+            "Merge the shards of a run into one.",
+            "merge RUN RUN --out RUN",
         )
-        return found
-
-    @property
-    def standing(self) -> str:
-        """How the run stands, in a sentence."""
-        cells = [cell for cell in self.score.cells if not cell.part]
-        done = sum(cell.complete for cell in cells)
-        told = f"{done} of {len(cells)} cells are complete."
-        if self.run is None:
-            return told
-        counted = sum(self.run.counts.values())
-        run = f"The run is {self.run.status}: {counted:,} of {self.run.planned:,} planned rollouts"
-        return f"{run} have a row. {told}"
-
-    @cached_property
-    def figures(self) -> dict[str, str]:
-        """The simulators of which there is a figure, by the file of its picture."""
-        return {
-            f"README-{re.sub('[^A-Za-z0-9._-]', '-', simulator)}.png": simulator
-            for simulator in self.score.outcomes
-            if Data(self.score, simulator).cells
-        }
-
-    def pictures(self) -> dict[str, bytes]:
-        """Draw the figures: success by condition.
-
-        Raises:
-            MissingExtraError: matplotlib is not installed.
-        """
-        with TemporaryDirectory() as folder:
-            for file, simulator in self.figures.items():
-                with open_figure() as figure:
-                    draw_figure("success", figure, Data(self.score, simulator))
-                    save_figure(figure, Path(folder) / file)
-            return {file: (Path(folder) / file).read_bytes() for file in self.figures}
-
-    def provenance(self, about: Publication) -> list[tuple[str, Any]]:
-        """Return where the results come from: split, revision, rows and policy."""
-        rows: list[tuple[str, Any]] = []
-        if self.run is not None:
-            rows.append(("split", code(self.run.split)))
-        if about.base:
-            rows.append(("published split", code(about.base)))
-        for simulator, revision in sorted(self.score.rows.revisions.items()):
-            rows.append((f"revision of the split, {escape(simulator)}", code(revision)))
-        if self.score.rows.unpinned:
-            rows.append(("revision of the split", "the rows name none"))
-        rows.append((f"SHA-256 of `{self.rows_file.name}`", code(sha256_file(self.rows_file))))
-        if self.run is not None:
-            policy = self.run.identity.get("policy")
-            rows.append(("policy", code(policy) if policy else "not told"))
-            for start in self.run.starts[-1:]:
-                rows += [("git", code(start.git))] if start.git else []
-                told = (f"{name} {version}" for name, version in sorted(start.versions.items()))
-                rows.append(("versions of the last start", escape(", ".join(told))))
-        return [*rows, ("version of the protocol", code(PROTOCOL_VERSION))]
-
-    @property
-    def details(self) -> dict[str, Any]:
-        """What makes the run the one that it is, and how it was started, as plain values."""
-        if self.run is None:
-            return {}
-        commands = dict.fromkeys(line for start in self.run.starts for line in start.command)
-        found: dict[str, Any] = {"What makes the run the one that it is": self.run.identity}
-        if commands:
-            found["Its commands"] = [*commands]
-        return found
-
-
-def results_values(facts: ResultsFacts) -> dict[str, Any]:
-    """Return what the template of results names, but for publication and provenance."""
-    found = facts.score
-    effects = found.tables["effects"]
-    statuses = Counter(row.status for row in found.rows)
-    return {
-        "systems": facts.systems,
-        "headlines": {name: headline(found, name) for name in found.outcomes},
-        "figures": {
-            file: f"Success by condition, {simulator}" for file, simulator in facts.figures.items()
-        },
-        "grids": [{"title": one.title, "table": one, "note": Raw(one.note)} for one in found.grids],
-        "effects": {"table": effects, "note": Raw(effects.note)} if effects.rows else None,
-        "standing": facts.standing,
-        "grid": _GRIDS[found.settings.grid],
-        "cells": _cells(found),
-        "rows": len(found.rows),
-        "rows_file": facts.rows_file.name,
-        "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in FINAL),
-        "refused": found.rows.refused,
-        "split_name": facts.split_name,
-        "limits": facts.limits,
+    [(source, run)] = found.rows.sources.items()
+    exported = source.parent / RUN_TABLES[0]
+    file = exported if run is not None and exported.is_file() else source
+    splits = {*found.rows.names("episode_split")}
+    rows = CardTable(
+        name="rollouts",
+        record=Rollout,
+        path=file.name,
+        sha256=sha256_file(file),
+        split=splits.pop() if len(splits) == 1 else "mixed",
+    )
+    systems = dict.fromkeys(name for one in found.outcomes.values() for name in one.systems)
+    names = list(map(display_name, systems))
+    figures = {
+        f"README-{re.sub('[^A-Za-z0-9._-]', '-', simulator)}.png": simulator
+        for simulator in found.outcomes
+        if Data(found, simulator).cells
     }
+    effects, statuses = found.tables["effects"], Counter(row.status for row in found.rows)
+    starts = run.starts if run is not None else ()
+    return Facts(
+        kind="results",
+        title="RoboMME-Interference results",
+        description=f"Rollouts of {', '.join(names)} on RoboMME-Interference: "
+        f"{len(found.rows):,} rows.",
+        origin="A policy was rolled out in a simulator, a row an episode.",
+        examples=len(found.rows),
+        tables=[rows],
+        families=tuple(found.rows.names("family")),
+        simulators=tuple(found.outcomes),
+        limits=_limits(found),
+        provenance=lambda about: _provenance(found, run, rows, about),
+        pictures=lambda: _pictures(found, figures),
+        values={
+            "systems": names,
+            "headlines": {name: headline(found, name) for name in found.outcomes},
+            "figures": {file: f"Success by condition, {name}" for file, name in figures.items()},
+            "grids": [
+                {"title": one.title, "table": one, "note": Raw(one.note)} for one in found.grids
+            ],
+            "effects": {"table": effects, "note": Raw(effects.note)} if effects.rows else None,
+            "standing": _standing(found, run),
+            "grid": _GRIDS[found.settings.grid],
+            "cells": _cells(found),
+            "rows": len(found.rows),
+            "rows_file": rows.path,
+            "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in FINAL),
+            "refused": found.rows.refused,
+        },
+        base=starts[-1].settings.get("split") if starts else None,
+        details=_details(run),
+        tags=("evaluation-results",),
+    )
+
+
+def _limits(found: Score) -> list[str]:
+    partial = (
+        "Not every cell is complete: rates over parts of the grid cannot be compared with "
+        "rates over all of it."
+    )
+    complete = all(cell.complete for cell in found.cells if not cell.part)
+    return [
+        origin_limit(tuple(found.outcomes)),
+        *found.notes,
+        *[partial] * (not complete),
+        "The same episode, repeated on a GPU, may come out otherwise: small differences need "
+        "the paired tests, or repeats with other model seeds.",
+    ]
+
+
+def _standing(found: Score, run: RunHeader | None) -> str:
+    """Return how the run stands, in a sentence."""
+    cells = [cell for cell in found.cells if not cell.part]
+    cell_text = f"{sum(cell.complete for cell in cells)} of {len(cells)} cells are complete."
+    if run is None:
+        return cell_text
+    counted = sum(run.counts.values())
+    run_text = f"The run is {run.status}: {counted:,} of {run.planned:,} planned rollouts have a"
+    return f"{run_text} row. {cell_text}"
+
+
+def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
+    """Draw success by condition, a picture a simulator."""
+    with TemporaryDirectory() as folder:
+        for file, simulator in figures.items():
+            with open_figure() as figure:
+                draw_figure("success", figure, Data(found, simulator))
+                save_figure(figure, Path(folder) / file)
+        return {file: (Path(folder) / file).read_bytes() for file in figures}
+
+
+def _provenance(found: Score, run: RunHeader | None, table: CardTable, about: Publication) -> Rows:
+    """Return where the results come from: split, revision, rows and policy."""
+    rows: Rows = [("split", code(run.split))] if run is not None else []
+    if about.base:
+        rows.append(("published split", code(about.base)))
+    for simulator, revision in sorted(found.rows.revisions.items()):
+        rows.append((f"revision of the split, {escape(simulator)}", code(revision)))
+    if found.rows.unpinned:
+        rows.append(("revision of the split", "the rows name none"))
+    rows.append((f"SHA-256 of `{table.path}`", code(table.sha256)))
+    if run is not None:
+        policy = run.identity.get("policy")
+        rows.append(("policy", code(policy) if policy else "not told"))
+        for start in run.starts[-1:]:
+            rows += [("git", code(start.git))] if start.git else []
+            versions = (f"{name} {version}" for name, version in sorted(start.versions.items()))
+            rows.append(("versions of the last start", escape(", ".join(versions))))
+    return [*rows, ("version of the protocol", code(PROTOCOL_VERSION))]
+
+
+def _details(run: RunHeader | None) -> dict[str, Any]:
+    """Return what makes the run the one that it is, and how it was started."""
+    if run is None:
+        return {}
+    found: dict[str, Any] = {"What makes the run the one that it is": run.identity}
+    if commands := dict.fromkeys(line for start in run.starts for line in start.command):
+        found["Its commands"] = [*commands]
+    return found
 
 
 def _cells(found: Score) -> Table:
@@ -218,3 +193,44 @@ def _cells(found: Score) -> Table:
     ]
     columns = "simulator system condition n:count expected:count missing:count errors:count"
     return Table.make("cells", "Cells", f"{columns} complete:flag", rows)
+
+
+# --- the repository ------------------------------------------------------------------------------
+
+
+def score_run(run: Path, grid: Grid = Grid.BENCHMARK) -> Score:
+    """Score the run that is to be published, which has ended."""
+    needed = (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
+    if missing := [name for name in needed if not (run / name).is_file()]:
+        raise PublishError(
+            f"{run} holds no run that has ended: {missing[0]} is missing",
+            "Run it to its end with the same evaluate command, or give the folder of a run.",
+        )
+    return score(Settings(rows=(run,), grid=grid))
+
+
+def results_content(found: Score, run: Path, config: VersionConfig) -> RepoContent:
+    """Return what the repository of a run's results holds; videos of rollouts are left out."""
+    command = f"robomme-interference publish-results RUN --repo-id {config.repo_id}"
+    files: RepoFiles = {
+        name: LocalFile(run / name) for name in (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
+    }
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_score(found, folder, command=command)
+        for path in sorted(one for one in folder.rglob("*") if one.is_file()):
+            files[f"score/{path.relative_to(folder).as_posix()}"] = LocalFile(path.read_bytes())
+    facts = results_facts(found)
+
+    def card(version: Version) -> dict[str, bytes]:
+        about = Publication(config.repo_id, str(version), config.license, None, command)
+        return card_files(facts, about)
+
+    parts = {str(item): _rollout_digest(to_dict(row)) for item, row in read_record(run).items()}
+    return RepoContent(config.repo_id, Version(1, 0, 0), files, parts, card, RUN_HEADER)
+
+
+def _rollout_digest(row: dict[str, Any]) -> str:
+    """Return a digest of what a rollout came to, its times aside."""
+    left_out: Iterable[str] = {*TIMING_COLUMNS, "attempt", "video"}
+    return digest({name: value for name, value in row.items() if name not in left_out})

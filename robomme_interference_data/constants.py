@@ -125,6 +125,8 @@ DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)
 """Names of a split's datasets, which are their kinds."""
 QUESTIONS_PATH = "questions.parquet"
 """Questions about the past, which a split may have."""
+PARTS_PATH = "parts.json"
+"""Digests of what a published version holds, by which the next one is numbered."""
 
 MANIFESTS = "manifests"
 MANIFEST_HEADER = "manifest.json"

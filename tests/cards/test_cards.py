@@ -12,9 +12,10 @@ from support.splits import GOLDEN
 
 from robomme_interference_data import load_split
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.cards import citation
-from robomme_interference_data.cards.metadata import size_category
-from robomme_interference_data.cards.render import CROISSANT, README, STRIP, split_files
+from robomme_interference_data.cards.croissant import BIBTEX, PAPER
+from robomme_interference_data.cards.facts import split_facts
+from robomme_interference_data.cards.film import STRIP
+from robomme_interference_data.cards.render import CROISSANT, README, card_files, size_category
 from robomme_interference_data.constants import RECORDS_PATH
 
 NAMES = ("demonstrations", "split", "results")
@@ -33,7 +34,7 @@ def test_golden_cards(made: dict[str, dict[str, bytes]], name: str) -> None:
 
 
 def test_the_same_data_gives_the_same_bytes(made: dict[str, dict[str, bytes]]) -> None:
-    again = split_files(load_split(GOLDEN), OF_SPLIT)
+    again = card_files(split_facts(load_split(GOLDEN)), OF_SPLIT)
     assert again == made["split"]
     assert again[STRIP] != made["demonstrations"][STRIP]
 
@@ -42,9 +43,9 @@ def test_the_same_data_gives_the_same_bytes(made: dict[str, dict[str, bytes]]) -
 def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> None:
     text = (published / name / README).read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)]*)\)", text)
-    assert citation.URL in links
+    assert PAPER in links
     for link in links:
-        assert link == citation.URL or (published / name / link).is_file()
+        assert link == PAPER or (published / name / link).is_file()
     for path in re.findall(r"`((?:manifests|meta)/[\w./]+\.\w+)`", text):
         root = published / ("split" if path.startswith("manifests") else name)
         assert (root / path).is_file(), path
@@ -148,8 +149,7 @@ def test_the_citation_is_the_project_s() -> None:
     found = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     paper = found["preferred-citation"]
     [author] = paper["authors"]
-    assert (paper["title"], paper["url"]) == (citation.TITLE, citation.URL)
-    assert (paper["year"], paper["month"]) == (citation.YEAR, citation.MONTH)
-    assert f"{author['family-names']}, {author['given-names']}" == citation.AUTHOR
-    for part in (citation.TITLE, citation.AUTHOR, citation.URL, str(citation.YEAR)):
-        assert part in citation.BIBTEX
+    name = f"{author['family-names']}, {author['given-names']}"
+    assert paper["url"] == PAPER
+    for part in (paper["title"], paper["url"], paper["year"], paper["month"], name):
+        assert f"{{{part}}}" in BIBTEX

@@ -10,9 +10,11 @@ from support.hub import BASE, SPLIT, push_split, running_hub
 from support.splits import GOLDEN
 
 from robomme_interference_data import load_split
-from robomme_interference_data.cards.commands import card_text
+from robomme_interference_data.cards.commands import facts_of
+from robomme_interference_data.cards.facts import split_facts
 from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.render import results_text, split_text
+from robomme_interference_data.cards.render import card_text
+from robomme_interference_data.cards.results import results_facts
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -33,7 +35,7 @@ def test_a_card_is_printed(run: Run, folder: str) -> None:
 def test_a_card_of_a_run(run: Run) -> None:
     code, out, _ = run("card", RUN)
     assert code == 0
-    assert out == results_text(RUN, Publication("namespace/name"))
+    assert out == card_text(results_facts(RUN), Publication("namespace/name"))
 
 
 def test_a_card_of_what_is_on_the_hub(
@@ -44,11 +46,11 @@ def test_a_card_of_what_is_on_the_hub(
         code, out, _ = run("card", SPLIT, "--repo-id", SPLIT)
         assert code == 0
         place = f"{BASE}@{base}"
-        assert out == split_text(load_split(GOLDEN), Publication(SPLIT, base=place))
+        assert out == card_text(split_facts(load_split(GOLDEN)), Publication(SPLIT, base=place))
         assert not [path for path in hub.downloads() if path.endswith(".mp4")]
         code, out, _ = run("card", place, "--repo-id", BASE)
         assert code == 0
-        assert out == card_text(str(GOLDEN / "demonstrations"), Publication(BASE))
+        assert out == card_text(facts_of(str(GOLDEN / "demonstrations")), Publication(BASE))
 
 
 @pytest.mark.parametrize(

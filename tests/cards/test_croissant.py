@@ -1,16 +1,22 @@
 """`croissant.json`: what the reference library reads of it, and what dataset tracks ask for."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 from support.cards import OF_SPLIT
+from support.splits import GOLDEN
+from support.tabletop import TABLETOP
 
-from robomme_interference_data.cards.columns import columns_of
-from robomme_interference_data.cards.croissant import as_bytes
-from robomme_interference_data.cards.render import CROISSANT
+from robomme_interference_data import load_split
+from robomme_interference_data.cards.croissant import as_bytes, croissant
+from robomme_interference_data.cards.facts import split_facts
+from robomme_interference_data.cards.render import CROISSANT, card_text
+from robomme_interference_data.cards.tables import columns_of
 from robomme_interference_data.constants import RECORDS_PATH
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.schema.codec import arrow_schema
@@ -91,11 +97,24 @@ def test_the_reference_library_reads_the_rows(published: Path) -> None:
 @pytest.mark.parametrize("record", [BufferManifest, EpisodeRecord, Question, Rollout])
 def test_every_column_is_described(record: type) -> None:
     columns = columns_of(record)
-    maps = {"feature_sha256"}
-    assert {one.name for one in columns} == {*arrow_schema(record).names} - maps
+    assert {one.name for one in columns} == {*arrow_schema(record).names} - {"feature_sha256"}
     for column in (part for one in columns for part in (one, *one.parts)):
-        assert column.about.endswith((".", "…")), column.name
-        assert "`" not in column.about
+        assert column.about.endswith((".", "…")) and "`" not in column.about, column.name
+
+
+OPTIMIZED = """
+from robomme_interference_data.cards.tables import columns_of
+from robomme_interference_data.schema.manifest import BufferManifest
+
+print(all(part.about for one in columns_of(BufferManifest) for part in (one, *one.parts)))
+"""
+
+
+def test_columns_are_described_without_docstrings() -> None:
+    done = subprocess.run(
+        [sys.executable, "-OO", "-c", OPTIMIZED], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "True\n"
 
 
 def test_records_in_columns_have_their_parts() -> None:
@@ -106,6 +125,18 @@ def test_records_in_columns_have_their_parts() -> None:
     assert columns["sessions"].words == "list of records"
     assert columns["goals"].words == "list of text"
     assert columns["query"].words == "record"
+
+
+@pytest.mark.parametrize(("split", "has_questions"), [(TABLETOP, True), (GOLDEN, False)])
+def test_questions_are_a_table_of_their_own(split: Path, has_questions: bool) -> None:
+    facts = split_facts(load_split(split))
+    sets = {one["name"]: one for one in json.loads(croissant(facts, OF_SPLIT))["recordSet"]}
+    text = card_text(facts, OF_SPLIT)
+    assert ("`questions.parquet`" in text) == ("questions" in sets) == has_questions
+    assert ("config_name: questions" in text) == has_questions
+    if has_questions:
+        types = {one["name"]: one["dataType"] for one in sets["questions"]["field"]}
+        assert (types["picture"], types["text"]) == ("sc:ImageObject", "sc:Text")
 
 
 def test_the_file_is_safe_in_a_page() -> None:

@@ -1,31 +1,47 @@
-"""Publish a split: over real HTTP, with the Hub's own client, and with whatever can go wrong."""
+"""Publish over real HTTP, with the Hub's own client: splits, their versions, and results."""
 
+import io
 import json
+import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from huggingface_hub import constants
+from support import runs, worlds
 from support.hub_server import HubServer
+from support.machine import full_disk
 from support.publishing import (
     LESSONS,
     UNITS,
+    content_of,
     files,
     plain_cards,
+    plan,
     plan_again,
     publish,
-    publisher,
     tags,
 )
 from support.splits import CONDITIONS, GOLDEN, contents, copy_split
+from support.tabletop import TABLETOP, copy_tabletop
 
 from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.cards import render
-from robomme_interference_data.errors import HubError, InvalidOptionError, PublishError
+from robomme_interference_data.build_dataset.audit import Audit, Leak
+from robomme_interference_data.build_dataset.questions import write_questions
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.cards import checks, results
+from robomme_interference_data.cards import publish as publish_module
+from robomme_interference_data.cards.checks import check_split
+from robomme_interference_data.data.questions import read_questions
+from robomme_interference_data.errors import HubError, PublishError
+from robomme_interference_data.storage.files import canonical_json
 
 QUERY = "MoveCube/test/0"
+CARD = {"README.md", "README-strip.png", "croissant.json", "parts.json"}
 Login = Callable[..., None]
+Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(autouse=True)
@@ -34,76 +50,71 @@ def _somebody(login: Login, monkeypatch: pytest.MonkeyPatch) -> None:
     plain_cards(monkeypatch)
 
 
+@pytest.fixture
+def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the checks, which decode everything and import lerobot."""
+    monkeypatch.setattr(checks, "check_split", lambda *_: None)
+
+
 def writes(hub: HubServer) -> list[str]:
     """Return what was asked of the Hub beside reading."""
     return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]
 
 
-# --- what is published ---------------------------------------------------------------------------
+# --- a split -------------------------------------------------------------------------------------
 
 
-def test_a_published_split_is_the_one_on_disk(hub: HubServer) -> None:
+def test_a_published_split_is_the_one_on_disk(hub: HubServer, tmp_path: Path) -> None:
+    for planned in plan(GOLDEN)[2]:
+        report = planned.to_dict()
+        assert report["new_repository"] and report["commit"] is None
+        assert (report["sent_files"], report["sent_bytes"]) == (report["files"], report["bytes"])
+    assert (writes(hub), hub.received, hub.repositories) == ([], 0, {})  # planning sends nothing
+
     lessons, units = publish(GOLDEN)
-    assert (lessons.repository.repo_id, units.repository.repo_id) == (LESSONS, UNITS)
-    here, there = load_split(GOLDEN), load_split(UNITS, revision="data-1.0.0")
-    assert (there.revision, there.location) == (here.revision, f"{UNITS}@{units.published}")
-    assert [*there.manifests()] == [*here.manifests()]
-    mine = load_buffer(QUERY, "k3", split=here)
-    theirs = load_buffer(QUERY, "k3", split=there, verify=True)
+    assert report["bytes"] == sum(map(len, files(hub, UNITS).values()))
+    golden, published = load_split(GOLDEN), load_split(UNITS, revision="data-1.0.0")
+    assert published.revision == golden.revision
+    assert published.location == f"{UNITS}@{units.published}"
+    assert [*published.manifests()] == [*golden.manifests()]
+    mine = load_buffer(QUERY, "k3", split=golden)
+    theirs = load_buffer(QUERY, "k3", split=published, verify=True)
     for camera in mine.cameras:
         assert np.array_equal(theirs.frames(camera), mine.frames(camera))
-    assert np.array_equal(theirs.query.frame(), mine.query.frame())
-
-
-def test_what_repositories_hold(hub: HubServer) -> None:
-    lessons, units = publish(GOLDEN)
-    card = {"README.md", "README-strip.png", "croissant.json"}
-    for step, name in ((lessons, "demonstrations"), (units, "distractors")):
-        repo_id, held = step.repository.repo_id, contents(GOLDEN / name)
+    for done, name in ((lessons, "demonstrations"), (units, "distractors")):
+        repo_id, held = done.repository.repo_id, contents(GOLDEN / name)
         found = files(hub, repo_id)
         assert {path: found[path] for path in held} == held
-        assert found.keys() - held.keys() - card <= {
-            "manifests/manifest.json",
-            "manifests/buffers.parquet",
-        }
-        assert tags(hub, repo_id) == {"data-1.0.0": step.published, "v3.0": step.published}
+        manifests = {"manifests/manifest.json", "manifests/buffers.parquet"} & found.keys()
+        assert found.keys() - held.keys() - manifests == CARD
+        assert tags(hub, repo_id) == {"data-1.0.0": done.published, "v3.0": done.published}
         own = hub.repositories[f"datasets/{repo_id}"]
         assert [one.title for one in own.commits.values()] == ["initial commit", "Version 1.0.0"]
+    base = f"{LESSONS}@{lessons.published}"
     places = json.loads(files(hub, UNITS)["manifests/manifest.json"])["datasets"]
-    assert {name: one["place"] for name, one in places.items()} == {
-        "demonstrations": f"{LESSONS}@{lessons.published}",
-        "distractors": ".",
-    }
-    assert f"{LESSONS}@{lessons.published}".encode() in files(hub, UNITS)["README.md"]
+    assert [one["place"] for one in places.values()] == [base, "."]
+    assert base.encode() in files(hub, UNITS)["README.md"]
 
-
-def test_the_tag_comes_last(hub: HubServer) -> None:
-    publish(GOLDEN)
-    asked = [one for one in writes(hub) if "/commit/" in one or "/tag/" in one]
-    places = [one.split("/")[4] + " " + one.split("/")[5] for one in asked]
+    # The tag comes last, and nothing is sent a second time.
+    sent = [one.split("/")[4:6] for one in writes(hub) if "/commit/" in one or "/tag/" in one]
     once = ["commit", "tag", "tag"]
-    assert places == [f"{name} {what}" for name in ("tiny-demonstrations", "tiny") for what in once]
+    assert sent == [[name, what] for name in ("tiny-demonstrations", "tiny") for what in once]
     made = [one.json()["tag"] for one in hub.asked if "/tag/" in one.path]
     assert made == ["v3.0", "data-1.0.0"] * 2
-
-
-def test_a_plan_sends_nothing(hub: HubServer) -> None:
-    _, units = publisher(GOLDEN).plan()
-    assert (writes(hub), hub.received, hub.repositories) == ([], 0, {})
-    told = units.as_dict()
-    assert told["new_repository"] and told["commit"] is None
-    assert (told["sent_files"], told["sent_bytes"]) == (told["files"], told["bytes"])
-    publish(GOLDEN)
-    assert told["bytes"] == sum(map(len, files(hub, UNITS).values()))
-
-
-def test_a_second_time_sends_no_bytes(hub: HubServer) -> None:
-    first = publish(GOLDEN)
     hub.asked.clear()
     again = publish(GOLDEN)
-    assert [one.published for one in again] == [one.published for one in first]
+    assert [one.published for one in again] == [lessons.published, units.published]
     assert (writes(hub), hub.received) == ([], 0)
-    assert [one.as_dict()["sent_files"] for one in again] == [0, 0]
+
+    # The folder holds the same, but for what names the demonstrations' commit.
+    own_files = {path: file.read() for path, file in content_of(GOLDEN).folder().items()}
+    prefix = "demonstrations/"
+    assert {k.removeprefix(prefix): v for k, v in own_files.items() if k.startswith(prefix)} == (
+        files(hub, LESSONS)
+    )
+    rest = {k: v for k, v in own_files.items() if not k.startswith(prefix)}
+    differing = {path for path, data in files(hub, UNITS).items() if rest.pop(path) != data}
+    assert (rest, differing) == ({}, {"README.md", "manifests/manifest.json"})
 
 
 def test_private_repositories(hub: HubServer, login: Login) -> None:
@@ -113,6 +124,26 @@ def test_private_repositories(hub: HubServer, login: Login) -> None:
     login("stranger")
     with pytest.raises(HubError, match="no dataset repository"):
         load_split(UNITS)
+
+
+def test_questions_are_parts_of_a_split(hub: HubServer, tmp_path: Path, run: Run) -> None:
+    publish(TABLETOP)
+    assert files(hub, UNITS)["questions.parquet"] == (TABLETOP / "questions.parquet").read_bytes()
+    published = load_split(UNITS, revision="data-1.0.0")
+    questions = read_questions(published)
+    assert questions == read_questions(load_split(TABLETOP))
+    assert [*verify_split(published)] == []
+    part = ("--families", "MoveCube")
+    for options, comes in ((part, False), ((*part, "--questions"), True), ((), True)):
+        out = tmp_path / str(len(options))
+        assert run("fetch", f"{UNITS}@data-1.0.0", *options, "--to", out)[0] == 0
+        assert (out / "questions.parquet").exists() == comes
+    split = copy_tabletop(tmp_path / "split")
+    first, *others = questions.values()
+    turned = replace(first, right=(first.right + 1) % len(first.options))
+    write_questions([turned, *others], split)
+    with pytest.raises(PublishError, match=r'version="2\.0\.0"'):
+        plan(split)
 
 
 # --- versions ------------------------------------------------------------------------------------
@@ -126,8 +157,6 @@ def changed(tmp_path: Path, how: str) -> tuple[Path, dict[str, str]]:
         (root / "distractors" / "index" / "thumbnail" / "index.json").write_text("{}")
     elif how == "added":
         plan_again(root, [*CONDITIONS, "k2"])
-    elif how == "fewer":
-        plan_again(root, CONDITIONS[:-1])
     elif how == "drawn":
         plan_again(root, CONDITIONS, seed=1)
     return root, {"license": "cc-by-4.0"} if how == "card" else {}
@@ -135,13 +164,7 @@ def changed(tmp_path: Path, how: str) -> tuple[Path, dict[str, str]]:
 
 @pytest.mark.parametrize(
     ("how", "following"),
-    [
-        ("card", "1.0.1"),
-        ("index", "1.0.1"),
-        ("added", "1.1.0"),
-        ("fewer", "2.0.0"),
-        ("drawn", "2.0.0"),
-    ],
+    [("card", "1.0.1"), ("index", "1.0.1"), ("added", "1.1.0"), ("drawn", "2.0.0")],
 )
 def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, following: str) -> None:
     lessons, units = publish(GOLDEN)
@@ -150,14 +173,17 @@ def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, follo
     for version in (None, "1.0.0"):
         with pytest.raises(PublishError, match=r"1\.0\.0 already") as caught:
             publish(root, version=version, **options)
-        assert f"--version {following}" in str(caught.value.hint)
+        assert f'version="{following}"' in str(caught.value.hint)
     if following != "1.0.1":
         with pytest.raises(PublishError, match="how much has changed") as caught:
             publish(root, version="1.0.1", **options)
-        assert f"--version {following}" in str(caught.value.hint)
+        assert f'version="{following}"' in str(caught.value.hint)
     assert writes(hub) == []
     kept, new = publish(root, version=following, **options)
-    # The demonstrations are as they were; with another licence, their card is not.
+    if how == "added":  # only what has changed is sent
+        rows = new.files["manifests/buffers.parquet"].sha256
+        assert hub.uploads() == [rows]
+    # The demonstrations are as they were; with another license, their card is not.
     assert (kept.published == lessons.published) == (how != "card")
     assert load_split(UNITS).header.datasets["demonstrations"].place == (
         f"{LESSONS}@{lessons.published}"
@@ -173,66 +199,50 @@ def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, follo
     assert [*now.manifests()] == [*load_split(root).manifests()]
 
 
-def test_an_older_version_is_not_published_after_a_newer_one(hub: HubServer) -> None:
-    publish(GOLDEN, version="2.0.0")
-    with pytest.raises(PublishError, match="how much has changed") as caught:
-        publish(GOLDEN, version="1.0.0")
-    assert "--version 2.0.1" in str(caught.value.hint)
-
-
-def test_only_what_has_changed_is_sent(hub: HubServer, tmp_path: Path) -> None:
-    publish(GOLDEN)
-    root, _ = changed(tmp_path, "added")
-    hub.asked.clear()
-    _, units = publish(root, version="1.1.0")
-    rows = units.tree["manifests/buffers.parquet"]
-    assert hub.uploads() == [rows.sha256]
-
-
-def test_files_that_are_no_more_are_removed(hub: HubServer, tmp_path: Path) -> None:
+def test_an_older_version_is_not_published_after_a_newer_one(
+    hub: HubServer, tmp_path: Path
+) -> None:
     root, _ = changed(tmp_path, "index")
-    publish(root)
+    publish(root, version="2.0.0")
     path = "index/thumbnail/index.json"
     assert path in files(hub, UNITS)
-    _, units = publish(GOLDEN, version="1.0.1")
+    with pytest.raises(PublishError, match=r'how much has changed[^"]*version="2\.0\.1"'):
+        publish(GOLDEN, version="1.0.0")
+    _, units = publish(GOLDEN, version="2.0.1")
     assert units.difference.removed == (path,)
-    assert path not in files(hub, UNITS)
-    assert path in files(hub, UNITS, "data-1.0.0")
+    assert path not in files(hub, UNITS) and path in files(hub, UNITS, "data-2.0.0")
 
 
-def test_demonstrations_count_their_own_versions(hub: HubServer, tmp_path: Path) -> None:
-    publish(GOLDEN)
+def test_demonstrations_count_their_own_versions(
+    hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lessons, units = publish(GOLDEN)
+    plain = publish_module.card_files
+
+    def card(facts: Any, about: Any) -> dict[str, bytes]:
+        found = plain(facts, about)
+        return found | {"README.md": b"---\n---\nmore"} if about.repo_id == LESSONS else found
+
+    # Their card alone: the split names the first commit, which holds the data.
+    with monkeypatch.context() as patch:
+        patch.setattr(publish_module, "card_files", card)
+        for _ in range(2):
+            new, kept = publish(GOLDEN)
+            assert (str(new.version), kept.published) == ("1.0.1", units.published)
+        assert tags(hub, LESSONS)["data-1.0.1"] == new.published != lessons.published
+        publish(GOLDEN, "someone/other", demonstrations_id=LESSONS)
+        header = load_split("someone/other").header.datasets["demonstrations"]
+        assert header.place == f"{LESSONS}@{lessons.published}"
+    # Their data: the split has to be another version.
     root = copy_split(tmp_path / "split")
     (root / "demonstrations" / "index").mkdir()
     (root / "demonstrations" / "index" / "more").write_bytes(b"more")
     with pytest.raises(PublishError):
         publish(root)
-    lessons, units = publish(root, version="1.0.1")
-    assert (str(lessons.version), str(units.version)) == ("1.0.1", "1.0.1")
-    (root / "demonstrations" / "index" / "most").write_bytes(b"most")
-    lessons, units = publish(root, version="3.0.0")
-    assert (str(lessons.version), str(units.version)) == ("1.0.2", "3.0.0")
-
-
-def test_their_card_alone_is_a_version_of_theirs(
-    hub: HubServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lessons, units = publish(GOLDEN)
-    told = {"README.md": b"---\nlicense: mit\n---\nmore", "README-strip.png": b"a"}
-    for card, version in ((told, "1.0.1"), (told | {"croissant.json": b"{}"}, "1.0.2")):
-        monkeypatch.setattr(render, "demonstrations_files", lambda *_, card=card: card)
-        new, kept = publish(GOLDEN)
-        assert (str(new.version), files(hub, LESSONS)["README.md"]) == (version, card["README.md"])
-        assert tags(hub, LESSONS)[f"data-{version}"] == new.published != lessons.published
-        assert kept.published == units.published  # it names the first commit, which holds the data
-        hub.asked.clear()
-        again = publish(GOLDEN)
-        assert [one.published for one in again] == [new.published, units.published]
-        assert writes(hub) == []
-    # What is for them from now on names the commit of their data, too.
-    publish(GOLDEN, "someone/other", demonstrations_id=LESSONS)
-    header = load_split("someone/other").header.datasets["demonstrations"]
-    assert header.place == f"{LESSONS}@{lessons.published}"
+    new, units = publish(root, version="3.0.0")
+    assert (str(new.version), str(units.version)) == ("1.0.2", "3.0.0")
+    header = load_split(UNITS).header.datasets["demonstrations"]
+    assert header.place == f"{LESSONS}@{new.published}"
 
 
 # --- published demonstrations --------------------------------------------------------------------
@@ -251,121 +261,68 @@ def placed(hub: HubServer, tmp_path: Path, commit: str | None = None) -> Path:
 
 def test_a_split_of_published_demonstrations(hub: HubServer, tmp_path: Path) -> None:
     root = placed(hub, tmp_path)
-    [units] = publish(root)
-    assert units.repository.repo_id == UNITS
+    assert len(publish(root)) == 1
     assert hub.repositories.keys() == {"datasets/others/lessons", f"datasets/{UNITS}"}
     assert len(load_buffer(QUERY, "k1", split=UNITS, verify=True).sessions) == 2
-
-
-def test_they_may_be_published_again_elsewhere(hub: HubServer, tmp_path: Path) -> None:
-    root = placed(hub, tmp_path)
-    lessons, _ = publish(root, demonstrations_id="someone/mine")
-    header = load_split(UNITS).header.datasets["demonstrations"]
+    lessons, _ = publish(root, "someone/again", demonstrations_id="someone/mine")
+    header = load_split("someone/again").header.datasets["demonstrations"]
     assert header.place == f"someone/mine@{lessons.published}"
 
 
-def test_demonstrations_that_are_not_there(hub: HubServer, tmp_path: Path) -> None:
-    hub.push("datasets/others/lessons", GOLDEN / "demonstrations")
+def test_published_demonstrations_that_cannot_be_used(hub: HubServer, tmp_path: Path) -> None:
+    commit = hub.push("datasets/others/lessons", GOLDEN / "distractors")
+    with pytest.raises(PublishError, match="other demonstrations"):
+        publish(placed(hub, tmp_path / "other", commit))
     with pytest.raises(HubError, match="no revision"):
-        publish(placed(hub, tmp_path, commit="a" * 40))
-
-
-def test_demonstrations_that_are_gated(hub: HubServer, tmp_path: Path) -> None:
-    root = placed(hub, tmp_path)
+        publish(placed(hub, tmp_path / "missing", commit="a" * 40))
+    root = placed(hub, tmp_path / "gated")
     hub.gated.add("datasets/others/lessons")
     with pytest.raises(HubError, match="gated"):
         publish(root)
     assert UNITS not in str(hub.repositories)
 
 
-def test_demonstrations_that_are_others(hub: HubServer, tmp_path: Path) -> None:
-    commit = hub.push("datasets/others/lessons", GOLDEN / "distractors")
-    with pytest.raises(PublishError, match="other demonstrations"):
-        publish(placed(hub, tmp_path, commit))
+# --- who may, and what is there ------------------------------------------------------------------
 
 
-# --- who may -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("who", "told"),
-    [
-        ({"name": "stranger"}, "may not write to someone/"),
-        ({"name": "someone", "write": False}, "may not write to someone/"),
-    ],
-)
-@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("who", [{"name": "stranger"}, {"name": "someone", "write": False}])
+@pytest.mark.parametrize("exists", [False, True])
 def test_a_token_without_rights(
-    hub: HubServer, login: Login, who: dict[str, object], told: str, there: bool
+    hub: HubServer, login: Login, who: dict[str, object], exists: bool
 ) -> None:
-    if there:
+    if exists:
         hub.push(f"datasets/{LESSONS}", {"README.md": b"to come"})
         hub.push(f"datasets/{UNITS}", {"README.md": b"to come"})
     login(**who)
-    with pytest.raises(HubError, match=told) as caught:
+    with pytest.raises(HubError, match="may not write to someone/") as caught:
         publish(GOLDEN)
     assert "hf auth login" in str(caught.value.hint)
-    assert hub.uploads() == []
-    assert tags(hub, LESSONS) == {}
+    assert hub.uploads() == [] and tags(hub, LESSONS) == {}
 
 
-@pytest.mark.parametrize("token", ["hf_unknown", None])
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("token", ["hf_unknown", ""])
 def test_nobody_is_logged_in(
-    hub: HubServer, monkeypatch: pytest.MonkeyPatch, token: str | None
+    hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch, token: str
 ) -> None:
-    if token is None:
-        monkeypatch.delenv("HF_TOKEN")
-    else:
-        monkeypatch.setenv("HF_TOKEN", token)
-    with pytest.raises(HubError, match="does not know this login") as caught:
-        publish(GOLDEN)
-    assert "hf auth login" in str(caught.value.hint)
-    assert writes(hub) == []
+    monkeypatch.setenv("HF_TOKEN", token)
+    monkeypatch.setattr(checks, "check_split", lambda *_: pytest.fail("checks take hours"))
+    code, _, err = run("publish", GOLDEN, "--repo-id", UNITS, "--yes")
+    assert (code, len(hub.requests) <= 1) == (1, True)
+    assert "does not know this login" in err and "hf auth login" in err
+    assert "was sent" not in err
 
 
-def test_members_publish_for_an_organization(hub: HubServer, login: Login) -> None:
-    login("member", orgs=("someone",))
-    publish(GOLDEN)
-    assert "data-1.0.0" in tags(hub, UNITS)
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        ({"repo_id": "tiny"}, "--repo-id 'tiny'"),
-        ({"demonstrations_id": "a/b/c"}, "--demonstrations-id 'a/b/c'"),
-        ({"demonstrations_id": UNITS}, "are both"),
-        ({"repo_id": "someone/" + "a" * 90}, "--demonstrations-id 'someone/a*-demonstrations'"),
-        ({"version": "1.0"}, "--version '1.0'"),
-        ({"version": ""}, "--version ''"),
-        ({"license": "MIT License"}, "--license"),
-    ],
-)
-def test_options(hub: HubServer, options: dict[str, str], told: str) -> None:
-    with pytest.raises(InvalidOptionError, match=told):
-        publisher(GOLDEN, **options)
-    assert hub.requests == []
-
-
-# --- what is there -------------------------------------------------------------------------------
-
-
-def test_a_repository_of_something_else(hub: HubServer) -> None:
-    hub.push(f"datasets/{UNITS}", {"data/train.csv": b"1,2", "README.md": b"mine"})
+def test_what_a_repository_may_hold(hub: HubServer) -> None:
+    other = {"data/train.csv": b"1,2", "README.md": b"mine"}
+    hub.push("datasets/someone/other", other)
     with pytest.raises(PublishError, match=r"something else, such as data/train\.csv"):
-        publish(GOLDEN)
+        publish(GOLDEN, "someone/other")
     assert writes(hub) == []
-
-
-def test_a_repository_made_by_hand(hub: HubServer) -> None:
     hub.push(f"datasets/{UNITS}", {"README.md": b"to come", "LICENSE": b"free"})
     publish(GOLDEN)
     assert files(hub, UNITS)["LICENSE"] == b"free"
     assert files(hub, UNITS)["README.md"] != b"to come"
-
-
-def test_a_renamed_repository(hub: HubServer) -> None:
-    publish(GOLDEN)
     hub.renamed[f"datasets/{UNITS}"] = "datasets/someone/new"
     hub.repositories["datasets/someone/new"] = hub.repositories.pop(f"datasets/{UNITS}")
     hub.repositories["datasets/someone/new"].name = "datasets/someone/new"
@@ -377,4 +334,133 @@ def test_offline(hub: HubServer, offline: Callable[[], None]) -> None:
     offline()
     with pytest.raises(HubError, match="HF_HUB_OFFLINE is set"):
         publish(GOLDEN)
-    assert hub.requests == [] and constants.HF_HUB_OFFLINE
+    assert hub.requests == []
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_the_command(
+    hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked = ("publish", GOLDEN, "--repo-id", UNITS, "--license", "cc-by-4.0")
+    code, out, err = run(*asked, "--dry-run", "--json")
+    assert (code, writes(hub)) == (0, [])
+    assert [one["commit"] for one in json.loads(out)] == [None, None]
+    assert err.count("new repository") == 2
+    assert f"robomme-interference index {GOLDEN}" in err  # the demonstrations have no embeddings
+    code, _, err = run(*asked)
+    assert (code, "--yes" in err, writes(hub)) == (1, True, [])  # nobody can answer
+    for answer in ("n\n", "\n", ""):
+        monkeypatch.setattr(sys, "stdin", Terminal(answer))
+        assert run(*asked)[0] == 1 and writes(hub) == []
+    code, out, err = run(*asked, "--yes", "--json", "--version", "1.2.3")
+    assert code == 0, err
+    for one in json.loads(out):
+        assert one["version"] == "1.2.3"
+        assert tags(hub, one["repo_id"]) == {"data-1.2.3": one["commit"], "v3.0": one["commit"]}
+        assert one["sent_files"] == one["files"] > 0
+    code, out, err = run(*asked)
+    assert (code, out, err.count("published, ")) == (0, "", 2)
+    assert f'load_split("{UNITS}", revision="data-1.2.3")' in err
+    root, _ = changed(tmp_path, "added")
+    asked = ("publish", root, *asked[2:])
+    code, _, err = run(*asked, "--yes")
+    assert (code, "--version 1.3.0" in err) == (1, True)
+    monkeypatch.setattr(sys, "stdin", Terminal("y\n"))
+    assert run(*asked, "--version", "1.3.0")[0] == 0
+    assert len(load_split(UNITS, revision="data-1.3.0")) == 18
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_the_command_into_a_folder(hub: HubServer, run: Run, tmp_path: Path) -> None:
+    out, asked = tmp_path / "out", ("publish", GOLDEN, "--repo-id", UNITS)
+    assert run(*asked, "--to", out, "--dry-run")[0] == 0 and not out.exists()
+    code, text, _ = run(*asked, "--to", out, "--json")
+    found = contents(out)
+    size = sum(map(len, found.values()))
+    expected = {"to": str(out), "files": len(found), "bytes": size, "written": True}
+    assert (code, json.loads(text)) == (0, expected)
+    assert "already there" in run(*asked, "--to", out)[2]
+    assert hub.requests == []
+    root = copy_split(tmp_path / "split")
+    before = contents(root)
+    code, _, err = run("publish", root, "--repo-id", UNITS, "--to", root / "distractors" / "out")
+    assert (code, "inside" in err, contents(root)) == (1, True, before)
+
+
+def test_a_split_that_fails_a_check_is_not_published(
+    hub: HubServer, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = copy_split(tmp_path / "split")
+    (root / "distractors" / "meta" / "build_report.json").write_text("{}\n")
+    code, _, err = run("publish", root, "--repo-id", UNITS, "--yes")
+    assert (code, writes(hub)) == (1, [])
+    assert "build_report.json" in err and f"robomme-interference verify {root}" in err
+    audit = Audit({}, leaks=[Leak("same scene", "unit MoveCube/train/0"), Leak("other", "b")])
+    monkeypatch.setattr(checks, "audit_split", lambda _: audit)
+    with pytest.raises(PublishError, match="2 leaks, such as same scene: unit MoveCube") as caught:
+        check_split(load_split(GOLDEN))
+    assert caught.value.command == f"audit {GOLDEN}"
+
+
+# --- results -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of one rollout that has ended."""
+    monkeypatch.setenv(worlds.SPLIT, str(GOLDEN))
+    runs.run_one(tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_results(hub: HubServer, ended: Path, run: Run, tmp_path: Path) -> None:
+    repo = "someone/results"
+    asked = ("publish-results", ended, "--repo-id", repo, "--grid", "given")
+    code, out, err = run(*asked, "--dry-run", "--json")
+    assert code == 0, err
+    assert json.loads(out)[0]["sent_files"] > 0 and tags(hub, repo) == {}
+    with full_disk(1000):
+        code, _, err = run(*asked, "--yes")
+    assert code == 1 and "File too large" in err and hub.repositories == {}
+    code, _, err = run(*asked, "--yes")
+    assert code == 0, err
+    found = files(hub, repo)
+    assert {"run.json", "rollouts.jsonl", "rollouts.parquet", "score/report.html"} <= found.keys()
+    assert {"README.md", "croissant.json", "score/tables/main.csv"} <= found.keys()
+    for name in ("run.json", "rollouts.jsonl", "rollouts.parquet", "rollouts.csv"):
+        assert found[name] == (ended / name).read_bytes()
+    sent = hub.received
+    code, _, err = run(*asked, "--yes")
+    assert code == 0 and "published, " in err and hub.received == sent
+    assert run(*asked, "--to", tmp_path / "out")[0] == 0
+    assert contents(tmp_path / "out") == found
+    code, out, err = run("card", repo)
+    assert code == 0 and "results" in out, err
+
+
+def test_other_rows_are_another_version(
+    hub: HubServer, ended: Path, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(results, "card_files", lambda *_: {"README.md": b"card"})
+    repo = "someone/results"
+    asked = ("publish-results", ended, "--repo-id", repo, "--yes")
+    assert run(*asked)[0] == 0
+    record = ended / "rollouts.jsonl"
+    row = json.loads(record.read_text(encoding="utf-8"))
+    record.write_text(canonical_json(row | {"steps": row["steps"] + 1}) + "\n", encoding="utf-8")
+    code, _, err = run(*asked)
+    assert code == 1 and "--version 2.0.0" in err
+    assert run(*asked, "--version", "2.0.0")[0] == 0
+    assert [*tags(hub, repo)] == ["data-1.0.0", "data-2.0.0"]
+    (ended / "rollouts.parquet").unlink()
+    for folder in (ended, tmp_path / "nothing"):
+        code, _, err = run("publish-results", folder, "--repo-id", repo)
+        assert code == 1 and "no run that has ended" in err

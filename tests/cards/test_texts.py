@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +16,30 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.cards.commands import card_text
-from robomme_interference_data.cards.facts import SplitFacts
+from robomme_interference_data.cards.facts import (
+    count_same_family,
+    demonstrations_facts,
+    split_facts,
+)
 from robomme_interference_data.cards.film import film_of_split
 from robomme_interference_data.cards.limits import is_whole_grid
 from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.render import (
-    demonstrations_text,
-    results_files,
-    results_text,
-    split_text,
+from robomme_interference_data.cards.render import card_files, card_text
+from robomme_interference_data.cards.results import results_facts
+from robomme_interference_data.constants import (
+    FAMILIES,
+    IDENTITY_PATH,
+    RECORDS_PATH,
+    REPORT_PATH,
+    SUMS_PATH,
 )
-from robomme_interference_data.constants import FAMILIES, IDENTITY_PATH, REPORT_PATH
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Settings
-from robomme_interference_data.evaluate.score.scoring import score
+from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
-from robomme_interference_data.storage.files import read_json, write_json
+from robomme_interference_data.storage.files import format_sums, read_json, write_json
 
 COMMIT = "0123456789" * 4
 
@@ -56,13 +62,27 @@ def made_up(
     ]
     for kind, records in (("demonstrations", asked), ("distractors", pool)):
         write_metadata(root / kind, kind, records)
-        path = root / kind / IDENTITY_PATH
-        write_json(path, {**read_json(path), **(identity or {})})
+        sums = format_sums(root / kind, [RECORDS_PATH])
+        (root / kind / SUMS_PATH).write_text(sums)
+        path, digest = root / kind / IDENTITY_PATH, sha256(sums.encode()).hexdigest()
+        write_json(path, {**read_json(path), **(identity or {}), "sums": digest})
         write_json(root / kind / REPORT_PATH, {"skipped": [], **(report or {})})
     planned = {"conditions": ("no-history", "k0", "k1", "k3"), **options}
     for _ in write_manifests(plan_manifests(in_folder(root), **planned), root):
         pass
     return load_split(root)
+
+
+def split_text(split: Split, about: Publication) -> str:
+    return card_text(split_facts(split), about)
+
+
+def demonstrations_text(split: Split) -> str:
+    return card_text(demonstrations_facts(split.datasets["demonstrations"]), OF_DEMONSTRATIONS)
+
+
+def results_text(results: Score | Path, about: Publication) -> str:
+    return card_text(results_facts(results), about)
 
 
 def test_exact_data_is_called_so(tmp_path: Path) -> None:
@@ -78,7 +98,7 @@ def test_lossy_data_is_called_so(tmp_path: Path, part: str, inexact: int) -> Non
     text = split_text(split, OF_SPLIT)
     assert "**Exact.**" not in text
     assert f"**Lossy.** {inexact} of 4 buffers" in text
-    demonstrations = demonstrations_text(split.datasets["demonstrations"], OF_DEMONSTRATIONS)
+    demonstrations = demonstrations_text(split)
     assert ("**Lossy.** 1 of 1 episodes" in demonstrations) == (part == "query")
 
 
@@ -100,7 +120,7 @@ def test_hostile_goals_are_text(tmp_path: Path) -> None:
     split = made_up(tmp_path, query={"goals": (HOSTILE,), "difficulty": HOSTILE})
     for text in (
         split_text(split, OF_SPLIT),
-        demonstrations_text(split.datasets["demonstrations"], OF_DEMONSTRATIONS),
+        demonstrations_text(split),
     ):
         assert "{{ about }} &#124; \\`x\\` &lt;script&gt;" in text
         assert "<script" not in text
@@ -127,19 +147,20 @@ def test_hostile_sources_are_text(tmp_path: Path, source: dict[str, Any]) -> Non
     assert "`a/b@" not in text
 
 
-def test_a_split_of_the_own_family_is_labelled(tmp_path: Path) -> None:
+def test_a_split_of_the_own_family_is_labelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     split = made_up(tmp_path, conditions=("k0", "k1"))
     [k0, k1] = split.manifests()
     lesson, unit = k1.sessions
     own = replace(unit, family="MoveCube", source=lesson.source)
     other = BufferManifest(**{**vars(k1), "sessions": (lesson, own)})
-    facts = SplitFacts(split)
-    assert facts.same_family == 0
+    assert (count_same_family([k0, k1]), count_same_family([k0, other])) == (0, 1)
     assert "own family" not in split_text(split, OF_SPLIT)
-    facts = SplitFacts(split)
-    vars(facts)["manifests"] = (k0, other)
-    assert facts.same_family == 1
-    assert any("own family" in one for one in facts.limits)
+    monkeypatch.setattr(split, "manifests", lambda: [k0, other])
+    text = split_text(split, OF_SPLIT)
+    assert "**Not the paper's protocol: 1 of 2 buffers hold" in text
+    assert any("own family" in one for one in split_facts(split).limits)
 
 
 def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
@@ -170,7 +191,7 @@ def test_what_yielded_nothing_is_counted(tmp_path: Path) -> None:
     report = {"skipped": [{"episode_id": "MoveCube/train/9", "why": "short"}] * 3}
     split = made_up(tmp_path, report=report)
     assert "(3 recorded episodes yielded nothing here" in split_text(split, OF_SPLIT)
-    text = demonstrations_text(split.datasets["demonstrations"], OF_DEMONSTRATIONS)
+    text = demonstrations_text(split)
     assert "3 recorded episodes yielded no demonstration" in text
 
 
@@ -196,12 +217,6 @@ def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
     assert "| demonstrations | not published |" in split_text(split, Publication("people/tiny"))
 
 
-def test_units_have_no_card_of_their_own(tmp_path: Path) -> None:
-    split = made_up(tmp_path)
-    with pytest.raises(InvalidOptionError, match="distractors"):
-        demonstrations_text(split.datasets["distractors"], OF_DEMONSTRATIONS)
-
-
 def test_a_damaged_report(tmp_path: Path) -> None:
     split = made_up(tmp_path)
     (tmp_path / "distractors" / REPORT_PATH).write_text("{")
@@ -210,18 +225,16 @@ def test_a_damaged_report(tmp_path: Path) -> None:
 
 
 def test_a_split_without_buffers(tmp_path: Path) -> None:
-    facts = SplitFacts(made_up(tmp_path))
-    vars(facts)["manifests"] = ()
     with pytest.raises(FormatError, match="no buffers"):
-        film_of_split(facts)
+        film_of_split(made_up(tmp_path), (), ())
 
 
 # --- results --------------------------------------------------------------------------------------
 
 
-def test_results_are_those_of_the_score() -> None:
+def test_results_are_those_of_the_score(made: dict[str, dict[str, bytes]]) -> None:
     found = score(Settings(rows=(RUN,)))
-    assert results_files(found, OF_RESULTS) == results_files(RUN, OF_RESULTS)
+    assert card_files(results_facts(found), OF_RESULTS) == made["results"]
     text = results_text(found, OF_RESULTS)
     [grid] = found.grids
     assert grid.grid() in text
@@ -239,7 +252,7 @@ def test_results_of_several_runs_are_refused(tmp_path: Path) -> None:
 
 def test_results_of_rows_without_a_run(tmp_path: Path) -> None:
     (tmp_path / "rows.jsonl").write_bytes((RUN / "rollouts.jsonl").read_bytes())
-    text = card_text(str(tmp_path / "rows.jsonl"), Publication("people/rows"))
+    text = results_text(tmp_path / "rows.jsonl", Publication("people/rows"))
     assert "path: rows.jsonl" in text
     assert "The run is" not in text
 

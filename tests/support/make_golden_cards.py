@@ -8,24 +8,18 @@ from support.cards import OF_DEMONSTRATIONS, OF_RESULTS, OF_SPLIT, RUN, without_
 from support.splits import GOLDEN
 
 from robomme_interference_data import load_split
-from robomme_interference_data.cards.render import (
-    CROISSANT,
-    README,
-    demonstrations_files,
-    results_files,
-    split_files,
-)
+from robomme_interference_data.cards.facts import demonstrations_facts, split_facts
+from robomme_interference_data.cards.render import CROISSANT, README, card_files
+from robomme_interference_data.cards.results import results_facts
 
 
 def cards() -> Iterator[tuple[str, dict[str, bytes]]]:
     """Yield the cards by name."""
     split = load_split(GOLDEN)
-    yield (
-        "demonstrations",
-        demonstrations_files(split.datasets["demonstrations"], OF_DEMONSTRATIONS),
-    )
-    yield "split", split_files(split, OF_SPLIT)
-    yield "results", results_files(RUN, OF_RESULTS)
+    lessons = demonstrations_facts(split.datasets["demonstrations"])
+    yield "demonstrations", card_files(lessons, OF_DEMONSTRATIONS)
+    yield "split", card_files(split_facts(split), OF_SPLIT)
+    yield "results", card_files(results_facts(RUN), OF_RESULTS)
 
 
 if __name__ == "__main__":

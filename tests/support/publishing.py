@@ -13,19 +13,19 @@ from robomme_interference_data.build_dataset.manifests import (
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.cards import render
-from robomme_interference_data.cards.publication import Publication
-from robomme_interference_data.cards.publish import Publisher
-from robomme_interference_data.cards.publish_config import PublishConfig
-from robomme_interference_data.cards.step import Step
+from robomme_interference_data.cards import publish as publish_module
+from robomme_interference_data.cards.facts import Facts
+from robomme_interference_data.cards.publication import Publication, PublishConfig
+from robomme_interference_data.cards.publish import SplitContent, plan_split, publish_split
+from robomme_interference_data.cards.publisher import Publisher, RepoPlan
 
 UNITS, LESSONS = "someone/tiny", "someone/tiny-demonstrations"
 
 
 def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let cards tell only as what something is published: pictures take a second each."""
+    """Replace cards by ones that state only as what something is published: pictures are slow."""
 
-    def card(_: Any, about: Publication) -> dict[str, bytes]:
+    def card(_: Facts, about: Publication) -> dict[str, bytes]:
         text = f"---\nlicense: {about.license}\n---\n{about}\n"
         picture, machines = about.repo_id.encode(), b"{}"
         return {
@@ -34,26 +34,33 @@ def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
             "croissant.json": machines,
         }
 
-    for name in ("demonstrations_files", "split_files"):
-        monkeypatch.setattr(render, name, card)
+    monkeypatch.setattr(publish_module, "card_files", card)
 
 
-def publisher(
-    root: Path, repo_id: str = UNITS, waits: list[float] | None = None, **options: Any
-) -> Publisher:
-    """Return what publishes a split; it waits by writing down for how long."""
+def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> SplitContent:
+    """Return what the repositories of a split are to hold."""
+    return SplitContent(load_split(root), PublishConfig(repo_id, **options))
+
+
+def plan(
+    root: Path,
+    repo_id: str = UNITS,
+    waits: list[float] | None = None,
+    private: bool = False,
+    **options: Any,
+) -> tuple[SplitContent, Publisher, list[RepoPlan]]:
+    """Plan to publish a split; instead of waiting, seconds are added to `waits`."""
+    content = content_of(root, repo_id, **options)
     wait = [] if waits is None else waits
-    private = options.pop("private", False)
-    config = PublishConfig(repo_id, **options)
-    return Publisher(load_split(root), config, private=private, wait=wait.append)
+    publisher = Publisher(content.config, private=private, wait=wait.append)
+    return content, publisher, plan_split(content, publisher)
 
 
-def publish(root: Path, repo_id: str = UNITS, **options: Any) -> list[Step]:
+def publish(root: Path, repo_id: str = UNITS, **options: Any) -> list[RepoPlan]:
     """Publish a split; return what became of its repositories."""
-    own = publisher(root, repo_id, **options)
-    steps = own.plan()
-    own.check_rights(steps)
-    return own.run(steps)
+    content, publisher, plans = plan(root, repo_id, **options)
+    publisher.check_rights(plans)
+    return publish_split(content, publisher, plans)
 
 
 def plan_again(root: Path, conditions: Iterable[str], seed: int = 0) -> None:

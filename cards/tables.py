@@ -1,0 +1,173 @@
+"""The tables of cards. Their texts are Markdown already."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from statistics import mean, median
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import pyarrow as pa
+
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.codec import arrow_schema, descriptions
+from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
+from robomme_interference_data.schema.manifest import BufferManifest
+from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.viz.tables import Table
+
+from .markdown import code, escape
+
+_WORDS = {
+    pa.string(): "text",
+    pa.int64(): "whole number",
+    pa.float64(): "number",
+    pa.bool_(): "true or false",
+    pa.binary(): "bytes",
+}
+_DIFFICULTIES = "easy:count medium:count hard:count other:count"
+
+
+def count_table(records: Iterable[EpisodeRecord]) -> Table:
+    """Return how many episodes there are by family and difficulty, and their frames."""
+    rows = [
+        (escape(name), len(found), *_difficulties(found), sum(one.length for one in found))
+        for name, found in _by_family(records).items()
+    ]
+    columns = f"family episodes:count {_DIFFICULTIES} frames:count"
+    return Table.make("counts", "Episodes", columns, [*rows, _total(rows)])
+
+
+def unit_table(queries: Iterable[EpisodeRecord], units: Iterable[EpisodeRecord]) -> Table:
+    """Return how many queries there are by family and difficulty, and units by family."""
+    asked, pool = _by_family(queries), Counter(one.episode_id.family for one in units)
+    rows = []
+    for name in sorted({*asked, *pool}, key=_family_rank):
+        found = asked.get(name, [])
+        rows.append((escape(name), len(found), *_difficulties(found), pool[name]))
+    columns = f"family queries:count {_DIFFICULTIES} units:count"
+    return Table.make("counts", "Queries and units", columns, [*rows, _total(rows)])
+
+
+def goal_table(records: Iterable[EpisodeRecord]) -> Table:
+    """Return the goal of the first episode of each family."""
+    first = [found[0] for found in _by_family(records).values()]
+    rows = [
+        (escape(one.episode_id), escape(one.difficulty or ""), escape(one.goal)) for one in first
+    ]
+    return Table.make("goals", "Goals", "episode difficulty goal", rows)
+
+
+def condition_table(conditions: Iterable[str], manifests: Iterable[BufferManifest]) -> Table:
+    """Return what the buffers of each condition hold."""
+    groups: dict[str, list[BufferManifest]] = {name: [] for name in conditions}
+    for one in manifests:
+        groups.setdefault(one.condition, []).append(one)
+    rows = []
+    for name, found in groups.items():
+        frames = [one.history_frames for one in found] or [0]
+        rows.append(
+            (
+                *(escape(name), "paper" if name in DEFAULT_CONDITIONS else "ours"),
+                *(len(found), max((len(one.sessions) for one in found), default=0)),
+                *(min(frames), round(median(frames)), max(frames)),
+                mean(one.lesson_share for one in found) if found else None,
+            )
+        )
+    columns = "condition whose buffers:count sessions:count min:count median:count max:count"
+    return Table.make("conditions", "Conditions", f"{columns} lesson_share:rate", rows)
+
+
+def _by_family(records: Iterable[EpisodeRecord]) -> dict[str, list[EpisodeRecord]]:
+    """Return records by family, in canonical order."""
+    groups = defaultdict[str, list[EpisodeRecord]](list)
+    for record in records:
+        groups[record.episode_id.family].append(record)
+    return {name: groups[name] for name in sorted(groups, key=_family_rank)}
+
+
+def _difficulties(records: Sequence[EpisodeRecord]) -> tuple[int, ...]:
+    counts = Counter(record.difficulty for record in records)
+    known = [counts[name] for name in DIFFICULTIES]
+    return (*known, len(records) - sum(known))
+
+
+def _total(rows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    return ("all", *(sum(column) for column in list(zip(*rows, strict=True))[1:]))
+
+
+def _family_rank(name: str) -> tuple[int, str]:
+    return (FAMILIES.index(name) if name in FAMILIES else len(FAMILIES), name)
+
+
+# --- the columns of a table ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CardColumn:
+    """A column of a table.
+
+    Attributes:
+        name: Its name.
+        type: Its type in Arrow.
+        about: What it means.
+        parts: What a record in it is made of.
+    """
+
+    name: str
+    type: pa.DataType
+    about: str
+    parts: tuple["CardColumn", ...] = ()
+
+    @property
+    def repeated(self) -> bool:
+        """Whether a value is a list."""
+        return bool(pa.types.is_list(self.type))
+
+    @property
+    def item(self) -> pa.DataType:
+        """Type of a value, or of one in its list."""
+        return self.type.value_type if self.repeated else self.type
+
+    @property
+    def words(self) -> str:
+        """Its type in words."""
+        one = _WORDS.get(self.item, "record")
+        return f"list of {one}s".replace("texts", "text") if self.repeated else one
+
+
+def columns_of(record: Any) -> tuple[CardColumn, ...]:
+    """Return the columns of a record; those of its maps, which differ between files, are left out.
+
+    Args:
+        record: The dataclass.
+    """
+    texts, hints = descriptions(record), get_type_hints(record)
+    found = []
+    for field in arrow_schema(record):
+        inner = _record_in(hints.get(field.name))
+        if pa.types.is_struct(field.type) and inner is None:
+            continue  # a map
+        parts = columns_of(inner) if inner else ()
+        about = texts[field.name].replace("`", "")
+        found.append(CardColumn(field.name, field.type, about, parts))
+    return tuple(found)
+
+
+def column_table(record: type) -> Table:
+    """Return the columns of a record as a table."""
+    rows = []
+    for column in columns_of(record):
+        rows.append((code(column.name), column.words, escape(column.about)))
+        for part in column.parts:
+            rows.append((code(f"{column.name}.{part.name}"), part.words, escape(part.about)))
+    return Table.make("columns", "Columns", "column type meaning", rows)
+
+
+def _record_in(hint: Any) -> Any:
+    """Return the record that a value is, or that its list is of, or None."""
+    if get_origin(hint) in (tuple, UnionType):
+        return next(filter(None, map(_record_in, get_args(hint))), None)
+    own = is_dataclass(hint) and isinstance(hint, type) and hint is not EpisodeId
+    return hint if own and fields(hint) else None

@@ -1,0 +1,176 @@
+"""The files of a repository: how they differ from others, in a folder, and what a split has."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from huggingface_hub.hf_api import RepoFile
+from hypothesis import given
+from hypothesis import strategies as st
+from support.hub_repositories import Blob
+from support.machine import full_disk
+from support.publishing import content_of, plain_cards, plan_again
+from support.splits import GOLDEN, contents, copy_split
+
+from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.cards.publication import Version
+from robomme_interference_data.cards.publish import parts_of_buffers, parts_of_dataset
+from robomme_interference_data.cards.repo import (
+    LocalFile,
+    RepoFiles,
+    compare,
+    total_size,
+    write_folder,
+)
+from robomme_interference_data.errors import PublishError
+
+BASE = f"someone/lessons@{'0123456789' * 4}"
+
+
+def remote(data: bytes, large: bool = False) -> RepoFile:
+    return RepoFile(**Blob(data, large).entry("file"))
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_a_file_is_known_by_its_digest(tmp_path: Path, large: bool) -> None:
+    (tmp_path / "file").write_bytes(b"hello\n")
+    for file in (LocalFile(b"hello\n"), LocalFile(tmp_path / "file")):
+        assert file.equals(remote(b"hello\n", large))
+        assert not file.equals(remote(b"hullo\n", large))
+        assert not file.equals(remote(b"hello", large))
+        assert file.sha256 == hashlib.sha256(b"hello\n").hexdigest()
+
+
+FILES = st.dictionaries(st.sampled_from("abcdef"), st.binary(max_size=3), max_size=6)
+
+
+@given(FILES, FILES, st.booleans())
+def test_what_differs(expected: dict[str, bytes], existing: dict[str, bytes], large: bool) -> None:
+    files = {path: LocalFile(data) for path, data in expected.items()}
+    found = compare(files, {path: remote(data, large) for path, data in existing.items()})
+    kept = {path: data for path, data in existing.items() if path not in found.removed}
+    sent = {path: expected[path] for path in found.sent}
+    assert kept | sent == expected
+    assert bool(found) == (expected != existing)
+    assert all(existing.get(path) != expected[path] for path in found.sent)
+    assert total_size(files, found.sent) == sum(map(len, sent.values()))
+
+
+def test_what_is_unmanaged_is_left_alone() -> None:
+    unmanaged = (".gitattributes", "LICENSE", "LICENSE.txt", ".github/workflow.yml")
+    existing = {path: remote(b"x") for path in (*unmanaged, "LICENSES/x", "data/.x", "NOTICE")}
+    assert compare({}, existing).removed == ("LICENSES/x", "NOTICE", "data/.x")
+
+
+# --- what the repository of a split holds --------------------------------------------------------
+
+
+def test_the_files_of_a_split(tmp_path: Path) -> None:
+    root = copy_split(tmp_path / "split")
+    for path in ("index/thumbnail/a.npy", "index/.thumbnail.building/b.npy", "LICENSE", ".x"):
+        (root / "distractors" / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / "distractors" / path).write_bytes(b"more")
+    found = content_of(root).units(BASE).data
+    header = found.pop("manifests/manifest.json").read().decode()
+    assert {path: file.read() for path, file in found.items()} == {
+        **contents(GOLDEN / "distractors"),
+        "index/thumbnail/a.npy": b"more",
+        "manifests/buffers.parquet": (GOLDEN / "manifests/buffers.parquet").read_bytes(),
+    }
+    before = (GOLDEN / "manifests/manifest.json").read_text(encoding="utf-8")
+    added = [line.strip() for line in header.splitlines() if line not in before.splitlines()]
+    assert added == [f'"place": "{BASE}",', '"place": ".",']
+
+
+def test_parts_are_episodes_and_buffers(tmp_path: Path) -> None:
+    split = load_split(GOLDEN)
+    families = ("MoveCube", "PatternLock", "VideoRepick")
+    lessons = parts_of_dataset(split.datasets["demonstrations"])
+    assert sorted(lessons) == [f"demonstrations {family}/test/0" for family in families]
+    before = parts_of_buffers(split.manifests())
+    root = copy_split(tmp_path / "split")
+    plan_again(root, ["k0", "k1", "k2", "k3", "k7", "no-history"])
+    more = parts_of_buffers(load_split(root).manifests())
+    assert Version(1, 0, 0).following(before, more) == (1, 1, 0)
+    plan_again(root, split.conditions, seed=1)
+    drawn = parts_of_buffers(load_split(root).manifests())
+    same = {name.rpartition(" ")[2] for name in before if drawn[name] == before[name]}
+    assert drawn.keys() == before.keys() and same == {"no-history", "k0"}
+
+
+# --- in a folder ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def _plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain_cards(monkeypatch)
+
+
+def folder(root: Path, **options: Any) -> RepoFiles:
+    return content_of(root, **options).folder()
+
+
+@pytest.mark.usefixtures("_plain")
+def test_a_folder_is_a_split(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert write_folder(folder(GOLDEN), one)
+    golden, written = load_split(GOLDEN), load_split(one)
+    assert written.revision == golden.revision
+    assert [*verify_split(written)] == []
+    mine = load_buffer("MoveCube/test/0", "k7", split=golden).frames("front")
+    theirs = load_buffer("MoveCube/test/0", "k7", split=written, verify=True).frames("front")
+    assert np.array_equal(mine, theirs)
+    assert write_folder(folder(one), two)
+    assert contents(two) == contents(one)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
+
+
+@pytest.mark.usefixtures("_plain")
+def test_an_earlier_version_is_replaced(tmp_path: Path) -> None:
+    files, out = folder(GOLDEN), tmp_path / "out"
+    assert write_folder(files, out)
+    assert not write_folder(files, out)
+    before = contents(out)
+    assert write_folder(folder(GOLDEN, version="1.0.1"), out)
+    assert contents(out).keys() == before.keys()
+    (out / "data" / "more").write_bytes(b"")
+    assert write_folder(files, out)
+    assert contents(out) == before
+
+
+@pytest.mark.usefixtures("_plain")
+@pytest.mark.parametrize("other", ["file", "split", ".git/config", "LICENSE"])
+def test_a_folder_of_something_else_is_kept(tmp_path: Path, other: str) -> None:
+    out = tmp_path / "out"
+    if other == "split":
+        copy_split(out)
+    elif other == "file":
+        out.write_bytes(b"mine")
+    else:
+        write_folder(folder(GOLDEN, version="1.0.1"), out)
+        (out / other).parent.mkdir(exist_ok=True)
+        (out / other).write_bytes(b"mine")
+    before = contents(tmp_path)
+    with pytest.raises(PublishError, match="nothing that was exported"):
+        write_folder(folder(GOLDEN), out)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.usefixtures("_plain")
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
+    out, files = tmp_path / "out", folder(GOLDEN)
+    for left in (0, 12_000):  # the first file does not fit, a later one
+        with full_disk(left), pytest.raises(OSError, match="File too large") as caught:
+            write_folder(files, out)
+        assert str(tmp_path) in f"{caught.value.filename} {caught.value.filename2}"
+        assert [*tmp_path.iterdir()] == []
+    write_folder(folder(GOLDEN, version="1.0.1"), out)
+    before = contents(tmp_path)
+    with full_disk(12_000), pytest.raises(OSError, match="File too large"):
+        write_folder(files, out)
+    assert contents(tmp_path) == before
+    assert write_folder(files, out)
+    assert {path: file.read() for path, file in files.items()} == contents(out)
