@@ -1,7 +1,11 @@
 """What video files declare is bounded before FFmpeg sees them; sound ones are let through."""
 
+import io
+import itertools
 import struct
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -9,7 +13,7 @@ import pytest
 from support.splits import GOLDEN
 
 from robomme_interference_data.errors import FormatError, InterferenceError
-from robomme_interference_data.storage.untrusted.video_boxes import find_container
+from robomme_interference_data.storage.untrusted.video_boxes import _check_declared, find_container
 from robomme_interference_data.storage.video import iter_frames
 
 VIDEO = GOLDEN / "demonstrations/videos/observation.images.front/chunk-000/file-000.mp4"
@@ -72,6 +76,42 @@ def test_what_hides_behind_a_wrong_size_is_looked_at(tmp_path: Path) -> None:
         wrong = struct.pack(">I", size) + b"moov" + hidden
         with pytest.raises(FormatError, match="declares"):
             find_container(video(tmp_path / "a.mp4", wrong))
+
+
+PLACES = (
+    b"abcd dinf edts free hoov ilst iprp jp2h mdia meta minf moof mvex schi sinf skip stbl stsd "
+    b"traf trak tref udta uuid wave"
+)
+
+
+def test_wherever_ffmpeg_finds_a_table_it_is_looked_at() -> None:
+    """FFmpeg says how many durations it was told of; of sizes in the same place, we do."""
+    data, found, count = VIDEO.read_bytes(), 0, 1 << 23
+    moov, trak = data.rindex(b"moov") - 4, data.rindex(b"trak") - 4
+    size = int.from_bytes(data[trak : trak + 4])
+    before_it, track, after = (
+        data[moov + 8 : trak],
+        data[trak + 8 : trak + size],
+        data[trak + size :],
+    )
+    fields = (b"", bytes(4), bytes(8), bytes(4) + box(b"hdlr", bytes(8), b"mdir", bytes(12)))
+    for name, before, outer in itertools.product(PLACES.split(), fields, (b"udta", None)):
+
+        def hidden(evil: bytes, name: bytes = name, parts: Any = (before, outer)) -> io.BytesIO:
+            inner = box(name, parts[0], evil)
+            inner = box(parts[1], inner) if parts[1] else inner
+            return io.BytesIO(
+                data[:moov] + box(b"moov", before_it, box(b"trak", track, inner), after)
+            )
+
+        with suppress(av.error.FFmpegError):
+            with av.open(hidden(table(b"stts", 1, count, 1)), format="mp4") as container:
+                told = [stream.frames for stream in container.streams]
+            if count in told:
+                found += 1
+                with pytest.raises(ValueError, match="declares"):
+                    _check_declared(hidden(table(b"stsz", 100, count)))
+    assert found > 20
 
 
 def test_frames_themselves_are_not_looked_at(tmp_path: Path) -> None:
