@@ -22,7 +22,7 @@ from robomme_interference_data import DecodedCache, Split, load_split
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
-from robomme_interference_data.evaluate.run.config import Run
+from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor
@@ -185,7 +185,7 @@ def seconds_a_rollout(
             episodes="0",
             workers=workers,
         )
-        run_evaluation(config, listener=clock, executor=executor)
+        run_evaluation(config, progress=clock, executor=executor)
     counted = clock.times[workers - 1 :]  # most likely
     return (counted[-1] - counted[0]) / (len(counted) - 1)
 

@@ -17,11 +17,12 @@ from robomme_interference_data.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .policies.policy import Policy, RolloutInfo
-    from .run.config import RunConfig
+    from .run.config import AskConfig, RunConfig
     from .run.evaluation import RunResult, run_evaluation
     from .run.merge import Merged, merge_runs
 
 __all__ = [
+    "AskConfig",
     "Merged",
     "Policy",
     "RolloutInfo",

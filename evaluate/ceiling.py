@@ -23,7 +23,7 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.viz.tables import Table
 
-from .run.config import CeilingConfig, unusual_retrieval
+from .run.config import CeilingConfig, non_default_retrieval
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Ceiling:
 def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
     """Return the ceiling of a memory on a split, by family and condition, and of all families."""
     check_memory(config.memory, "ceiling")
-    unusual_retrieval(config)
+    non_default_retrieval(config)
     if config.shift != NO_SHIFT and config.retrieval is None:
         raise InvalidOptionError(
             f"the shift {config.shift} says nothing without a retrieval step: memories do not look",

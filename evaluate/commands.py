@@ -1,7 +1,7 @@
 """The commands of rollouts and questions: `ceiling`, `evaluate`, `ask` and `merge`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -17,9 +17,6 @@ from robomme_interference_data.cli.options import AsJson, SplitFolder, with_sett
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
 from .run.config import AskConfig, CeilingConfig, RunConfig
-
-if TYPE_CHECKING:
-    from .run.evaluation import RunResult
 
 
 @with_settings
@@ -90,14 +87,7 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
       --split S --out runs/shard-2
     ```
     """
-    from .run.evaluation import run_evaluation
-    from .run.progress import RunProgress
-
-    check_output(config.out)
-    kept = f"Finished rollouts are in {config.out}"
-    with stoppable(kept, config.out), RunProgress(quiet=as_json) as shown:
-        result = run_evaluation(config, listener=shown, command=[command_line()])
-    _tell(result, "rollouts", as_json=as_json)
+    _run(config, "Finished rollouts", "rollouts", as_json=as_json)
 
 
 @with_settings
@@ -120,22 +110,22 @@ def ask(config: AskConfig, as_json: AsJson = False) -> None:
       --system mine-blank --split S --out runs/blank
     ```
     """
-    from .questions.ask import run_examination
-    from .run.progress import RunProgress
-
-    check_output(config.out)
-    kept = f"Answers are in {config.out}"
-    with stoppable(kept, config.out), RunProgress(quiet=as_json, unit="questions") as shown:
-        result = run_examination(config, listener=shown, command=[command_line()])
-    _tell(result, "questions", as_json=as_json)
+    _run(config, "Answers", "questions", as_json=as_json)
 
 
-def _tell(result: "RunResult", unit: str, *, as_json: bool) -> None:
-    """Print what a run came to; fails if something broke."""
+def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) -> None:
+    """Run, and print the results; fails if something broke."""
     from robomme_interference_data.schema.codec import to_dict
 
-    from .run.progress import rate_table
+    from .run.evaluation import run_evaluation
+    from .run.progress import RunProgress, rate_table
 
+    check_output(config.out)
+    with (
+        stoppable(f"{kept} are in {config.out}", config.out),
+        RunProgress(quiet=as_json, unit=unit) as shown,
+    ):
+        result = run_evaluation(config, progress=shown, command=[command_line()])
     if as_json:
         print_json([to_dict(row) for row in result.rows])
     else:
@@ -173,7 +163,7 @@ def merge(
 
     check_output(out)
     merged = merge_runs(runs, out)
-    lists = {name: getattr(merged, name) for name in _TOLD}
+    lists = {name: getattr(merged, name) for name in _LISTS}
     if as_json:
         told = {
             name: [{"episode": str(one.episode), "condition": one.condition} for one in items]
@@ -186,13 +176,13 @@ def merge(
         if items:
             more = f" and {len(items) - 5:,} more" if len(items) > 5 else ""
             shown = ", ".join(map(str, items[:5]))
-            say(f"{len(items):,} {_TOLD[name]}: {shown}{more}")
+            say(f"{len(items):,} {_LISTS[name]}: {shown}{more}")
     echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
 
 
-_TOLD = {
+_LISTS = {
     "missing": "missing",
     "broken": "broken, to be run again",
-    "double": "in more than one run, the first one kept",
-    "differing": "of those did not end alike",
+    "duplicates": "in more than one run, the first one kept",
+    "conflicts": "of those did not end alike",
 }

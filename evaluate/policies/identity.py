@@ -7,20 +7,17 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, redirect_stdout, suppress
-from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from robomme_interference_data.errors import (
-    InterferenceError,
     InvalidOptionError,
     PolicyError,
     PolicyServerError,
 )
 from robomme_interference_data.evaluate.systems import System
-from robomme_interference_data.runtime.executor import Executor, Worker
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
 from .policy import Policy
@@ -58,7 +55,7 @@ def describe_policy(
 
     Returns:
         The policy, closed, for its attributes; and its metadata, as plain values: empty for a
-        server that workers start, see `describe_served`.
+        server that workers start, see `check_served`.
     """
     spec = parse_policy(text)
     check_workers(spec, workers)
@@ -66,10 +63,11 @@ def describe_policy(
         with closing(make_policy(text, options)) as policy:
             return policy, {}
     with redirect_stdout(sys.stderr):  # stdout is for the rows
-        policies = [
-            make_policy(text, options, worker=worker) for worker in range(len(spec.servers) or 1)
-        ]
-        every = [_metadata(text, policy) for policy in policies]
+        policies, every = [], []
+        for worker in range(len(spec.servers) or 1):
+            policies.append(make_policy(text, options, worker=worker))
+            with closing(policies[-1]):
+                every.append(policy_metadata(text, policies[-1]))
     policy, metadata = policies[0], dict(every[0])
     if spec.kind == "websocket":
         _check_metadata(every, policy_options(text, options)["checkpoint"])
@@ -86,37 +84,22 @@ def describe_policy(
     return policy, metadata
 
 
-def describe_served(
-    text: str, options: Sequence[str], system: System, executor: Executor
-) -> dict[str, Any]:
-    """Have a worker start the policy's server, and return its checked metadata."""
-    ask = partial(_ask_served, text, tuple(options))
-    (outcome,) = executor.run(ask, [system.keeps_frames is not None], attempts=1)
-    if isinstance(outcome.error, InterferenceError):
-        raise outcome.error
-    if outcome.error is not None:
-        raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
-    metadata, keeps = outcome.value
+def check_served(
+    text: str,
+    options: Sequence[str],
+    system: System,
+    metadata: Mapping[str, Any],
+    keeps: bool | None,
+) -> None:
+    """Check the metadata of a server that a worker started, and whether it keeps frames."""
     _check_metadata([metadata], policy_options(text, options)["checkpoint"])
     if keeps is not None:
         _check_keeps(keeps, metadata["server"], system)
-    return dict(metadata)
 
 
-def _ask_served(
-    text: str, options: Sequence[str], kind: bool, worker: Worker
-) -> tuple[dict[str, Any], bool | None]:
-    """Return a server's metadata, and whether it keeps frames, if that is asked."""
-    with closing(make_policy(text, options)) as policy:
-        keeps = cast("Any", policy).keeps_frames() if kind else None
-        return _metadata(text, policy), keeps
-
-
-def _metadata(text: str, policy: Policy) -> dict[str, Any]:
-    try:
-        metadata = policy.metadata()
-    finally:
-        policy.close()
+def policy_metadata(text: str, policy: Policy) -> dict[str, Any]:
+    """Return a policy's metadata as plain values."""
+    metadata = policy.metadata()
     try:
         if isinstance(metadata, Mapping):
             return dict(plain(metadata))
@@ -221,7 +204,11 @@ def plain(value: Any) -> Any:
         return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(str(value))
-    if value is None or isinstance(value, bool | int | float):
+    big = isinstance(value, int) and value.bit_length() > 63  # more than a file of ours can hold
+    if value is None or (isinstance(value, bool | int | float) and not big):
         return value
-    text = os.fspath(value) if isinstance(value, str | os.PathLike) else repr(value)
+    if big:
+        text = hex(value)
+    else:
+        text = os.fspath(value) if isinstance(value, str | os.PathLike) else repr(value)
     return str(text).encode("utf-8", "backslashreplace").decode()

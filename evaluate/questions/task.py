@@ -11,11 +11,11 @@ from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.data.loading import load_split
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.evaluate.rollout.rollout import retrieval_columns
-from robomme_interference_data.evaluate.rollout.transcripts import record_file
-from robomme_interference_data.evaluate.rollout.worker import make_selector
-from robomme_interference_data.evaluate.run.config import AskConfig, Run
+from robomme_interference_data.evaluate.rollout.transcripts import transcript_file
+from robomme_interference_data.evaluate.run.config import AskConfig
+from robomme_interference_data.evaluate.run.identity import make_selector, package_versions
+from robomme_interference_data.evaluate.run.kind import Job, Run, stored_count
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.versions import package_versions
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.evidence import known_parts
@@ -27,11 +27,7 @@ from robomme_interference_data.schema.sampling import (
     lesson_share,
 )
 
-from .answers import (
-    Answerer,
-    Asked,
-    make_answerer,
-)
+from .responders import Prompted, Responder, make_responder
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
@@ -48,12 +44,12 @@ class AskTask:
         self._split: Split | None = None
         self._questions: dict[EpisodeId, Question] = {}
         self._selector: Selector | None = None
-        self._answerer: Answerer | None = None
+        self._responder: Responder | None = None
 
-    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, None]:
-        """Ask a question, and hand in what was asked and answered; return its row."""
+    def __call__(self, task: Job, worker: Worker) -> tuple[Rollout, None]:
+        """Ask a question, and send its transcript; return its row."""
         try:
-            return self._ask(task, worker), None
+            return self._ask(task.item, worker), None
         except Exception:
             self.close()
             raise
@@ -67,9 +63,9 @@ class AskTask:
 
     def close(self) -> None:
         """Release who answers."""
-        if self._answerer is not None:
-            self._answerer.close()
-        self._answerer = None
+        if self._responder is not None:
+            self._responder.close()
+        self._responder = None
 
     def _ask(self, item: WorkItem, worker: Worker) -> Rollout:
         config, began = self._run.config, time.perf_counter()
@@ -77,8 +73,8 @@ class AskTask:
             self._split = load_split(config.split, cache=config.cache, threads=1)
             self._questions = read_questions(self._split)
             self._selector = make_selector(config)
-        if self._answerer is None:
-            self._answerer = make_answerer(config)
+        if self._responder is None:
+            self._responder = make_responder(config)
         buffer, question = (
             self._split.load(item.episode, item.condition),
             self._questions[item.episode],
@@ -97,10 +93,12 @@ class AskTask:
             return chunk.frames[camera]
 
         known = None if evidence is None else known_parts(evidence, kept)
-        asked = Asked(question, buffer.query, config.model_seed, known, frames)
-        answered = self._answerer.answer(asked)
-        right = answered.letter == question.letters[question.right]
-        own = answered.calls is not None
+        prompted = Prompted(question, buffer.query, config.model_seed, known, frames)
+        answer = self._responder.answer(prompted)
+        right = answer.letter == question.letters[question.right]
+        own = answer.calls is not None
+        tokens = stored_count(answer.tokens)
+        faults = (answer.letter is None) + (tokens != answer.tokens)
         row = self._run.row(
             item,
             seed=buffer.query.seed,
@@ -114,18 +112,18 @@ class AskTask:
             lesson_share=lesson_share(buffer.sessions, given) if given else None,
             evidence_kept=None if evidence is None else evidence_kept(evidence, kept),
             **retrieval_columns(self._selector, buffer, given),
-            answer=answered.letter,
+            answer=answer.letter,
             chance=question.chance,
-            model_calls=answered.calls,
-            model_tokens=answered.tokens,
-            model_faults=int(answered.letter is None) if own else None,
-            model_s=round(answered.seconds, 4) if answered.seconds is not None else None,
+            model_calls=answer.calls,
+            model_tokens=tokens,
+            model_faults=faults if own else None,
+            model_s=round(answer.seconds, 4) if answer.seconds is not None else None,
             wall_s=round(time.perf_counter() - began, 4),
         )
         if own:
             line = {
-                **{"question": question.text, "prompt": answered.prompt, "text": answered.text},
-                **{"answer": answered.letter, "right": question.letters[question.right]},
+                **{"question": question.text, "prompt": answer.prompt, "text": answer.text},
+                **{"answer": answer.letter, "right": question.letters[question.right]},
             }
-            worker.send_file(*record_file("answers", item, [line]))
+            worker.send_file(*transcript_file("answers", item, [line]))
         return row

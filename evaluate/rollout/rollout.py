@@ -16,7 +16,8 @@ from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RolloutError
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
-from robomme_interference_data.evaluate.run.config import Run, RunConfig
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.kind import Run, stored_count
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.subgoals.writer import History, SubgoalWriter
 from robomme_interference_data.evaluate.systems import check_history, name_system
@@ -229,11 +230,13 @@ def retrieval_columns(
 def _model_columns(writer: SubgoalWriter | None) -> dict[str, Any]:
     if writer is None:
         return {}
-    tokens = [turn.tokens for turn in writer.turns if turn.tokens is not None]
+    counts = [turn.tokens for turn in writer.turns if turn.tokens is not None]
+    tokens = stored_count(sum(counts)) if counts else None
+    wrong = sum(turn.fault is not None for turn in writer.turns)
     return {
         "model_calls": sum(turn.calls for turn in writer.turns),
-        "model_tokens": sum(tokens) if tokens else None,
-        "model_faults": sum(turn.fault is not None for turn in writer.turns),
+        "model_tokens": tokens,
+        "model_faults": wrong + (bool(counts) and tokens is None),
     }
 
 

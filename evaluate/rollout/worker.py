@@ -1,10 +1,11 @@
 """What a worker of a run does: one rollout after the other."""
 
+import logging
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
-from robomme_interference_data.cli.console import say
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.data.loading import load_split
@@ -14,15 +15,17 @@ from robomme_interference_data.errors import (
     WorkerRetiredError,
     first_line,
 )
-from robomme_interference_data.evaluate.policies.identity import plain
+from robomme_interference_data.evaluate.policies.identity import plain, policy_metadata
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.run.config import RetrievalConfig, Run, RunConfig
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.identity import make_selector, package_versions
+from robomme_interference_data.evaluate.run.kind import Job, Run
 from robomme_interference_data.evaluate.run.log import clip_name
 from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.versions import package_versions
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
+from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.rollouts import Rollout, Status
@@ -35,76 +38,121 @@ from robomme_interference_data.simulators.registry import (
 
 from .clips import Clip
 from .rollout import run_rollout
-from .transcripts import record_file
+from .transcripts import transcript_file
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a worker opens before the first job: the `simulator`, or the policy's `server`."""
+
+    what: str
 
 
 class RolloutTask:
     """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.
 
     What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
-    that broke is used again. Clips, subgoals and the log of a server that it started are handed
-    in.
+    that broke is used again. Clips, subgoals and the log of a server that it started are sent.
 
     Args:
         run: The run.
-        said: What the policy said of itself when the run began.
     """
 
-    def __init__(self, run: Run[RunConfig], said: Mapping[str, Any]):
-        self._run, self._said = run, said
+    def __init__(self, run: Run[RunConfig]):
+        self._run = run
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
+        self._checked = False  # whether the policy is what the run began with
         self._writer: SubgoalWriter | None = None
         self._split: Split | None = None
         self._logs: dict[str, bytes] = {}
         self._selector: Selector | None = None
 
-    def __call__(self, task: WorkItem, worker: Worker) -> tuple[Rollout, str | None]:
-        """Run a rollout; return its row, and what befell its clip, or None.
+    def __call__(self, task: Job | Opening, worker: Worker) -> Any:
+        """Run a rollout; return its row, and what befell its clip, or None. Or open something.
 
         Raises:
             WorkerRetiredError: The policy's server is gone, or another than when the run began.
             Exception: Whatever broke in the rollout.
         """
-        clip = Clip(task, self._run.system, worker.folder) if self._run.config.videos else None
         try:
-            row = self._roll(task, worker, clip)
+            if isinstance(task, Opening):
+                return self._open(task, worker)
+            return self._run_job(task, worker)
+        except Exception:
+            self.close()
+            raise
+
+    def _open(self, opening: Opening, worker: Worker) -> Any:
+        """Open the simulator; or the policy, and return what it reports, and if it keeps frames.
+
+        Whether it does is asked only where that is known of the system.
+        """
+        policy = self._open_policy(worker)
+        if opening.what == "simulator":
+            self._open_simulator(policy, worker)
+            return None
+        known = name_system(self._run.system).keeps_frames is not None
+        return (
+            policy_metadata(self._run.config.policy, policy),
+            cast("Any", policy).keeps_frames() if known else None,
+        )
+
+    def _run_job(self, job: Job, worker: Worker) -> tuple[Rollout, str | None]:
+        item, config = job.item, self._run.config
+        clip = Clip(item, self._run.system, worker.folder) if config.videos else None
+        try:
+            row = self._roll(job, worker, clip)
         except Exception as error:
             what = f"{type(error).__name__}: {first_line(error)}"
-            self._hand_in(task, worker, clip, Status.ERROR, what)
-            self.close()
+            self._send_files(item, worker, clip, Status.ERROR, what)
             if isinstance(error, ServerKeepaliveError):
-                say(f"{task}: {error.message}. A rollout that ends so is begun again, once.")
-            if isinstance(error, PolicyServerError) and self._run.config.serve is None:
+                logger.warning("%s: %s. It is started again, once.", item, error.message)
+            if isinstance(error, PolicyServerError) and config.serve is None:
+                self.close()
                 self._check_server(worker)
             raise
         # Whatever became of what is to be looked at, the rollout ended as it did.
-        self._hand_in(task, worker, clip, Status(row.status))
+        self._send_files(item, worker, clip, Status(row.status))
         return row, clip.problem if clip else None
 
-    def _roll(self, item: WorkItem, worker: Worker, clip: Clip | None) -> Rollout:
+    def _open_policy(self, worker: Worker) -> Policy:
+        config = self._run.config
+        if self._policy is None:
+            self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
+            self._checked = False
+        return self._policy
+
+    def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
+        config = self._run.config
+        if self._simulator is None:
+            options = simulator_options(config, policy.cameras)
+            with worker.limit(config.simulator_timeout, "the simulator's start"):
+                self._simulator = make_simulator(config.simulator, **options)
+        return self._simulator
+
+    def _roll(self, job: Job, worker: Worker, clip: Clip | None) -> Rollout:
         config = self._run.config
         if self._split is None:
             self._split = load_split(config.split, cache=config.cache, threads=1)
             self._selector = make_selector(config)
-        if self._policy is None:
-            self._policy = make_policy(config.policy, config.policy_options, worker=worker.number)
-            self._check_served(self._policy)
-            self._hand_in_logs(worker)
+        policy = self._open_policy(worker)
+        if not self._checked:
+            self._check_served(policy, job.metadata)
+            self._send_logs(worker)
+            self._checked = True
         if self._writer is None:
             self._writer = make_writer(config)
-        if self._simulator is None:
-            options = simulator_options(config, self._policy.cameras)
-            with worker.limit(config.simulator_timeout, "the simulator's start"):
-                self._simulator = make_simulator(config.simulator, **options)
         return run_rollout(
             self._run,
-            item,
-            simulator=self._simulator,
-            policy=self._policy,
+            job.item,
+            simulator=self._open_simulator(policy, worker),
+            policy=policy,
             split=self._split,
             selector=self._selector,
             writer=self._writer,
@@ -128,7 +176,7 @@ class RolloutTask:
                     thing.close()
         self._policy = self._simulator = self._writer = None
 
-    def _hand_in(
+    def _send_files(
         self,
         item: WorkItem,
         worker: Worker,
@@ -136,21 +184,21 @@ class RolloutTask:
         status: Status,
         error: str | None = None,
     ) -> None:
-        """Hand in the subgoals of a rollout, its clip, and logs of servers that it started."""
-        self._hand_in_logs(worker)
+        """Send the subgoals of a rollout, its clip, and logs of servers that it started."""
+        self._send_logs(worker)
         if status is not Status.ERROR:
             self._logs.clear()
         if self._writer is not None:
-            worker.send_file(*record_file("subgoals", item, map(to_dict, self._writer.turns)))
+            worker.send_file(*transcript_file("subgoals", item, map(to_dict, self._writer.turns)))
         if clip is not None:
             clip.close(status, error)
             if clip.data is not None:
                 worker.send_file(clip_name(item), clip.data)
 
-    def _hand_in_logs(self, worker: Worker) -> None:
-        """Hand in what servers that the worker started have printed.
+    def _send_logs(self, worker: Worker) -> None:
+        """Send what servers that the worker started have printed.
 
-        Of one that broke again with the next rollout: what an attempt hands in may be lost.
+        Of one that broke again with the next rollout: the files of an attempt may be lost.
         """
         server: Any = self._policy
         if self._run.config.serve is not None and server is not None:
@@ -158,14 +206,14 @@ class RolloutTask:
         for log in self._logs.items():
             worker.send_file(*log)
 
-    def _check_served(self, policy: Policy) -> None:
+    def _check_served(self, policy: Policy, began: Mapping[str, Any]) -> None:
         """Retire the worker if the server that it reaches is not what the run began with."""
-        if "server_metadata" not in self._said:
+        if "server_metadata" not in began:
             return
-        said, first = (one["server_metadata"] for one in (plain(policy.metadata()), self._said))
-        if said != first:
+        found, first = (one["server_metadata"] for one in (plain(policy.metadata()), began))
+        if found != first:
             raise WorkerRetiredError(
-                f"a worker's policy server says {said} of itself; the run began with {first}",
+                f"a worker's policy server reports {found}; the run began with {first}",
                 "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
             )
 
@@ -179,15 +227,6 @@ class RolloutTask:
             raise WorkerRetiredError(error.message, error.hint) from error
         finally:
             policy.close()
-
-
-def make_selector(config: RetrievalConfig) -> "Selector | None":
-    """Make the retrieval step of a run, None if it has none; see `Selector` for its errors."""
-    if config.retrieval is None:
-        return None
-    from robomme_interference_data.retrieval.selector import Selector
-
-    return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
 
 
 def simulator_options(config: RunConfig, watched: Iterable[str]) -> dict[str, Any]:

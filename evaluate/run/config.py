@@ -1,17 +1,16 @@
 """The settings of a run, each declared once: what Python gives, and the options of `evaluate`."""
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from robomme_interference_data.constants import PROTOCOL_VERSION, SAMPLE_FRAMES
+from robomme_interference_data.constants import SAMPLE_FRAMES, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import WorkersConfig
-from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
-
-from .plan import WorkItem
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,51 +142,35 @@ class CeilingConfig(RetrievalConfig):
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
 
 
-def unusual_retrieval(config: RetrievalConfig) -> dict[str, str]:
-    """Return in what the retrieval step is not the paper's: setting to value.
+def check_shared(config: WorkConfig) -> None:
+    """Check the settings that both kinds of work share, by themselves.
 
     Raises:
-        InvalidOptionError: Something is, and there is no retrieval step.
+        InvalidOptionError: One is not what it may be.
     """
-    usual = {one.name: one.default for one in fields(RetrievalConfig) if one.name != "retrieval"}
-    found = {name: value for name in usual if (value := getattr(config, name)) != usual[name]}
+    for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
+        value = getattr(config, name, 1)
+        if not 0 < value < math.inf:
+            raise InvalidOptionError.expected(
+                name, value, "more than 0", "Leave it out for the default."
+            )
+    if config.episode_split not in SPLITS:
+        raise InvalidOptionError.one_of("episode_split", config.episode_split, SPLITS)
+    Rule.parse(config.retrieval_rule)
+    non_default_retrieval(config)
+
+
+def non_default_retrieval(config: RetrievalConfig) -> dict[str, str]:
+    """Return the settings of the retrieval step that are not the paper's.
+
+    Raises:
+        InvalidOptionError: There are some, and no retrieval step.
+    """
+    defaults = {one.name: one.default for one in fields(RetrievalConfig) if one.name != "retrieval"}
+    found = {name: value for name in defaults if (value := getattr(config, name)) != defaults[name]}
     for name in found if config.retrieval is None else ():
         raise InvalidOptionError(
-            f"--{name.replace('_', '-')} says nothing without a retrieval step",
-            "Add --retrieval ENCODER, such as --retrieval siglip, or leave it out.",
+            f"`{name}` has no effect without a retrieval step",
+            'Set `retrieval`, such as retrieval="siglip", or leave it out.',
         )
     return found
-
-
-@dataclass(frozen=True)
-class Run[C: RunConfig | AskConfig]:
-    """A run whose settings were checked: what its workers need, and what all its rows say.
-
-    Attributes:
-        config: Its settings; the system is named, and a model on the Hub has its commit.
-        system: Name under which its rows stand.
-        split: Label of the split in its rows.
-        revision: `Split.revision`.
-    """
-
-    config: C
-    system: str
-    split: str
-    revision: str
-
-    def row(self, item: WorkItem, **values: Any) -> Rollout:
-        """Return the row of a rollout: `values`, and what makes it the one that it is."""
-        return Rollout(
-            system=self.system,
-            simulator=self.config.simulator,
-            split=self.split,
-            revision=self.revision,
-            family=item.episode.family,
-            condition=item.condition,
-            episode_split=item.episode.split,
-            episode=item.episode.index,
-            shift=self.config.shift,
-            model_seed=self.config.model_seed,
-            protocol_version=PROTOCOL_VERSION,
-            **values,
-        )

@@ -1,61 +1,54 @@
-"""What makes a run the one that it is, and what the record says of a start of it."""
+"""What makes a run the one that it is, and what the record says of an invocation."""
 
 import dataclasses
 import datetime
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.data.buffer_set import Split
-from robomme_interference_data.evaluate.policies.identity import plain, policy_identity
-from robomme_interference_data.evaluate.rollout.worker import make_selector
-from robomme_interference_data.evaluate.subgoals.registry import subgoals_identity
+from robomme_interference_data.evaluate.policies.identity import plain
+from robomme_interference_data.simulators.registry import simulator_class
 
 from .config import AskConfig, RetrievalConfig, RunConfig
-from .log import Start
+from .kind import RunKind
+from .log import Invocation
 from .plan import Plan
-from .versions import package_versions
+
+if TYPE_CHECKING:
+    from robomme_interference_data.retrieval.selector import Selector
 
 
-def run_identity(
-    config: RunConfig,
-    system: str,
-    split: Split,
-    plan: Plan,
-    said: Mapping[str, Any],
-    written: Mapping[str, Any],
-    versions: Mapping[str, str],
-) -> dict[str, Any]:
-    """Return what makes the run the one that it is, as plain values.
-
-    Args:
-        config: Its settings.
-        system: Name under which its rows stand.
-        split: The split.
-        plan: What is asked for.
-        said: What the policy says of itself.
-        written: What writes its subgoals says of itself; empty if nothing does.
-        versions: Of the simulator.
-    """
+def run_identity(kind: RunKind[Any], plan: Plan) -> dict[str, Any]:
+    """Return what can change a result, as plain values: it makes the run the one that it is."""
+    config = kind.config
     return {
-        "system": system,
+        "system": kind.system,
         "simulator": config.simulator,
-        "simulator_version": dict(versions),
-        "revision": split.revision,
+        "revision": kind.split.revision,
         "episode_split": config.episode_split,
         "shift": config.shift,
         "model_seed": config.model_seed,
-        "retrieval_index": retrieval_index(config, split, plan),
-        "subgoals": subgoals_identity(config, written),
+        "retrieval_index": _retrieval_index(config, kind.split, plan),
         "protocol_version": PROTOCOL_VERSION,
-        **policy_identity(config.policy, config.policy_options, said),
+        **kind.identity(plan),
     }
 
 
-def retrieval_index(config: RetrievalConfig, split: Split, plan: Plan) -> Any:
+def make_selector(config: RetrievalConfig) -> "Selector | None":
+    """Make the retrieval step of a run, None if it has none; see `Selector` for its errors."""
+    if config.retrieval is None:
+        return None
+    from robomme_interference_data.retrieval.selector import Selector
+
+    return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
+
+
+def _retrieval_index(config: RetrievalConfig, split: Split, plan: Plan) -> Any:
     """Return what the retrieval step's choices depend on; None without one.
 
     Looks for the index of every dataset that a planned condition needs.
@@ -69,24 +62,39 @@ def retrieval_index(config: RetrievalConfig, split: Split, plan: Plan) -> Any:
     return plain(found)
 
 
-def start_of(
-    config: RunConfig | AskConfig,
-    plan: Plan,
-    said: Mapping[str, Any],
-    versions: Mapping[str, str],
-    command: Sequence[str],
-) -> Start:
-    """Return what is recorded of a start that begins now."""
-    return Start(
+def invocation(kind: RunKind[Any], plan: Plan, command: Sequence[str]) -> Invocation:
+    """Return what is recorded of an invocation that begins now."""
+    return Invocation(
         command=tuple(map(plain, command)),
-        settings=plain(dataclasses.asdict(config)),
+        settings=plain(dataclasses.asdict(kind.config)),
         plan=plan,
-        versions=package_versions(config) | dict(versions),
+        versions=package_versions(kind.config) | dict(kind.versions),
         git=_git(),
         machine=platform.machine(),
-        policy=dict(said),
+        policy=dict(kind.metadata),
         started=now(),
     )
+
+
+def package_versions(config: RunConfig | AskConfig) -> dict[str, str]:
+    """Return the versions of Python and of what a run uses, by name; what is missing is left out.
+
+    RoboMME's interpreter has others: see `simulator_versions`.
+    """
+    names = ["robomme-interference-data", "numpy", "av", "torch"]
+    if isinstance(config, RunConfig) and config.policy.startswith("lerobot:"):
+        names.append("lerobot")
+    if config.retrieval is not None:
+        names.append("transformers")
+    if isinstance(config, RunConfig):
+        names += simulator_class(config.simulator).packages
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
 
 
 def now() -> str:

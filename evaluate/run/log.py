@@ -17,7 +17,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.errors import FormatError, RunFolderError, first_line
+from robomme_interference_data.errors import FormatError, RunFolderError, first_line, visible
 from robomme_interference_data.schema.codec import arrow_schema, from_dict, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
 from robomme_interference_data.storage.files import (
@@ -53,8 +53,8 @@ def clip_name(item: WorkItem) -> str:
 
 
 @dataclass(frozen=True)
-class Start:
-    """One start of the command: its settings, what was asked for, and where it ran.
+class Invocation:
+    """One invocation of the command: its settings, its plan, and where it ran.
 
     Attributes:
         command: The command line; empty from Python.
@@ -99,7 +99,7 @@ class RunHeader:
     status: str = "running"
     planned: int = 0
     counts: dict[str, int] = field(default_factory=dict)
-    starts: tuple[Start, ...] = ()
+    starts: tuple[Invocation, ...] = ()
     merged: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -132,7 +132,7 @@ class RunLog:
     def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
         self.folder, self.header, self.rows = folder, header, rows
 
-    def begin(self, start: Start) -> None:
+    def begin(self, start: Invocation) -> None:
         """Note a start of the command."""
         plans = self.header.plans
         plans += () if start.plan in plans else (start.plan,)
@@ -148,7 +148,7 @@ class RunLog:
         path = self.folder / RUN_RECORD
         try:
             with path.open("ab") as file:
-                file.write(_line(row))
+                file.write(row_line(row))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:  # from writing, it names no file
@@ -157,12 +157,12 @@ class RunLog:
             log = self.folder / ERRORS_LOG
             with log.open("a", encoding="utf-8", errors="backslashreplace") as file:
                 file.write(f"{row.finished_at} {WorkItem.of(row)}, attempt {row.attempt}\n")
-                file.write(f"{trace.rstrip()}\n\n")
+                file.write(f"{visible(trace.rstrip())}\n\n")
 
     def write_all(self, rows: Iterable[Rollout]) -> None:
         """Write all rows anew, whole or not at all."""
         with atomic_path(self.folder / RUN_RECORD) as partial:
-            partial.write_bytes(b"".join(map(_line, rows)))
+            partial.write_bytes(b"".join(map(row_line, rows)))
 
     def end(self, header: RunHeader) -> None:
         """Export the tables, in canonical order, and write a header with how the folder stands."""
@@ -255,9 +255,7 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
         return rows
     for number, line in enumerate(whole_lines(path).splitlines(), 1):
         try:
-            row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
-            if b"\\u" in line:  # half of a character, which no table can hold
-                canonical_json(to_dict(row)).encode()
+            row = row_of(line)
             item = WorkItem.of(row)
             if item in rows and is_done(rows[item]):
                 raise ValueError(f"it is a second one of {item}")
@@ -270,6 +268,23 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
             ) from None
         rows[item] = row
     return rows
+
+
+def row_of(line: bytes) -> Rollout:
+    """Read a line of a record.
+
+    Raises:
+        ValueError: It is no row, or holds what no table can hold.
+    """
+    row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
+    if b"\\u" in line:  # half of a character
+        canonical_json(to_dict(row)).encode()
+    return row
+
+
+def row_line(row: Rollout) -> bytes:
+    """Return a row's line in a record."""
+    return (canonical_json(to_dict(row)) + "\n").encode()
 
 
 def whole_lines(record: Path) -> bytes:
@@ -317,7 +332,3 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             flat[prefix + name] = repr(value)
     return flat
-
-
-def _line(row: Rollout) -> bytes:
-    return (canonical_json(to_dict(row)) + "\n").encode()

@@ -1,4 +1,4 @@
-"""Join the shards of a run: one folder, and what is missing or double in it."""
+"""Join the shards of a run: one folder, and what is missing or duplicated in it."""
 
 import shutil
 from collections.abc import Sequence
@@ -32,8 +32,8 @@ class Merged:
         planned: Rollouts that the shards together were to run.
         missing: Planned rollouts without a row.
         broken: Rollouts whose row is an error.
-        double: Rollouts that more than one shard finished; the first shard's row is kept.
-        differing: Those of them that did not end alike.
+        duplicates: Rollouts that more than one shard finished; the first shard's row is kept.
+        conflicts: Those of them that did not end alike.
     """
 
     folder: Path
@@ -41,8 +41,8 @@ class Merged:
     planned: int
     missing: tuple[WorkItem, ...]
     broken: tuple[WorkItem, ...]
-    double: tuple[WorkItem, ...]
-    differing: tuple[WorkItem, ...]
+    duplicates: tuple[WorkItem, ...]
+    conflicts: tuple[WorkItem, ...]
 
 
 def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
@@ -61,9 +61,9 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     for folder, (header, _) in zip(folders, runs, strict=True):
         check_same_run(folder, header.identity, first.identity)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise RunFolderError(f"{target} is there already", "Give a new folder to --out.")
+        raise RunFolderError(f"{target} is there already", "Give a new folder.")
     found: dict[WorkItem, tuple[Rollout, Path]] = {}
-    double: dict[WorkItem, bool] = {}
+    duplicates: dict[WorkItem, bool] = {}
     for folder, (_, rows) in zip(folders, runs, strict=True):
         for item, own in rows.items():
             row = replace(own, split=first.split)
@@ -71,7 +71,9 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
             if before is None or (is_done(row) and not is_done(before[0])):
                 found[item] = row, folder
             elif is_done(row):
-                double[item] = double.get(item, False) or _outcome(row) != _outcome(before[0])
+                duplicates[item] = duplicates.get(item, False) or _outcome(row) != _outcome(
+                    before[0]
+                )
     headers = [header for header, _ in runs]
     plans = [replace(plan, shard="1/1") for header in headers for plan in header.plans]
     joined = replace(
@@ -99,8 +101,8 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         len(items),
         tuple(item for item in items if item not in found),
         tuple(item for item in sorted(found) if not is_done(found[item][0])),
-        tuple(sorted(double)),
-        tuple(sorted(item for item, differs in double.items() if differs)),
+        tuple(sorted(duplicates)),
+        tuple(sorted(item for item, differs in duplicates.items() if differs)),
     )
 
 

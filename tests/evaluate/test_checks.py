@@ -32,13 +32,12 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.run import checks
-from robomme_interference_data.evaluate.run.checks import (
+from robomme_interference_data.evaluate.rollout.checks import (
     check_plan,
     check_settings,
-    check_simulator,
     default_system,
 )
+from robomme_interference_data.evaluate.rollout.worker import simulator_options
 from robomme_interference_data.evaluate.run.plan import plan_work
 from robomme_interference_data.evaluate.systems import name_system
 from robomme_interference_data.runtime.executor import Serial
@@ -69,9 +68,9 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"episodes": "0-9"}, UnknownNameError, "no query episode"),
         ({"episode_split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
-        ({"workers": 0}, InvalidOptionError, "--workers 0; expected more than 0"),
-        ({"rollout_timeout": float("nan")}, InvalidOptionError, "--rollout-timeout nan"),
-        ({"simulator_timeout": float("inf")}, InvalidOptionError, "--simulator-timeout inf"),
+        ({"workers": 0}, InvalidOptionError, "workers 0; expected more than 0"),
+        ({"rollout_timeout": float("nan")}, InvalidOptionError, "rollout_timeout nan"),
+        ({"simulator_timeout": float("inf")}, InvalidOptionError, "simulator_timeout inf"),
         ({"system": "pi05_baseline"}, InvalidOptionError, "pi05_baseline takes no history, so k0"),
         (
             {"system": "retrieval-framesamp-modul", "retrieval": "thumbnail"},
@@ -80,8 +79,8 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "and none is given"),
         ({"system": "Perceptual_FrameSamp_Modul"}, UnknownNameError, "reads like the system"),
-        ({"retrieval_rule": "oracle"}, InvalidOptionError, "--retrieval-rule says nothing"),
-        ({"retrieval_camera": "wrist"}, InvalidOptionError, "--retrieval-camera says nothing"),
+        ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
+        ({"retrieval_camera": "wrist"}, InvalidOptionError, "`retrieval_camera` has no effect"),
         ({"retrieval": "thumbnail", "retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
         ({"retrieval": "thumbnail", "retrieval_rule": "best!"}, UnknownNameError, "best!"),
         ({"retrieval": "thumbnail"}, MissingIndexError, "'thumbnail'"),
@@ -182,33 +181,24 @@ def test_the_simulator_is_made_before_the_folder_and_only_for_rollouts_that_are_
             raise NoRendererError("no driver", "Install one.")
         return World()
 
-    working = 2  # once to see, once to run
+    working = 1
     monkeypatch.setitem(SIMULATORS, "sample", make)
     sample = {"simulator": "sample"}
     whole = run_one(tmp_path / "whole", **sample)
-    assert (len(whole.rows), len(made)) == (1, 2)
+    assert (len(whole.rows), len(made)) == (1, 1)
     with pytest.raises(NoRendererError):
         run_one(tmp_path / "run", **sample)
     assert not (tmp_path / "run").exists()
     assert run_one(tmp_path / "whole", **sample).rows == whole.rows
-    assert len(made) == 3
+    assert len(made) == 2
     with pytest.raises(NoRendererError):
         run_one(tmp_path / "whole", conditions=("no-history", "k0"), **sample)
 
 
-def test_only_what_somebody_looks_at_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[dict[str, Any]] = []
-
-    def make(name: str, **options: Any) -> Any:
-        asked.append(options)
-        raise NoRendererError("no driver")
-
+def test_only_what_somebody_looks_at_is_drawn() -> None:
     def options(name: str, *watched: str, **changes: Any) -> dict[str, Any]:
-        with pytest.raises(NoRendererError):
-            check_simulator(config(simulator=name, **changes), watched, Serial())
-        return asked[-1]
+        return simulator_options(config(simulator=name, **changes), watched)
 
-    monkeypatch.setattr(checks, "make_simulator", make)
     assert options("tabletop") == {"cameras": (), "shift": "none"}
     assert options("tabletop", shift="light:2") == {"cameras": (), "shift": "light:2"}
     assert options("tabletop", "wrist")["cameras"] == ("wrist",)
@@ -232,9 +222,8 @@ def test_recall_needs_evidence(tiny_split: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(split, "query", lambda episode: known[episode])
     settings = config(policy="recall:window")
     plan = plan_work(split.episode_ids, conditions=("k0",))
-    policy = make_policy(settings.policy)
     with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
-        check_plan(settings, name_system("recall-window"), split, policy, plan)
+        check_plan(settings, name_system("recall-window"), split, plan, plan.items())
     assert "docs/sources.md" in (raised.value.hint or "")
 
 

@@ -107,7 +107,7 @@ def test_a_stop_tells_of_rollouts_only_where_there_are_some(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_module, "run_items" if begun else "check_plan", stop)
+    monkeypatch.setattr(run_module, "_run_items" if begun else "plan_work", stop)
     line = f"evaluate --policy hold {USUAL} --families MoveCube --split {tiny_split}"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 130 and "go on with:\nrobomme-interference" in done.stderr
@@ -127,4 +127,4 @@ def test_merge_tells_what_is_missing_and_double(tmp_path: Path) -> None:
     told = json.loads(type_in(f"{line} {tmp_path / 'again'} --json").stdout)
     assert (told["planned"], told["rows"], len(told["missing"])) == (2, 1, 1)
     assert told["missing"][0]["episode"] == "MoveCube/test/0"
-    assert told["differing"] == told["broken"] == []
+    assert told["conflicts"] == told["broken"] == []

@@ -88,7 +88,7 @@ def test_where_a_server_listens_makes_no_other_run(tmp_path: Path) -> None:
         serve("one", first, shard="1/2")
         serve("two", second, shard="2/2")
         merged = merge_runs([tmp_path / "one", tmp_path / "two"], tmp_path / "merged")
-        assert merged.missing == merged.double == ()
+        assert merged.missing == merged.duplicates == ()
         again = serve("merged", second, policy_options=("response_s=30",))
         assert again.counts["fail"] == 2
         addresses = {start["policy"]["server"] for start in header(tmp_path / "merged")["starts"]}

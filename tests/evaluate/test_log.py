@@ -1,15 +1,27 @@
 """The files of a run, held against golden ones, and what is no record."""
 
 import json
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.run.log import open_log, read_record, read_run
+from robomme_interference_data.evaluate.policies.identity import plain
+from robomme_interference_data.evaluate.run.kind import stored_count
+from robomme_interference_data.evaluate.run.log import (
+    open_log,
+    read_record,
+    read_run,
+    row_line,
+    row_of,
+)
 from robomme_interference_data.schema.codec import to_dict
+from robomme_interference_data.storage.files import canonical_json, parse_json
 from robomme_interference_data.storage.parquet import open_parquet
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "run"
@@ -43,6 +55,21 @@ def test_a_killed_run_stands_as_its_record_says(tmp_path: Path) -> None:
     header, _ = read_run(out)
     assert (header.status, header.planned) == ("incomplete", 3)
     assert header.counts == {"success": 1, "fail": 0, "timeout": 1, "error": 0}
+
+
+@given(
+    tokens=st.integers(),
+    metadata=st.recursive(
+        st.integers() | st.integers(10**300, 10**5000) | st.text() | st.floats(allow_nan=False),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    ),
+)
+def test_numbers_from_outside_can_be_read_again(tokens: int, metadata: Any) -> None:
+    row = replace(ROWS[0], model_tokens=stored_count(tokens))
+    assert row_of(row_line(row)) == row
+    with suppress(ValueError):  # an infinity, which is refused before the run
+        stored = plain(metadata)
+        assert parse_json(canonical_json(stored).encode(), "it") == stored
 
 
 @given(cut=st.integers(0, 2000))

@@ -30,7 +30,7 @@ def test_shards_make_the_run(tmp_path: Path) -> None:
     assert [header(folder)["status"] for folder in folders] == ["complete"] * 3
     merged = merge_runs(folders, tmp_path / "merged")
     assert untimed(merged.rows) == untimed(whole.rows)
-    assert (merged.planned, merged.missing, merged.broken, merged.double) == (4, (), (), ())
+    assert (merged.planned, merged.missing, merged.broken, merged.duplicates) == (4, (), (), ())
     found, one = header(tmp_path / "merged"), header(tmp_path / "whole")
     for name in ("identity", "plans", "counts", "planned", "status", "split"):
         assert found[name] == one[name]
@@ -61,8 +61,8 @@ def test_a_finished_row_stands_before_an_error(tmp_path: Path, trouble: Path) ->
     both = [tmp_path / "broken", tmp_path / "whole"]
     for number, order in enumerate((both, both[::-1])):
         merged = merge_runs(order, tmp_path / f"merged-{number}")
-        assert merged.broken == merged.missing == merged.differing == ()
-        assert len(merged.double) == 3
+        assert merged.broken == merged.missing == merged.conflicts == ()
+        assert len(merged.duplicates) == 3
         assert untimed(merged.rows) == untimed(whole.rows)
         assert "world fell apart" in (merged.folder / "errors.log").read_text()
     only = merge_runs([tmp_path / "broken"], tmp_path / "merged-2")
@@ -77,9 +77,9 @@ def test_double_rollouts_that_differ_are_told_apart(tmp_path: Path) -> None:
     changed["steps"] -= 1
     log.write_text(json.dumps(changed) + "\n" + "".join(others))
     merged = merge_runs([a.folder, b.folder], tmp_path / "merged")
-    assert len(merged.double) == 4
+    assert len(merged.duplicates) == 4
     episode = EpisodeId(changed["family"], "test", changed["episode"])
-    assert merged.differing == (WorkItem(changed["condition"], episode),)
+    assert merged.conflicts == (WorkItem(changed["condition"], episode),)
     assert merged.rows == a.rows
 
 

@@ -2,7 +2,9 @@
 
 import fcntl
 import shutil
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from support.runs import header, run, run_one, untimed
 from support.worlds import World
 
 from robomme_interference_data.errors import RunFolderError, SimulatorCrashError
+from robomme_interference_data.evaluate.rollout import worker
 from robomme_interference_data.evaluate.run.log import read_record
 from robomme_interference_data.runtime.executor import Outcome, Serial
 
@@ -105,7 +108,7 @@ def test_the_header_says_how_the_folder_stands_from_the_start_and_after_ctrl_c(
     out = tmp_path / "run"
     impatient = Impatient(out)
     with pytest.raises(KeyboardInterrupt):
-        run(out, listener=impatient)
+        run(out, progress=impatient)
     begun = impatient.seen
     assert (begun["status"], begun["planned"]) == ("running", 4)
     assert set(begun["counts"].values()) == {0} and begun["starts"][0]["ended"] is None
@@ -186,6 +189,21 @@ def test_words_that_no_file_can_hold_end_no_run(tmp_path: Path) -> None:
     assert header(tmp_path / "said")["identity"]["policy_metadata"]["checkpoint"] == r"caf\udce9"
 
 
+def test_a_number_that_no_file_can_hold_is_an_error_of_its_rollout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    roll = worker.run_rollout
+    monkeypatch.setattr(
+        worker, "run_rollout", lambda *args, **named: replace(roll(*args, **named), seed=10**30)
+    )
+    (row,) = run_one(tmp_path / "run").rows
+    assert row.status == "error" and "cannot be stored: " in str(row.error)
+    assert read_record(tmp_path / "run")
+    says = "python:support.own_policies:says"
+    run_one(tmp_path / "said", policy=says, policy_options=("what=huge",))
+    assert header(tmp_path / "said")["identity"]["policy_metadata"]["checkpoint"] == hex(10**5000)
+
+
 def test_a_run_in_which_everything_breaks_stops(tmp_path: Path, trouble: Path) -> None:
     for family in ("VideoRepick", "MoveCube"):
         (trouble / f"{family}-0").write_text("raise")
@@ -197,6 +215,10 @@ def test_a_run_in_which_everything_breaks_stops(tmp_path: Path, trouble: Path) -
 
 def test_without_any_worker_the_run_stops_with_why(tmp_path: Path) -> None:
     class Lost(Serial):
+        @contextmanager
+        def session(self, function: Any) -> Iterator[Any]:
+            yield self
+
         def run(self, *_: Any, **__: Any) -> Generator[Outcome]:
             yield from ()
             raise SimulatorCrashError("nobody is left")

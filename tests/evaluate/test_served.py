@@ -38,7 +38,7 @@ def test_a_worker_starts_its_server_and_ends_it(tmp_path: Path) -> None:
     result = serve(tmp_path / "run", "--pids", tmp_path / "pids")
     assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * 4
     pids = (tmp_path / "pids").read_text().split()
-    assert len(pids) == 2  # one to be asked what it is, and the worker's
+    assert len(pids) == 1  # the one that was asked what it is serves the rollouts
     assert not any(psutil.pid_exists(int(pid)) for pid in pids)
     (log,) = (tmp_path / "run" / "servers").iterdir()
     assert log.name.endswith("-0.log") and log.read_text().startswith("serving at 18")
@@ -111,7 +111,7 @@ def test_it_has_to_say_what_it_serves(tmp_path: Path) -> None:
 
 def test_a_worker_whose_server_says_something_else_does_no_rollout(tmp_path: Path) -> None:
     with pytest.raises(WorkerRetiredError, match="'other'"):
-        serve(tmp_path / "run", "--differs", tmp_path / "asked")
+        serve(tmp_path / "run", "--differs", tmp_path / "asked", "--dies", tmp_path / "died")
     assert (tmp_path / "run" / "rollouts.jsonl").read_text() == ""
 
 

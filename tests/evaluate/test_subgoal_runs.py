@@ -30,7 +30,7 @@ from robomme_interference_data.errors import (
     RunFolderError,
 )
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.run.checks import check_settings, default_system
+from robomme_interference_data.evaluate.rollout.checks import check_settings, default_system
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import OracleWriter
 from robomme_interference_data.schema.subgoal import Subgoal

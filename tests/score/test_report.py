@@ -15,7 +15,7 @@ from support import scoring as made
 from support.browser import open_page
 from support.scoring import BASE, OWN, RETRIEVAL, cells
 
-from robomme_interference_data.evaluate.run.log import Start
+from robomme_interference_data.evaluate.run.log import Invocation
 from robomme_interference_data.evaluate.run.plan import Plan
 from robomme_interference_data.evaluate.score.plots.curves import Data
 from robomme_interference_data.evaluate.score.plots.figures import (
@@ -41,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows[place] = replace(rows[place], video=VIDEO)
     rows[place + 1] = replace(rows[place + 1], video="videos/gone.mp4")
     starts = tuple(
-        Start(
+        Invocation(
             command=(f"robomme-interference evaluate --out 'my run' --shard {shard}/2",),
             settings={},
             plan=Plan({"MoveCube/test": "0-5"}, ("k0",)),

@@ -10,8 +10,8 @@ from support.tabletop import QUERIES, TABLETOP
 from robomme_interference_data import load_split
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.evaluate import RunResult
-from robomme_interference_data.evaluate.questions.ask import run_examination
 from robomme_interference_data.evaluate.run.config import AskConfig
+from robomme_interference_data.evaluate.run.evaluation import run_evaluation
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Serial
 
@@ -29,12 +29,12 @@ def right_letter(episode: EpisodeId) -> str:
 
 
 def ask(
-    out: Path, *, executor: Executor | None = None, listener: Any = None, **changes: Any
+    out: Path, *, executor: Executor | None = None, progress: Any = None, **changes: Any
 ) -> RunResult:
     """Ask all questions under k0, unless told otherwise."""
     usual: dict[str, Any] = {"model": "recall", "split": TABLETOP, "conditions": ("k0",)}
     config = AskConfig(out=out, **usual | changes)
-    return run_examination(config, executor=executor or Serial(), listener=listener)
+    return run_evaluation(config, executor=executor or Serial(), progress=progress)
 
 
 def behind(server: ChatServer, **changes: Any) -> dict[str, Any]:

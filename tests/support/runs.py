@@ -9,7 +9,7 @@ from support import worlds
 
 from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
-from robomme_interference_data.evaluate.run.config import Run
+from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Serial
@@ -37,10 +37,10 @@ def config(**changes: Any) -> RunConfig:
 
 
 def run(
-    out: Path, executor: Executor | None = None, *, listener: Any = None, **changes: Any
+    out: Path, executor: Executor | None = None, *, progress: Any = None, **changes: Any
 ) -> RunResult:
     settings = config(out=out, **changes)
-    return run_evaluation(settings, executor=executor or Serial(), listener=listener)
+    return run_evaluation(settings, executor=executor or Serial(), progress=progress)
 
 
 def run_one(out: Path, **changes: Any) -> RunResult:

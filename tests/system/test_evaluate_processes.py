@@ -199,10 +199,10 @@ def test_servers_that_go_away_cost_no_rollout(tmp_path: Path, monkeypatch: Any) 
     served |= {"conditions": CONDITIONS}
     with servers(2) as (stops, urls):
         monkeypatch.setenv("SERVERS", urls)
-        result = runs.run(tmp_path / "one", Processes(2), listener=Stopper(stops[1:]), **served)
+        result = runs.run(tmp_path / "one", Processes(2), progress=Stopper(stops[1:]), **served)
         assert [(row.status, row.attempt) for row in result.rows] == [("fail", 1)] * ROLLOUTS
         with pytest.raises(WorkerRetiredError, match="cannot be reached"):
-            runs.run(tmp_path / "two", Processes(1), listener=Stopper(stops[:1]), **served)
+            runs.run(tmp_path / "two", Processes(1), progress=Stopper(stops[:1]), **served)
     rows = read_record(tmp_path / "two")
     assert 1 <= len(rows) < ROLLOUTS and {row.status for row in rows.values()} == {"fail"}
     header = json.loads((tmp_path / "two" / "run.json").read_text())
@@ -222,7 +222,7 @@ def test_servers_that_workers_start_end_with_the_command(
     running = start(tmp_path / "run", 0.05, policy="websocket", words=words)
     wait_for_rows(tmp_path / "run", 2, running)
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
-    assert len(pids) == 3  # one was asked what it is; then one beside each worker
+    assert len(pids) == 2  # one beside each worker
     os.killpg(running.pid, sent)
     running.communicate(timeout=60)
     wait_until_gone(pids)

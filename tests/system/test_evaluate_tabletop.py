@@ -9,7 +9,7 @@ from support.runs import untimed
 
 from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.run.checks import check_simulator
+from robomme_interference_data.evaluate.rollout.checks import check_simulator
 from robomme_interference_data.runtime.executor import Processes
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")

@@ -1,17 +1,13 @@
 """All that can be known to be wrong with a run before its first rollout."""
 
-import math
 import re
-from collections.abc import Iterable
-from functools import partial
-from typing import Any
+from collections.abc import Sequence
 
-from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
+from robomme_interference_data.constants import DEMONSTRATIONS
 from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
-    SimulatorCrashError,
 )
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
@@ -19,8 +15,12 @@ from robomme_interference_data.evaluate.policies.registry import (
     parse_policy,
     policy_options,
 )
-from robomme_interference_data.evaluate.rollout.clips import check_drawing
-from robomme_interference_data.evaluate.rollout.worker import simulator_options
+from robomme_interference_data.evaluate.run.config import (
+    RunConfig,
+    check_shared,
+    non_default_retrieval,
+)
+from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
 from robomme_interference_data.evaluate.subgoals.prompt import load_prompt
 from robomme_interference_data.evaluate.subgoals.writer import ORACLE
 from robomme_interference_data.evaluate.systems import (
@@ -31,18 +31,15 @@ from robomme_interference_data.evaluate.systems import (
     name_system,
 )
 from robomme_interference_data.retrieval.select import Rule
-from robomme_interference_data.runtime.executor import Executor, Worker
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.simulators.registry import (
     SIMULATORS,
     check_shift,
     find_simulator,
-    make_simulator,
     simulator_class,
 )
 
-from .config import RunConfig, WorkConfig, unusual_retrieval
-from .plan import Plan, WorkItem
+from .clips import check_drawing
 
 READS_SUBGOALS = ("websocket", "python", "obey")
 """Kinds of policies that may read subgoals."""
@@ -74,21 +71,7 @@ def default_system(config: RunConfig) -> str:
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     if config.retrieval is None:
         return name
-    return "-".join(("retrieval", name, *unusual_retrieval(config).values())).replace("/", "-")
-
-
-def check_positive(config: WorkConfig) -> None:
-    """Check numbers that have to be above 0.
-
-    Raises:
-        InvalidOptionError: One is not.
-    """
-    for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
-        value = getattr(config, name, 1)
-        if not 0 < value < math.inf:
-            raise InvalidOptionError.expected(
-                "--" + name.replace("_", "-"), value, "more than 0", "Leave it out for the default."
-            )
+    return "-".join(("retrieval", name, *non_default_retrieval(config).values())).replace("/", "-")
 
 
 def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
@@ -102,17 +85,13 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
     """
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
-    check_positive(config)
-    if config.episode_split not in SPLITS:
-        raise InvalidOptionError.one_of("--episode-split", config.episode_split, SPLITS)
+    check_shared(config)
     if policy.privileged and not simulator_class(config.simulator).scripted:
         raise InvalidOptionError(
             f"the policy {config.policy} asks the simulator for actions, and {config.simulator} "
             "gives none",
             "Run it on another simulator, such as tabletop, or take another policy.",
         )
-    Rule.parse(config.retrieval_rule)
-    unusual_retrieval(config)
     step = [] if config.retrieval is None else [config.retrieval_camera]
     for camera in (*policy.history_cameras, *step):
         split.datasets[DEMONSTRATIONS].shape(camera)  # refuses one that is not there
@@ -176,32 +155,16 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
             )
 
 
-def applicable(config: RunConfig, system: System, split: Split, policy: Policy) -> tuple[str, ...]:
-    """Return the conditions that the split has and that apply to system and policy."""
-    reads = _reads_history(config, policy)
-    return tuple(name for name in split.conditions if _refusal(system, reads, name) is None)
-
-
-def _reads_history(config: RunConfig, policy: Policy) -> bool:
-    """Whether the policy, or a model that writes its subgoals, does anything with a history."""
-    return policy.wants_history or config.subgoals is not None
-
-
 def check_plan(
-    config: RunConfig, system: System, split: Split, policy: Policy, plan: Plan
-) -> tuple[WorkItem, ...]:
-    """Check every rollout of a plan, and return them.
+    config: RunConfig, system: System, split: Split, plan: Plan, items: Sequence[WorkItem]
+) -> None:
+    """Check every rollout of a plan.
 
     Raises:
         InvalidOptionError: A condition does not apply, or the split is of another simulator.
         UnknownNameError: The split has no buffers for a condition.
         HistoryTooLongError: A buffer exceeds the system's position limit.
     """
-    items = plan.items()
-    for name in plan.conditions:
-        if (refusal := _refusal(system, _reads_history(config, policy), name)) is not None:
-            raise refusal
-        split.manifest(split.episode_ids[0], name)  # is refused with what there is
     recalls = parse_policy(config.policy).kind == "recall"
     own = ":" in config.simulator  # a simulator of one's own may serve any episodes
     for episode in dict.fromkeys(item.episode for item in items):
@@ -228,38 +191,11 @@ def check_plan(
             if WorkItem(name, manifest.episode_id) in planned:
                 longest[name] = max(manifest.history_frames, longest[name])
         check_history(system, longest)
-    return items
 
 
-def check_simulator(config: RunConfig, watched: Iterable[str], executor: Executor) -> None:
-    """Make the simulator once, by the executor, as a broken driver may end its process.
-
-    One of the user's own is made by the workers only.
-
-    Raises:
-        NoRendererError: This machine cannot draw its pictures.
-        MissingExtraError: Its libraries are not installed, or RoboMME's interpreter lacks it.
-        SimulatorCrashError: It cannot be made for another reason.
-    """
-    if config.simulator not in SIMULATORS:
-        return
-    tasks = [simulator_options(config, watched)]
-    make = partial(_make_once, config.simulator)
-    for outcome in executor.run(make, tasks, time_limit=config.simulator_timeout, attempts=1):
-        if isinstance(outcome.error, InterferenceError):
-            raise outcome.error
-        if outcome.error is not None:
-            raise SimulatorCrashError(
-                f"the {config.simulator} simulator cannot be made: {outcome.error}",
-                "robomme-interference doctor tells what works on this machine.",
-            )
-
-
-def _make_once(name: str, options: dict[str, Any], worker: Worker) -> None:
-    make_simulator(name, **options).close()
-
-
-def _refusal(system: System, reads_history: bool, condition: str) -> InterferenceError | None:
+def condition_refusal(
+    system: System, reads_history: bool, condition: str
+) -> InterferenceError | None:
     """Return why a condition does not apply, or None."""
     if condition != NO_HISTORY and not (system.with_history and reads_history):
         who = "the policy" if system.with_history else system.name

@@ -27,7 +27,7 @@ CONTROLS = ("none", "blank", "text")
 
 
 @dataclass(frozen=True)
-class Asked:
+class Prompted:
     """A question, with what may be known of the past.
 
     Attributes:
@@ -52,7 +52,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Answered:
+class Answer:
     """An answer, for row and record.
 
     Attributes:
@@ -70,7 +70,7 @@ class Answered:
     seconds: float | None = None
 
 
-class Answerer(ABC):
+class Responder(ABC):
     """Answers questions, one at a time, and keeps nothing from one to the next.
 
     Attributes:
@@ -81,7 +81,7 @@ class Answerer(ABC):
     images: int | None = None
 
     @abstractmethod
-    def answer(self, asked: Asked) -> Answered:
+    def answer(self, prompted: Prompted) -> Answer:
         """Answer.
 
         Raises:
@@ -96,46 +96,46 @@ class Answerer(ABC):
         """Release everything."""
 
 
-class Guesser(Answerer):
+class Guesser(Responder):
     """`guess`: draws an option."""
 
-    def answer(self, asked: Asked) -> Answered:
+    def answer(self, prompted: Prompted) -> Answer:
         """Draw from all options."""
-        return Answered(asked.draw(asked.question.letters))
+        return Answer(prompted.draw(prompted.question.letters))
 
     def metadata(self) -> dict[str, Any]:
         """Return its name."""
         return {"model": "guess"}
 
 
-class Recaller(Answerer):
+class Recaller(Responder):
     """`recall`: the ideal observer. It draws from the options that agree with what frames show."""
 
-    def answer(self, asked: Asked) -> Answered:
+    def answer(self, prompted: Prompted) -> Answer:
         """Draw from the options that cannot be ruled out; from all, if all can be.
 
         Raises:
             FormatError: The question's options are not answers that its scene allows.
         """
-        question, scene = asked.question, recorded_scene(asked.query)
+        question, scene = prompted.question, recorded_scene(prompted.query)
         if scene is None or max(question.answers) >= len(scene.answers):
             raise FormatError(
                 f"the options of {question.episode_id} are no answers that its scene allows",
                 "recall needs a simulator whose possible answers are known, such as tabletop.",
             )
-        left = {scene.choice(answer) for answer in scene.agreeing(asked.known or {})}
+        left = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
         choices = [scene.choice(scene.answers[number]) for number in question.answers]
         fits = [
             one for one, choice in zip(question.letters, choices, strict=True) if choice in left
         ]
-        return Answered(asked.draw("".join(fits) or question.letters))
+        return Answer(prompted.draw("".join(fits) or question.letters))
 
     def metadata(self) -> dict[str, Any]:
         """Return its name."""
         return {"model": "recall"}
 
 
-class ModelAnswerer(Answerer):
+class ModelResponder(Responder):
     """A vision-language model.
 
     Args:
@@ -149,7 +149,7 @@ class ModelAnswerer(Answerer):
         self.images = None if control == "text" else model.images
         self._prompt, self._sha256 = load_prompt(prompt)
 
-    def answer(self, asked: Asked) -> Answered:
+    def answer(self, prompted: Prompted) -> Answer:
         """Ask the model.
 
         Raises:
@@ -159,19 +159,19 @@ class ModelAnswerer(Answerer):
         views: dict[str, list[Any]] = {"<history>": [], "<picture>": []}
         if self._control != "text":
             try:
-                views["<picture>"] = [decode_image(asked.question.picture)]
+                views["<picture>"] = [decode_image(prompted.question.picture)]
             except FormatError as error:
-                raise error.about(f"the question of {asked.question.episode_id}") from None
-            frames = asked.frames()
+                raise error.about(f"the question of {prompted.question.episode_id}") from None
+            frames = prompted.frames()
             if self._control == "blank":
                 frames = np.full_like(frames, 128)
             if len(frames):
                 views["<history>"] = [Video(frames, FPS)]
-        messages = self._prompt.fill(asked.query.goal, asked.question, views)
+        messages = self._prompt.fill(prompted.query.goal, prompted.question, views)
         reply = self._model.reply(messages)
-        letter = read_letter(reply.text, asked.question.letters)
+        letter = read_letter(reply.text, prompted.question.letters)
         told_parts = told(messages[-1].parts)
-        return Answered(letter, told_parts, reply.text, reply.tokens, reply.calls, reply.seconds)
+        return Answer(letter, told_parts, reply.text, reply.tokens, reply.calls, reply.seconds)
 
     def metadata(self) -> dict[str, Any]:
         """Return what the model says of itself, and the SHA-256 of the prompt's file."""
@@ -186,9 +186,9 @@ OWN = {"recall": Recaller, "guess": Guesser}
 """Who answers without a model."""
 
 
-def make_answerer(config: AskConfig) -> Answerer:
+def make_responder(config: AskConfig) -> Responder:
     """Make who answers, in this process; see `make_model` and `load_prompt` for errors."""
     if config.model in OWN:
         return OWN[config.model]()
     model = make_model(config.model, config.model_options)
-    return ModelAnswerer(model, config.prompt, config.control)
+    return ModelResponder(model, config.prompt, config.control)

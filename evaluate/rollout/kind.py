@@ -1,0 +1,127 @@
+"""Rollouts as the work of a run: what is checked of them, and what identifies their run."""
+
+import dataclasses
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.errors import (
+    InterferenceError,
+    PolicyServerError,
+    SimulatorCrashError,
+)
+from robomme_interference_data.evaluate.policies.identity import (
+    check_kind,
+    check_served,
+    describe_policy,
+    hold_servers,
+    policy_identity,
+)
+from robomme_interference_data.evaluate.policies.registry import pin_policy, served_policy
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.kind import Run, RunKind
+from robomme_interference_data.evaluate.run.plan import Plan, WorkItem
+from robomme_interference_data.evaluate.subgoals.registry import (
+    describe_subgoals,
+    pin_subgoals,
+    subgoals_identity,
+)
+from robomme_interference_data.evaluate.systems import name_system
+from robomme_interference_data.runtime.executor import Session
+from robomme_interference_data.simulators.registry import SIMULATORS, simulator_versions
+
+from .checks import check_plan, check_settings, condition_refusal, default_system
+from .worker import Opening, RolloutTask
+
+
+class Rollouts(RunKind[RunConfig]):
+    """Rollouts of a policy in a simulator."""
+
+    def __init__(self, config: RunConfig, split: Split):
+        policy = served_policy(config.policy, config.serve)
+        config = dataclasses.replace(config, policy=policy)
+        self.system = config.system or default_system(config)
+        # One commit for all workers.
+        policy, subgoals = pin_policy(policy), pin_subgoals(config.subgoals)
+        super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), split)
+
+    def claim(self, folder: Path) -> AbstractContextManager[None]:
+        """Keep other runs from the policy's servers."""
+        return hold_servers(self.config.policy, folder)
+
+    def prepare(self) -> None:
+        """Check the settings; ask what the policy is, and what writes its subgoals."""
+        config = self.config
+        self._policy, self._of_policy = describe_policy(
+            config.policy, config.policy_options, workers=config.workers
+        )
+        check_settings(config, self.system, self.split, self._policy)
+        self._system = name_system(self.system)
+        self.config, self._of_subgoals = describe_subgoals(config, self._system)
+        self.metadata = self._of_policy | self._of_subgoals
+        self.versions = simulator_versions(config.simulator, config.robomme_python)
+
+    def refusal(self, condition: str) -> InterferenceError | None:
+        """Return why a condition does not apply to the system and its policy, or None."""
+        # A policy without memory may have a model that reads the history for it.
+        reads = self._policy.wants_history or self.config.subgoals is not None
+        return condition_refusal(self._system, reads, condition)
+
+    def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
+        """Check every rollout."""
+        check_plan(self.config, self._system, self.split, plan, items)
+
+    def task(self, run: Run[RunConfig]) -> RolloutTask:
+        """Return what rolls out."""
+        return RolloutTask(run)
+
+    def needs_session(self, todo: Sequence[WorkItem]) -> bool:
+        """Whether there is work, or a server that only workers start has to be asked."""
+        return bool(todo) or self.config.serve is not None
+
+    def open(self, session: Session, todo: Sequence[WorkItem]) -> None:
+        """Have a worker start the policy's server, and the simulator, before the first rollout.
+
+        A simulator of the user's own is made at the first rollout.
+
+        Raises:
+            PolicyServerError: The server ends, cannot be reached, or is not what the system's is.
+            InvalidOptionError: It cannot be started, or nobody says which checkpoint it serves.
+            NoRendererError: This machine cannot draw the simulator's pictures.
+            SimulatorCrashError: The simulator cannot be made for another reason.
+        """
+        config = self.config
+        if config.serve is not None:
+            self._of_policy, keeps = _opened(session, "server", None)
+            check_served(config.policy, config.policy_options, self._system, self._of_policy, keeps)
+            self.metadata = self._of_policy | self._of_subgoals
+        if todo:
+            if config.simulator in SIMULATORS:
+                _opened(session, "simulator", config.simulator_timeout)
+            check_kind(config.policy, config.policy_options, self._system)
+
+    def identity(self, plan: Plan) -> dict[str, Any]:
+        """Return what of simulator, policy and subgoals can change a result."""
+        config = self.config
+        return {
+            "simulator_version": dict(self.versions),
+            "subgoals": subgoals_identity(config, self._of_subgoals),
+            **policy_identity(config.policy, config.policy_options, self._of_policy),
+        }
+
+
+def _opened(session: Session, what: str, time_limit: float | None) -> Any:
+    (outcome,) = session.run([Opening(what)], time_limit=time_limit, attempts=1)
+    if isinstance(outcome.error, InterferenceError):
+        raise outcome.error
+    if outcome.error is not None and what == "server":
+        raise PolicyServerError(f"the policy's server cannot be started: {outcome.error}")
+    if outcome.error is not None:
+        raise SimulatorCrashError(
+            f"the simulator cannot be made: {outcome.error}",
+            "Check what works on this machine.",
+            "doctor",
+        )
+    return outcome.value
