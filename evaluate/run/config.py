@@ -7,7 +7,6 @@ from typing import ClassVar
 
 from robomme_interference_data.constants import SAMPLE_FRAMES, SPLITS
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.select import Rule
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.settings import setting
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP
@@ -148,6 +147,8 @@ def check_shared(config: WorkConfig) -> None:
     Raises:
         InvalidOptionError: One is not what it may be.
     """
+    from robomme_interference_data.retrieval.select import Rule
+
     for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
         value = getattr(config, name, 1)
         if not 0 < value < math.inf:

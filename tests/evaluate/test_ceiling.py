@@ -72,7 +72,7 @@ def test_what_cannot_be_told(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) 
         ceiling(split, CeilingConfig("framesmap"))
     with pytest.raises(UnknownNameError, match="k9"):
         ceiling(split, CeilingConfig(conditions=("k9",)))
-    with pytest.raises(InvalidOptionError, match="--retrieval-rule says nothing"):
+    with pytest.raises(InvalidOptionError, match="`retrieval_rule` has no effect"):
         ceiling(split, CeilingConfig(retrieval_rule="last"))
     with pytest.raises(InvalidOptionError, match="nothing to retrieve from under no-history"):
         ceiling(split, CeilingConfig(retrieval="thumbnail", conditions=("no-history", "k0")))
