@@ -128,7 +128,7 @@ def test_keepalive_ends_a_rollout_by_an_error_of_its_own(call: str) -> None:
 def test_such_a_rollout_is_begun_again_once(
     tmp_path: Path,
     world: None,
-    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
     times: int,
     status: str,
     attempt: int,
@@ -136,7 +136,7 @@ def test_such_a_rollout_is_begun_again_once(
     with compiling(None, "prompt", times).running() as server:
         result = run_one(tmp_path / "run", policy=server.url, policy_options=NAMED)
     assert [(row.status, row.attempt) for row in result.rows] == [(status, attempt)]
-    told = [line for line in capsys.readouterr().err.splitlines() if "begun again" in line]
+    told = [line for line in caplog.text.splitlines() if "started again" in line]
     assert len(told) == times
     assert all("MoveCube/test/0" in line and "keepalive" in line for line in told)
 
