@@ -68,25 +68,6 @@ def test_a_port_that_never_answers_is_told_soon_and_given_up(
     assert caplog.messages == [f"Waiting until policy server {where}, for 0.6 s at most …"]
 
 
-def test_a_server_that_starts_late_is_waited_for(caplog: pytest.LogCaptureFixture) -> None:
-    with listening(-1) as port:
-        server = PolicyServer(port=port)
-
-    def begin() -> None:
-        time.sleep(0.3)
-        running.__enter__()
-
-    running = server.running()
-    thread = threading.Thread(target=begin)
-    thread.start()
-    with client(server) as policy:
-        rollout(policy, 0, [], [])
-    thread.join()
-    running.__exit__(None, None, None)
-    assert len(server.calls) == 3
-    assert not caplog.messages  # that was no time
-
-
 @pytest.mark.parametrize(
     ("status", "words"),
     [
@@ -131,15 +112,6 @@ def test_a_server_that_was_restarted_is_connected_again_at_the_next_reset() -> N
         rollout(policy, 2, [2], [])
         policy.close()
     assert server.connections == 2
-
-
-def test_a_connection_that_broke_between_rollouts_costs_none(server: PolicyServer) -> None:
-    answers = iter([PolicyServer.CLOSE])
-    with client(server) as policy:
-        rollout(policy, 0, [], [])
-        server.before = lambda message: next(answers, None)
-        rollout(policy, 4, [4], [])
-    assert server.memory.count == 5
 
 
 @pytest.mark.parametrize("call", ["prompt", "reset"])

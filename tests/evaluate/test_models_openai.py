@@ -22,11 +22,9 @@ from support.chat_server import (
     EMPTY,
     ENDLESS,
     GARBAGE,
-    GONE,
     LOCKED,
     REFUSED,
     SLOW,
-    UNCOUNTED,
     ChatServer,
 )
 
@@ -44,7 +42,6 @@ from robomme_interference_data.evaluate.models.registry import (
     model_identity,
     parse_model,
 )
-from robomme_interference_data.storage.encode import png
 
 NOISE = np.random.default_rng(0).integers(0, 256, (20, 33, 21, 3), dtype=np.uint8)
 ASKED = [Message("system", ("be brief",)), Message("user", ("what is it? ", NOISE[0]))]
@@ -145,12 +142,6 @@ def test_what_goes_on_failing_is_one_error(server: ChatServer, fault: str, words
     assert len(server.seen) == 3
 
 
-def test_several_faults_in_one_question(server: ChatServer) -> None:
-    server.faults = [BUSY, GARBAGE, BROKEN, EMPTY, CLOSED]
-    reply = model_of(server).reply(ASKED)
-    assert (reply.calls, len(server.seen)) == (6, 6)
-
-
 @pytest.mark.parametrize("fault", [SLOW, DRIPS, DRIPS_HEADERS])
 def test_no_whole_answer_in_time(server: ChatServer, fault: str) -> None:
     server.faults = [fault] * 2
@@ -189,12 +180,6 @@ def test_what_no_repetition_mends(
     assert len(server.seen) == 1
 
 
-def test_tokens_that_nobody_counted(server: ChatServer) -> None:
-    server.faults = [UNCOUNTED]
-    reply = model_of(server).reply(ASKED)
-    assert (reply.text, reply.tokens, reply.calls) == ("1 images", None, 1)
-
-
 def test_a_wrong_model_is_told_with_those_that_are_served(server: ChatServer) -> None:
     with pytest.raises(ModelError, match="serves no model 'small'") as raised:
         model_of(server, name="small").reply(ASKED)
@@ -212,13 +197,6 @@ def test_a_key_that_is_none_is_refused_and_not_told(
     assert key not in str(raised.value)
 
 
-def test_a_model_that_is_gone_is_not_asked_again(server: ChatServer) -> None:
-    server.faults = [GONE]
-    with pytest.raises(ModelError, match="answers 404"):
-        model_of(server).reply(ASKED)
-    assert len(server.seen) == 1
-
-
 def test_a_wrong_model_is_told_before_the_first_question(server: ChatServer) -> None:
     with pytest.raises(ModelError, match="serves no model 'small'") as raised:
         model_of(server, name="small").metadata()
@@ -233,13 +211,6 @@ def test_nobody_there() -> None:
         model = make_model(f"openai:{url}#tiny", ["repeats=1"])
         with pytest.raises(ModelError, match="cannot be reached"):
             getattr(model, call)(*([ASKED] if call == "reply" else []))
-
-
-def test_another_page_is_no_endpoint(server: ChatServer) -> None:
-    model = make_model(f"openai:{server.url.removesuffix('/v1')}#tiny")
-    with pytest.raises(ModelError, match="answers 404") as raised:
-        model.metadata()
-    assert "/v1" in str(raised.value.hint)
 
 
 # --- how models are written ----------------------------------------------------------------------
@@ -282,9 +253,3 @@ def test_what_makes_a_model_the_one_that_it_is() -> None:
     assert here == model_identity("openai:http://other/v1#m", ["images=9", "repeats=1"], said)
     assert here != model_identity("openai:http://h/v1#m", ["images=8"], said)
     assert (here["kind"], here["model"], here["options"]["images"]) == ("openai", "m", 9)
-
-
-def test_png_keeps_every_pixel() -> None:
-    with av.open(io.BytesIO(png(NOISE[3]))) as container:
-        [frame] = container.decode(video=0)
-    assert np.array_equal(frame.to_ndarray(format="rgb24"), NOISE[3])

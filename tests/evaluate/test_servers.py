@@ -81,13 +81,6 @@ def test_a_server_of_the_other_kind_is_refused(
         assert len(server.calls) == asked_before
 
 
-def test_every_server_of_a_run_is_asked(server: PolicyServer) -> None:
-    with PolicyServer(Memoryless()).running() as other:
-        both = f"{server.url},127.0.0.1:{other.port}"
-        with pytest.raises(PolicyServerError, match=f":{other.port} acts without any frame"):
-            check_kind(both, NAMED, name_system(FRAMES))
-
-
 def test_another_error_says_nothing_of_the_kind(server: PolicyServer) -> None:
     server.before = lambda message: "no key 'x'" if "prompt" in message else None
     with pytest.raises(PolicyServerError, match="reports: no key 'x'"):
@@ -141,12 +134,6 @@ def test_such_a_rollout_is_begun_again_once(
     assert all("MoveCube/test/0" in line and "keepalive" in line for line in told)
 
 
-def test_a_server_may_compile_while_it_is_asked_for_its_kind() -> None:
-    with compiling(Memoryless(), "prompt").running() as server:
-        check_kind(server.url, NAMED, name_system(NONE))
-        assert server.connections == 2
-
-
 # --- locks -------------------------------------------------------------------------------------
 
 
@@ -184,15 +171,6 @@ def test_two_runs_never_drive_one_server(tmp_path: Path, world: None, server: Po
     # A killed run holds nothing.
     result = run_one(tmp_path / "second", policy=server.url, policy_options=NAMED)
     assert result.counts["fail"] == 1
-
-
-def test_a_run_lets_its_servers_go(tmp_path: Path) -> None:
-    url = "websocket://[::1]:8013,gpu1:8013"
-    for _ in range(2):
-        with hold_servers(url, tmp_path), hold_servers("websocket://gpu2:8013", tmp_path):
-            pass
-    with hold_servers("replay", tmp_path), hold_servers("replay", tmp_path):  # has none
-        pass
 
 
 def test_without_a_place_for_locks_a_run_goes_on(

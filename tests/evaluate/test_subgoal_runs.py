@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import openai
 import pytest
 from support.chat_server import (
@@ -65,13 +64,6 @@ def test_before_each_chunk_and_every_16_steps_at_least(single: bool, acts: int) 
     assert (row.model_calls, row.model_tokens, row.model_faults) == (0, None, 0)
 
 
-def test_without_a_writer_there_are_none() -> None:
-    policy = Told()
-    row = roll("no-history", policy)
-    assert policy.told == [None] * 3
-    assert (row.model_calls, row.model_tokens, row.model_s) == (None, None, None)
-
-
 # --- servers -------------------------------------------------------------------------------------
 
 
@@ -122,16 +114,6 @@ def test_an_endpoint_that_goes_away_costs_no_row(tmp_path: Path) -> None:
         second = run(tmp_path, **settings)
     assert [row.status for row in second.rows] == ["fail"] * 4
     assert sorted(row.attempt for row in second.rows) == [1, 1, 2, 2]
-
-
-def test_what_the_model_is_shown(tmp_path: Path, tiny_split: Path) -> None:
-    with ChatServer() as server:
-        run_one(tmp_path, **asking(server, conditions=("k1",)))
-        images = server.seen[0].images
-    buffer = load_split(tiny_split).load("MoveCube/test/0", "k1")
-    frames = buffer.frames("front")[[0, 26, 52, 79]]  # of 80, four evenly spread
-    assert all(np.array_equal(*pair) for pair in zip(images[:4], frames, strict=True))
-    assert np.array_equal(images[4], buffer.query.frame("front"))
 
 
 # --- what makes the run the one that it is -------------------------------------------------------

@@ -106,16 +106,6 @@ def test_what_cannot_be_used_leaves_the_subgoal_and_is_counted(text: str) -> Non
     ]
 
 
-def test_a_new_rollout_begins_anew() -> None:
-    model = Scripted("lift it", "")
-    writer = begun(model)
-    told(writer, 0, 0)
-    buffer = split_here().load("MoveCube/test/0", "no-history")
-    writer.start(History(buffer, range(0)), RolloutInfo("other", 0, 0), None)
-    assert writer.turns == []
-    assert told(writer, 0, 0) == Subgoal("other")
-
-
 def memer(*keyframes: Sequence[int]) -> Callable[..., Any]:
     said = [json.dumps({"subgoal": "go on", "keyframes": list(one)}) for one in keyframes]
     return Scripted(*said)  # type: ignore[return-value]
@@ -140,12 +130,6 @@ def test_key_frames_are_kept_near_ones_merged_and_shown_again() -> None:
     assert values(model.asked[2]) == [2, 16, *range(18, 33, 2)]
     assert values(model.asked[3]) == [2, 16, *range(34, 49, 2)]
     assert [turn.keyframes for turn in writer.turns] == [(0,), (2, 16), (2, 16), (2, 16, 48)]
-
-
-def test_a_frame_that_was_not_shown_cannot_be_kept() -> None:
-    writer = begun(memer([2]), prompt="memer")
-    told(writer, 0, 0)
-    assert writer.turns[0].fault is not None and writer.turns[0].keyframes == ()
 
 
 def test_the_record_says_what_was_asked_without_the_images() -> None:

@@ -4,7 +4,7 @@ import pytest
 from support.retrieval import made
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.retrieval.calibrate import Calibration, calibrate, sweep_steps
+from robomme_interference_data.retrieval.calibrate import Calibration, calibrate
 from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.retrieval.select import Rule, Similarities
 
@@ -93,13 +93,3 @@ def test_nothing_to_fit() -> None:
     with pytest.raises(InvalidOptionError, match="without any session of two frames"):
         found_in(short)
     assert found_in(*three()[:2]).held_out == ()  # one family
-
-
-def test_sweep_steps() -> None:
-    found = sweep_steps(0.80, 0.99)
-    assert len(found) == 20
-    assert found[:2] == [0.80, 0.81] and found[-1] == 0.99
-    assert sweep_steps(0.5, 0.5) == [0.5]
-    for first, last in ((0.9, 0.8), (-2, 0), (0, 2)):
-        with pytest.raises(InvalidOptionError, match="the lower one first"):
-            sweep_steps(first, last)

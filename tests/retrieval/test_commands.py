@@ -60,19 +60,6 @@ def test_index(own_split: Path, run: Run) -> None:
 # --- retrieval-score ---------------------------------------------------------------------------
 
 
-def test_the_table_by_family_and_condition(run: Run, indexed: Path) -> None:
-    code, out, err = run("retrieval-score", indexed)
-    assert code == 0 and "buffers/s" in err
-    assert "3 of 15 buffers hold no lesson and are left out" in err
-    title, _, heads, rule, *rest = out.splitlines()
-    assert title == "Retrieval on split, encoder thumbnail, camera front, rule max/adaptive"
-    assert heads.split()[:3] == ["family", "condition", "queries"] and set(rule) == {"-", " "}
-    counts = dict.fromkeys(FAMILIES, "1") | {"all": "3"}
-    rows = [line.split()[:3] for line in rest[: rest.index("")]]
-    assert rows == [[family, name, counts[family]] for family in counts for name in CONDITIONS]
-    assert out.splitlines()[-1].startswith("Cells of a family and a condition that pass: max/")
-
-
 def test_only_what_is_asked_for(run: Run, indexed: Path) -> None:
     picked = ("--families", "PatternLock,MoveCube", "--conditions", "k3,no-history")
     code, out, err = run("retrieval-score", indexed, *picked)
@@ -227,16 +214,6 @@ def test_why_wherever_the_lesson_lies(
     live = buffer.query.frame()
     drawing.draw_retrieval(buffer, measured, choice, found, live, tmp_path / "why.svg")
     assert said.rpartition(": ")[2] in (tmp_path / "why.svg").read_text()
-
-
-def test_what_was_chosen_may_be_in_several_parts(run: Run, indexed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "why.svg"
-    options = ("--split", indexed, "--rule", "top32", "--out", out)
-    code, told, _ = run("retrieve", EPISODE, "k3", *options)
-    chosen = json.loads(run("retrieve", EPISODE, "k3", *options[:4], "--json")[1])["chosen"]
-    assert code == 0 and out.exists() and len(chosen) > 1
-    assert sum(stop - start for start, stop in chosen) == 32
-    assert f"Chosen: frames {chosen[0][0]} to {chosen[0][1] - 1} and " in told
 
 
 # --- calibrate ---------------------------------------------------------------------------------

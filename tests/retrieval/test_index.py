@@ -15,7 +15,6 @@ from support.retrieval import (
     QUIET,
     Interrupted,
     TwoSums,
-    change_header,
     files_of,
     make_index,
     remade,
@@ -109,11 +108,6 @@ def test_normalising(features: np.ndarray, centred: bool) -> None:
     assert found * lengths == pytest.approx(exact, rel=1e-5, abs=1e-5)
 
 
-def test_nothing_is_left_of_the_centre() -> None:
-    rows = normalised(np.array([[3, 4], [1, 1]]), np.array([1, 1], np.float32))
-    assert rows[0] == pytest.approx([2 / 13**0.5, 3 / 13**0.5]) and not rows[1].any()
-
-
 def test_datasets_that_a_buffer_does_not_need_may_lack_an_index(
     indexed: Path, tiny_split: Path
 ) -> None:
@@ -184,13 +178,6 @@ def test_what_is_missing_or_damaged_is_made_again(
         path.write_bytes((path.read_bytes()[:-2] if path.exists() else b"") + b"xx")
     assert make_index(own_split) == again
     assert files_of(own_split) == files_of(indexed)
-
-
-def test_an_index_of_another_device_is_kept(indexed: Path, own_split: Path) -> None:
-    shutil.copytree(indexed, own_split, dirs_exist_ok=True)
-    header = own_split / "demonstrations/index/thumbnail/index.json"
-    change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
-    assert make_index(own_split) == [0, 0]
 
 
 # --- refusals ----------------------------------------------------------------------------------

@@ -57,18 +57,6 @@ def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
     assert title.endswith("encoder thumbnail, camera front, shift camera:2, rule max/adaptive")
 
 
-def test_the_film_strip_shows_what_the_robot_sees(run: Run, seen: Path, tmp_path: Path) -> None:
-    pictures = []
-    for shift in ("none", "light:1", "clutter:3"):
-        out = tmp_path / f"{shift[:5]}.png"
-        words = ("show", QUERIES[0], "k1", "--split", seen, "--shift", shift, "--out", out)
-        assert run(*words)[0] == 0
-        pictures.append(out.read_bytes())
-    assert pictures[0] == pictures[1] != pictures[2]
-    code, out, err = run("show", QUERIES[0], "k1", "--split", seen, "--shift", "light:1")
-    assert (code, out) == (1, "") and "--out strip.png" in err
-
-
 def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split: Path) -> None:
     code, _, err = run("retrieval-score", own_split, "--shift", "light:2")
     assert code == 1 and "Only a split that was built from tabletop" in err
@@ -91,13 +79,6 @@ def test_views_of_other_scenes_are_refused(
 ) -> None:
     with pytest.raises(SourceError, match=told):
         add_shifted(own_split, *families, kind=kind)
-
-
-def test_damage_is_found(seen: Path, tmp_path: Path) -> None:
-    split = shutil.copytree(seen, tmp_path / "split")
-    (split / SHIFTED / "meta" / "tasks.parquet").write_bytes(b"damaged")
-    where = [one.where for one in verify_split(load_split(split), decode=False)]
-    assert "shifted/meta/tasks.parquet" in where
 
 
 def test_retrieve_shows_what_the_robot_sees_under_a_shift(

@@ -162,11 +162,6 @@ def test_simulate_plays_an_episode_and_writes_what_is_seen(run: Run, tmp_path: P
     assert abs(frames[8][18, 1] - 200).max() < 40  # the front camera; the wrist's is 99
 
 
-def test_simulate_can_play_the_demonstration_only(run: Run) -> None:
-    told = json.loads(run(*EPISODE, "--json", "--policy", "none")[1])
-    assert (told["status"], told["steps"]) == ("ongoing", 0)
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -123,11 +123,9 @@ def test_it_tells_its_own_subgoal(simulator: RoboMMESimulator) -> None:
     [
         # The first picture of each camera, the first live view, one of the two steps.
         (["front", "wrist"], False, [3, 3]),
-        (["front"], False, [3, 1]),
         ([], False, [1, 1]),
         # All of the demonstration, 11 frames, and both steps; and once more the first live view.
         (["front"], True, [14, 1]),
-        (["wrist"], True, [13, 3]),
     ],
 )
 def test_what_nobody_looks_at_is_not_drawn(
@@ -167,17 +165,6 @@ def test_a_process_plays_few_episodes_and_none_depends_on_it(simulator: RoboMMES
     assert [told(simulator, episode) for episode in reversed(episodes)] == results[::-1]
     # The goal of this episode counts the environments that are open, itself included.
     assert simulator.reset("VideoRepick/test/0")[2].goals[-1] == "open environments: 1"
-
-
-def test_images_are_left_out_where_not_wanted(robomme_python: Path) -> None:
-    with RoboMMESimulator(robomme_python, cameras=["front"]) as simulator:
-        lesson, first, _ = simulator.reset("MoveCube/test/0")
-        assert list(lesson.images) == list(first.images) == ["front"]
-        lesson, first, _ = simulator.reset("MoveCube/test/3", demonstration=False)
-        assert (lesson.images, lesson.states.shape) == ({}, (5, 8))
-        assert first.images["front"][0, 0, 0] == 5
-        seen, _ = simulator.step(HOLD, observe=False)
-        assert (seen.images, seen.state.shape) == ({}, (8,))
 
 
 def test_simulate_plays_the_demonstration(
