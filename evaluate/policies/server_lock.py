@@ -56,17 +56,20 @@ def lock_server(host: str, port: int, holder: str) -> Iterator[None]:
 
 @contextmanager
 def reserve_port() -> Iterator[int]:
-    """Choose a free port for a server on this machine, and lock it until the block ends.
+    """Choose a free port for a server on this machine, and keep it until the block ends.
 
     A server listens only when its model is loaded. Were the port just free until then, two that
-    load at once might get the same, and one of them both rollouts.
+    load at once might get the same, and one of them both rollouts. So its number is also the name
+    of an abstract socket (Linux), which every user and container that could listen there sees, and
+    which goes with the process.
     """
     with ExitStack() as stack:
         for port in _PORTS:
-            with suppress(OSError), socket.socket() as free:  # a lock that is held is one too
+            name = stack.enter_context(socket.socket(socket.AF_UNIX))
+            with suppress(OSError), socket.socket() as free:
                 free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
                 free.bind(("", port))
-                stack.enter_context(lock_server("127.0.0.1", port, "a worker that started it"))
+                name.bind(f"\0robomme-interference-{port}")
                 break
         else:
             raise PolicyServerError(f"no port from {_PORTS[0]} to {_PORTS[-1]} is free here")

@@ -199,9 +199,9 @@ class ServedPolicy(WebsocketPolicy):
     """A policy server by the command that starts it, which is run when it is first needed.
 
     The command is run without a shell, in this process's folder and environment, and listens at a
-    port that no other worker of this user has on this machine. It ends, with all that it has
-    started, with `close`, or with this process, however that ends. A call that finds it ended
-    raises `ServerDiedError`, with what it printed last.
+    port that no other worker's server has on this machine. It ends, with all that it has started,
+    with `close`, or with this process, however that ends. A call that finds it ended raises
+    `ServerDiedError`, with what it printed last.
 
     Args:
         command: The command, with `{port}` in it.
