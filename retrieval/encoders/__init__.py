@@ -8,10 +8,23 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
 from robomme_interference_data.data.embeddings import EncoderRecord, encoder_id
-from robomme_interference_data.errors import InvalidOptionError, MissingIndexError, UnknownNameError
+from robomme_interference_data.errors import InvalidOptionError, MissingIndexError
+from robomme_interference_data.runtime.specs import Kind, Registry
 from robomme_interference_data.storage.files import canonical_json
 
-_KINDS = ("siglip", "thumbnail")
+ENCODERS = Registry(
+    "encoder",
+    {
+        "thumbnail": Kind("thumbnail", f"{__name__}.thumbnail:Thumbnail"),
+        "siglip": Kind(
+            "siglip, or siglip:ID with the id or folder of a model",
+            f"{__name__}.siglip:Siglip",
+            r"(?P<model>.+)",
+            default=PAPER_ENCODER,
+            extra="retrieval",
+        ),
+    },
+)
 
 _PAPER_CUT = 0.923
 """The paper's cut (section "Adding Retrieval"), which was made for its encoder alone."""
@@ -76,13 +89,7 @@ def encoder_name(name: str) -> str:
         name: `thumbnail`, `siglip` (the paper's model), or `siglip:` and the id or folder of a
             SigLIP or SigLIP 2 model, such as `siglip:google/siglip2-base-patch16-224`.
     """
-    kind, colon, model = name.partition(":")
-    if kind not in _KINDS:
-        raise UnknownNameError.none("encoder", kind, _KINDS)
-    if colon and (kind == "thumbnail" or not model):
-        expected = "thumbnail, siglip, or siglip:ID with the id or folder of a model"
-        raise InvalidOptionError.expected("encoder", name, expected)
-    return "siglip" if model == PAPER_ENCODER else name
+    return "siglip" if ENCODERS.parse(name).target == PAPER_ENCODER else name
 
 
 def published_threshold(name: str) -> float | None:
@@ -101,13 +108,9 @@ def make_encoder(name: str, *, device: str | None = None, batch: int | None = No
         device: Where to compute, such as `cpu`; None for a GPU if there is one.
         batch: Images at a time; None for what suits the encoder.
     """
-    kind, _, model = encoder_name(name).partition(":")
     if batch is not None and batch < 1:
         raise InvalidOptionError.expected("batch", batch, "1 or more")
-    if kind == "thumbnail":
-        from .thumbnail import Thumbnail
-
-        return Thumbnail()
-    from .siglip import Siglip
-
-    return Siglip(model or PAPER_ENCODER, device, batch)
+    spec = ENCODERS.parse(name)
+    options = {"device": device, "batch": batch} if spec.kind == "siglip" else {}
+    made: Encoder = ENCODERS.factory(spec)(**spec.given, **options)
+    return made

@@ -131,7 +131,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
     [
         ("index nowhere", "build all --source KIND:PATH"),
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
-        ("index {bare} --encoder thumbnail:x", "siglip:ID"),
+        ("index {bare} --encoder thumbnail:x", "expected thumbnail"),
         ("index {bare} --encoder siglip:", "siglip:ID"),
         ("index {bare} --encoder siglip:/nonexistent", "'/nonexistent' is neither a folder"),
         ("index {bare} --camera side", "camera 'side'"),
