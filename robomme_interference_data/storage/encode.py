@@ -122,6 +122,7 @@ class VideoEncoder:
                 "Use the codec 'av1-lossless'.",
             )
         self._path = path
+        self._container: Any = None
         os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints its settings otherwise
         with self._errors():
             # No version of FFmpeg is written then.
@@ -144,32 +145,25 @@ class VideoEncoder:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts = self._count
         frame.time_base = self._time_base
-        with self._writing():
+        with self._errors():
             self._container.mux(self._stream.encode(frame))
         self._count += 1
 
     def close(self) -> None:
         """Write what is pending and close the file."""
-        with self._writing():
+        with self._errors():
             self._container.mux(self._stream.encode(None))
             self._container.close()
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            with self._errors():
-                yield
-        except BuildError:
-            # PyAV would close it when it is collected, and print what fails once more by then.
-            with suppress(av.error.FFmpegError):
-                self._container.close()
-            raise
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
         except (av.error.FFmpegError, UnknownCodecError) as error:
+            if self._container is not None:
+                # PyAV would close it when it is collected, and print what fails once more by then.
+                with suppress(av.error.FFmpegError):
+                    self._container.close()
             raise BuildError(f"{self._path}: the video cannot be written: {error}") from error
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from huggingface_hub import constants
 from support.hub import BASE, SPLIT, push_split, running_hub
-from support.hub_server import HubServer, User
+from support.hub_server import HubServer
 from support.machine import full_disk
 from support.splits import GOLDEN
 
 from robomme_interference_data import Buffer, load_buffer, load_split
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.errors import HashMismatchError, HubError, InterferenceError
+from robomme_interference_data.errors import HashMismatchError, InterferenceError
 
 Run = Callable[..., tuple[int, str, str]]
 QUERY, VERSION = "MoveCube/test/0", "data-1.0.0"
@@ -67,22 +67,6 @@ def test_what_does_not_come_whole(hub: HubServer, path: str, what: dict[str, Any
         load()
     assert "someone/" in caught.value.message and caught.value.hint
     fault.times = 0
-    assert whole()
-
-
-def test_who_may_not_see_it(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    repository = hub.repositories[f"datasets/{SPLIT}"]
-    repository.private = True
-    with pytest.raises(HubError, match="there is no dataset repository") as caught:
-        load()
-    assert "hf auth login" in str(caught.value.hint)
-    repository.private = False
-    hub.gated.add(f"datasets/{SPLIT}")
-    with pytest.raises(HubError, match="gated"):
-        load()
-    hub.tokens["good"] = User("someone")
-    monkeypatch.setattr(constants, "HF_HUB_DISABLE_IMPLICIT_TOKEN", False)
-    monkeypatch.setenv("HF_TOKEN", "good")
     assert whole()
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from huggingface_hub import constants
 from support import worlds
 from support.hub import BASE, SPLIT, push_split, running_hub
 from support.hub_server import HubServer
@@ -23,7 +22,6 @@ from robomme_interference_data.constants import MANIFEST_PATH
 from robomme_interference_data.errors import (
     FormatError,
     HashMismatchError,
-    HubError,
     MissingFileError,
     UnknownNameError,
 )
@@ -98,15 +96,6 @@ def test_a_second_load_makes_no_request(hub: HubServer) -> None:
     before = len(hub.requests)
     load_buffer(QUERY, "k3", split=f"{SPLIT}@{VERSION}", verify=True)
     assert len(hub.requests) == before
-
-
-def test_offline(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    load_buffer(QUERY, "k1", split=SPLIT, revision=VERSION)
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    assert len(load_buffer(QUERY, "k1", split=SPLIT, revision=VERSION).frames()) > 0
-    with pytest.raises(HubError, match="not in the cache") as caught:
-        load_buffer(QUERY, "k7", split=SPLIT, revision=VERSION)
-    assert "hf download" in str(caught.value.hint)
 
 
 def test_a_version_stays_when_its_tag_is_moved_or_gone(hub: HubServer, tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ class Commit:
     files: dict[str, Blob] = field(repr=False)
 
     def entries(self, folder: str = "", recursive: bool = True) -> list[dict[str, Any]]:
-        """Return the files and folders under a folder, as `tree` and `paths-info` tell them."""
+        """Return the files and folders under a folder, as `tree` tells them."""
         below = f"{folder}/" if folder else ""
         files = {path: blob for path, blob in self.files.items() if path.startswith(below)}
         found = {path: blob.entry(path) for path, blob in files.items()}

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, quote, unquote, urlencode
+from urllib.parse import quote, unquote, urlencode
 
 from support.hub_http import Answer, LoopbackServer, Request
 from support.hub_repositories import GITATTRIBUTES, Blob, Refused, Repository
@@ -181,10 +181,6 @@ class HubServer(LoopbackServer):
             files = request.json()["files"]
             modes = [repo.upload_mode(commit, one["path"], one["size"]) for one in files]
             return Answer.json({"files": modes})
-        if what == "paths-info":
-            known = {entry["path"]: entry for entry in commit.entries()}
-            wanted = parse_qs(request.body.decode()).get("paths", [])
-            return Answer.json([known[path] for path in wanted if path in known])
         if what != "tree":
             raise Refused(404, "", "Not found")
         recursive = request.query.get("recursive", "").lower() == "true"
