@@ -85,6 +85,12 @@ class Table:
             writer.writerow([_plain(v, c.kind) for v, c in zip(row, self.columns, strict=True)])
         return out.getvalue()
 
+    def _layout(self, left: str, right: str) -> tuple[list[str], list[str], list[list[str]]]:
+        """Return the side of each column, one of two marks, its head, and the rows as read."""
+        sides = [left if one.kind in ("text", "flag") else right for one in self.columns]
+        heads = [one.name.replace("_", " ") for one in self.columns]
+        return sides, heads, [self.cells(row) for row in self.rows]
+
     def cells(self, row: Sequence[Any]) -> list[str]:
         """Return a row as a reader sees it."""
         return [_shown(v, c.kind) for v, c in zip(row, self.columns, strict=True)]
@@ -97,18 +103,14 @@ class Table:
 
     def grid(self) -> str:
         """Return the table as Markdown, without title and note."""
-        rule = ["---" if column.kind in ("text", "flag") else "---:" for column in self.columns]
-        heads = [column.name.replace("_", " ") for column in self.columns]
-        cells = ([cell.replace("|", "\\|") for cell in self.cells(row)] for row in self.rows)
+        rule, heads, rows = self._layout("---", "---:")
+        cells = ([cell.replace("|", "\\|") for cell in row] for row in rows)
         return "\n".join(f"| {' | '.join(line)} |" for line in [heads, rule, *cells])
 
     def latex(self) -> str:
         """Return the table as LaTeX, for the package booktabs; title and note are comments."""
-        sides = ["l" if column.kind in ("text", "flag") else "r" for column in self.columns]
-        heads = [column.name.replace("_", " ") for column in self.columns]
-        head, *lines = (
-            " & ".join(map(_tex, line)) for line in [heads, *map(self.cells, self.rows)]
-        )
+        sides, heads, rows = self._layout("l", "r")
+        head, *lines = (" & ".join(map(_tex, line)) for line in [heads, *rows])
         body = "".join(f"{line} \\\\\n" for line in lines)
         note = "".join(f"% {line}\n" for line in wrap(self.note, 96))
         return (
@@ -118,7 +120,7 @@ class Table:
 
     def html(self) -> str:
         """Return the table as HTML, under its title."""
-        sides = ["left" if column.kind in ("text", "flag") else "right" for column in self.columns]
+        sides, heads, rows = self._layout("left", "right")
 
         def line(tag: str, cells: Sequence[str]) -> str:
             found = (
@@ -127,17 +129,15 @@ class Table:
             )
             return f"<tr>{''.join(found)}</tr>"
 
-        heads = line("th", [column.name.replace("_", " ") for column in self.columns])
-        rows = "".join(line("td", self.cells(row)) for row in self.rows)
-        table = f"<table><thead>{heads}</thead><tbody>{rows}</tbody></table>"
+        body = "".join(line("td", row) for row in rows)
+        table = f"<table><thead>{line('th', heads)}</thead><tbody>{body}</tbody></table>"
         return f"<p>{escape(self.title)}</p>{table}<p>{escape(self.note)}</p>"
 
     def text(self) -> str:
         """Return the table for a terminal: aligned, under its title, the note below."""
-        heads = [column.name.replace("_", " ") for column in self.columns]
-        lines = [heads, *(self.cells(row) for row in self.rows)]
+        sides, heads, rows = self._layout("<", ">")
+        lines = [heads, *rows]
         widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
-        sides = ["<" if column.kind in ("text", "flag") else ">" for column in self.columns]
         laid = [
             "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip()
             for line in lines

@@ -16,6 +16,7 @@ from support.scoring import GOOD
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.comparisons.compare import compare
+from robomme_interference_data.evaluate.score.rows import files
 from robomme_interference_data.evaluate.score.rows.export import export
 from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows
 
@@ -355,6 +356,21 @@ def test_files_that_cannot_be_read(tmp_path: Path, capfd: pytest.CaptureFixture[
     with pytest.raises(FormatError, match="list<"):
         read_rows([nested])
     assert capfd.readouterr().err == ""
+
+
+def test_files_of_too_many_rows_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_MOST_ROWS", 100)
+    rows = made.rows()
+    sources = (
+        made.write_csv(tmp_path / "a.csv", rows),
+        made.write_parquet(tmp_path / "a.parquet", rows),
+        made.write_run(tmp_path / "run", rows),
+    )
+    for path in sources:
+        with pytest.raises(FormatError, match="more than 100 rows"):
+            read_rows([path], lenient=True)
 
 
 def test_files_that_are_not_there_or_twice(tmp_path: Path) -> None:

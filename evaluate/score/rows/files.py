@@ -26,6 +26,9 @@ _REQUIRED = ("family", "condition", "episode", "status", "success")
 _RUN_ONLY = {"split", "revision", "episode_split", "shift", "model_seed", "protocol_version"}
 """Key columns of a run's rows. The released layout is without them, and without `simulator`,
 which exported rows of other simulators have as one column more."""
+_MOST_ROWS = 1 << 20
+"""Rows of a file, at most: the paper's grid has 25,200."""
+
 _ALIASES = {"variant": "system"}  # its name in the paper's released tables
 
 
@@ -117,6 +120,11 @@ def _match(
     return {name: ours[name] for name in names if name in ours}
 
 
+def _bound(rows: int) -> None:
+    if rows > _MOST_ROWS:
+        raise ValueError(f"more than {_MOST_ROWS:,} rows; expected at most so many")
+
+
 def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
     for column in table.columns:
         kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
@@ -127,6 +135,7 @@ def _columns(path: Path, table: pa.Table) -> dict[str, list[Any]]:
 
 def _read_parquet(path: Path, names: Sequence[str], has_system: bool) -> Part:
     with open_parquet(path) as file:
+        _bound(file.metadata.num_rows)
         chosen = _match(path, file.schema_arrow.names, names, has_system)
         table = read_table(file, path, list(chosen.values()))
     columns = _columns(path, table)
@@ -145,6 +154,7 @@ def _read_csv(path: Path, names: Sequence[str], has_system: bool) -> Part:
         chosen = _match(path, header, names, has_system)
         line = reader.line_num + 1
         for fields in reader:
+            _bound(len(rows) + len(malformed))
             if len(fields) == len(header):
                 rows[line] = fields
             else:
@@ -161,6 +171,7 @@ def _read_record(path: Path, names: Sequence[str], has_system: bool) -> Part:
     """Read the record of a run: every finished row, and of other rollouts the last row."""
     if not (whole := whole_lines(path)):
         return Part({}, [])
+    _bound(whole.count(b"\n"))
     schema = pa.schema([_SCHEMA.field(name) for name in dict.fromkeys((*names, *KEY_COLUMNS))])
     options = pa_json.ParseOptions(schema, unexpected_field_behavior="ignore")
     table = pa_json.read_json(pa.BufferReader(whole), parse_options=options)
