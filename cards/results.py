@@ -16,7 +16,7 @@ from robomme_interference_data.constants import (
 from robomme_interference_data.errors import InvalidOptionError, PublishError
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
 from robomme_interference_data.evaluate.score.config import Grid, Settings
-from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score, score

@@ -71,6 +71,19 @@ def test_model_seeds_are_matched(tmp_path: Path) -> None:
     assert (overall["n"], overall["pairs"], overall["gained"], overall["lost"]) == (4, 2, 1, 1)
 
 
+def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
+    other = made.changed(own(k0="sf"), revision="cd" * 32, model_seed=9)
+    found = compared(tmp_path, own(k0="ss"), other)
+    (note,) = found.notes
+    assert "are of different splits" in note
+    released = made.released(
+        tmp_path / "c.csv", [f"{OWN},MoveCube,k0,{e},{e},easy,fail,0,9" for e in range(2)]
+    )
+    both = made.write_csv(tmp_path / "b.csv", made.changed(own(k0="ss"), simulator="robomme"))
+    (note,) = compare(both, released).notes
+    assert "Only one of the runs names the revision" in note
+
+
 def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:
     rows = own(k0="ssssssf-", k7="sfffffse") + cells({(BASE, "k0"): "ss"})
     found = compare(made.write_csv(tmp_path / "a.csv", rows), conditions=("k0", "k7"))

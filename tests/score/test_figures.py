@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from support import scoring as made
 from support.scoring import BASE, OWN, cells
 
-from robomme_interference_data.evaluate.score.plots.curves import Data, spread
+from robomme_interference_data.evaluate.score.plots.curves import spread
+from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.plots.styles import SeriesStyle, styles_of
 from robomme_interference_data.evaluate.score.scoring import Score

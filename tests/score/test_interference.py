@@ -10,7 +10,7 @@ from support import scoring as made
 from support.scoring import BASE, OWN, REPLAY, RETRIEVAL, record, records
 
 from robomme_interference_data.evaluate.score.comparisons.contrast import COMPARISONS, comparable
-from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.scoring import Score

@@ -17,7 +17,7 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells
 
 from robomme_interference_data.evaluate.run.log import Invocation
 from robomme_interference_data.evaluate.run.plan import Plan
-from robomme_interference_data.evaluate.score.plots.curves import Data
+from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import (
     FIGURES,
     draw_figure,

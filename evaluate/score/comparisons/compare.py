@@ -68,19 +68,16 @@ def compare(
     notes = list(_differing(one, other, matched))
     found = list[Contrast]()
     for a, b in matched:
-        both = [(c, c) for c in a.conditions if c in b.conditions]
-        if conditions:
-            both = [two for two in [(conditions[0], conditions[1])] if a.has(two[0], b, two[1])]
-        whole = {two: _pairs(a, b, two, "") for two in both}
-        for family in ("", *FAMILIES):
-            for two in both:
-                pairs = _pairs(a, b, two, family) if family else whole[two]
-                if pairs.n:
-                    names = (a.outcomes.simulator, b.system, two[1], (a.system, two[0]), "compare")
-                    complete = a.complete(two[0]) and b.complete(two[1])
-                    found.append(Contrast(*names, pairs, complete, family=family))
+        both = [(conditions[0], conditions[1])] if conditions else [(c, c) for c in a.conditions]
+        both = [two for two in both if two[0] in a.conditions and two[1] in b.conditions]
+        pairs = {(part, two): _pairs(a, b, two, part) for part in ("", *FAMILIES) for two in both}
+        for (family, (own, others)), here in pairs.items():
+            if here.n:
+                names = (a.outcomes.simulator, b.system, others, (a.system, own), "compare")
+                complete = a.complete(own) and b.complete(others)
+                found.append(Contrast(*names, here, complete, family=family))
         if a.repeats(b, one, other) and not conditions:
-            notes += _noise(a, b, {c: pairs for (c, _), pairs in whole.items()})
+            notes += _noise(a, b, {c: pairs["", (c, c)] for c, _ in both})
     if not found:
         runs = " and ".join(str(path) for path in (first, second) if path)
         under = " and ".join(conditions) or "a common condition"
@@ -137,9 +134,6 @@ class _Side:
     @property
     def conditions(self) -> list[str]:
         return self.outcomes.ran(self.system)
-
-    def has(self, condition: str, other: "_Side", others: str) -> bool:
-        return condition in self.conditions and others in other.conditions
 
     def complete(self, condition: str) -> bool:
         return bool(self.outcomes.complete[self.outcomes.cell(self.system, condition)])

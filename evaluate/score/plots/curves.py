@@ -1,129 +1,18 @@
-"""What figures show of a score, and the curves, axes and labels that they share."""
+"""Curves of success over conditions, and the axes and labels that figures share."""
 
 import math
-from collections.abc import Container, Mapping, Sequence
-from copy import copy
+from collections.abc import Mapping, Sequence
 from itertools import groupby
-from typing import Any, Self
+from typing import Any
 
-from robomme_interference_data.evaluate.score.scoring import Score
-from robomme_interference_data.evaluate.score.tables.cells import Cell
-from robomme_interference_data.evaluate.score.tables.paper import by_family
-from robomme_interference_data.evaluate.systems import base_of
 from robomme_interference_data.schema.conditions import (
     NO_HISTORY,
-    Condition,
-    Kind,
-    in_order,
     parse_condition,
 )
-from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import INK, connect_right, right_of, tidy
 
-from .styles import SeriesStyle, styles_of
-
-_PUBLISHED = ", published"
-_CHANCE = "(chance)"  # among systems: no name of one has brackets
-
-FEW = 4
-"""Up to so many systems, curves have intervals."""
-
-
-class Data:
-    """What the figures of one simulator show.
-
-    Attributes:
-        simulator: Its name.
-        cells: System, condition and part to what is drawn: cells with rows, and published rates,
-            whose systems are named `<system>, published`.
-        systems: Those that have rows.
-        absent: Published ones without rows here, behind a retrieval step that has: drawn in full.
-        beside: Published ones of systems with rows: dashes beside their points.
-        styles: Of all of them, and of the chance level.
-        conditions: Of all of them, in the order of tables.
-        least: The fewest sessions that one of them counts.
-        contrasts: The comparisons of the systems that have rows.
-        flips: Share of outcomes that differ between repeats; None without repeats.
-        apart: Condition and two systems that can be told apart under it.
-        access: The rows of the table `access`, without the simulator.
-        chance: Part of the episodes, or empty for all, to the share that guessing has: of those
-            that are all questions, as most episodes have it.
-    """
-
-    def __init__(self, score: Score, simulator: str):
-        self.simulator = simulator
-        found = [one for one in score.cells if one.simulator == simulator and one.n]
-        self.systems = list(dict.fromkeys(one.system for one in found))
-        self.contrasts = [one for one in score.contrasts if one.simulator == simulator]
-        repeats = [row[3:5] for row in score.tables["noise"].rows if row[0] == simulator]
-        pairs, flips = map(sum, zip(*repeats, strict=True)) if repeats else (0, 0)
-        self.flips = flips / pairs if pairs else None
-        self.apart = {
-            (one["condition"], frozenset((one["system"], one["against_system"])))
-            for one in (score.tables["matrix"].records() if "matrix" in score.tables else ())
-            if one["simulator"] == simulator and one["p_holm"] < ALPHA
-        }
-        access = score.tables.get("access")
-        self.access = [row[1:] for row in access.rows if row[0] == simulator] if access else []
-        asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
-        self.chance = {one.part: one.chance for one in asked}
-        bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]
-        self.styles = styles_of([*self.systems, *bases])
-        self.styles[_CHANCE] = SeriesStyle("chance", INK, "", ":", 0.9)
-        self.cells: dict[tuple[str, str, str], Cell] = {
-            (one.system, one.condition, one.part): one for one in found
-        }
-        self.absent, self.beside = list[str](), list[str]()
-        for one in (*score.published, *(by_family() if score.published else ())):
-            if one.simulator == simulator and one.system in self.styles:
-                name = f"{one.system}{_PUBLISHED}"
-                names = self.absent if one.system in bases else self.beside
-                names += [name] if name not in names else []
-                style, line = (
-                    self.styles[one.system],
-                    (0, (4, 2)) if one.system in bases else "none",
-                )
-                label = f"{style.label}, published"
-                self.styles[name] = SeriesStyle(label, style.colour, "_", line, 1.2)
-                self.cells[name, one.condition, one.part] = one
-        conditions = {condition for _, condition, _ in self.cells}
-        self.conditions: Sequence[Condition] = in_order(conditions) if conditions else ()
-        self.least = min((one.k for one in self.conditions if one.kind.counted), default=0)
-
-    @property
-    def kinds(self) -> list[Kind]:
-        """The kinds of its conditions, in the order of tables."""
-        return list(dict.fromkeys(one.kind for one in self.conditions))
-
-    def of(self, kinds: Container[Kind]) -> Self:
-        """Return what there is of some kinds of conditions, with the same places on the x axis."""
-        found = copy(self)
-        found.conditions = [one for one in self.conditions if one.kind in kinds]
-        names = {one.name for one in found.conditions}
-        found.cells = {key: cell for key, cell in self.cells.items() if key[1] in names}
-        found.systems = [one for one in self.systems if any(one == key[0] for key in found.cells)]
-        return found
-
-    def x(self, condition: str) -> float:
-        """Return the place on the x axis: log2(k + 1), right of conditions that do not count."""
-        one, plain = parse_condition(condition), [c for c in self.conditions if not c.kind.counted]
-        if not one.kind.counted:
-            return 0.3 + 1.3 * plain.index(one)
-        return 0.3 + 1.3 * len(plain) + math.log2((one.k + 1) / (self.least + 1))
-
-    def parts(self, names: Sequence[str]) -> list[str]:
-        """Return those of some parts that any cell with rows is of."""
-        own = {part for system, _, part in self.cells if system in self.systems}
-        return [name for name in names if name in own]
-
-    def has_parts(self, system: str) -> bool:
-        """Whether any cell of a system is of a part of the episodes."""
-        return any(name == system and part for name, _, part in self.cells)
-
-    def shown(self, systems: Sequence[str]) -> list[str]:
-        """Return the conditions that any cell of some systems is of."""
-        found = {condition for system, condition, _ in self.cells if system in systems}
-        return [one.name for one in self.conditions if one.name in found]
+from .data import CHANCE, FEW, PUBLISHED, Data
+from .styles import SeriesStyle
 
 
 def shifts(systems: Sequence[str]) -> dict[str, float]:
@@ -135,7 +24,7 @@ def shifts(systems: Sequence[str]) -> dict[str, float]:
 def mark(artists: Any, system: str) -> None:
     """Say of what is drawn which system it is of: pages set one apart by it."""
     for artist in artists:
-        artist.set_gid(f"system:{system.removesuffix(_PUBLISHED)}")
+        artist.set_gid(f"system:{system.removesuffix(PUBLISHED)}")
 
 
 def curve(
@@ -210,9 +99,9 @@ def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
     """
     if part not in data.chance:
         return {}
-    level, style = 100 * data.chance[part], data.styles[_CHANCE]
+    level, style = 100 * data.chance[part], data.styles[CHANCE]
     axes.axhline(level, color=style.colour, linestyle=style.line, linewidth=style.width, zorder=0)
-    return {_CHANCE: level}
+    return {CHANCE: level}
 
 
 # --- axes and labels ---------------------------------------------------------------------------
@@ -293,7 +182,7 @@ def label_ends(
             *axes.plot(1, label, **style.point, clip_on=False, transform=place),
             axes.text(1, label, style.label, transform=words, **letters),
         ]
-        if system != _CHANCE:
+        if system != CHANCE:
             mark(drawn, of or system)
 
 

@@ -22,7 +22,8 @@ from robomme_interference_data.viz.figure import (
 )
 
 from . import curves, forests
-from .curves import FEW, Data, curve, explained, legend
+from .curves import curve, explained, legend
+from .data import FEW, Data
 
 _PAPER = {parse_condition(one).kind for one in DEFAULT_CONDITIONS}
 _ALL_KINDS = ("heatmap", "kinds", "interference", "ceiling")

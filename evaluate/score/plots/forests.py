@@ -16,7 +16,8 @@ from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.significance import ALPHA
 from robomme_interference_data.viz.figure import GREY, INK, Hue, tidy
 
-from .curves import Data, label_ends, legend, mark, panel_grid, points_with_bars, set_axes, short
+from .curves import label_ends, legend, mark, panel_grid, points_with_bars, set_axes, short
+from .data import Data
 from .styles import SeriesStyle
 
 _FLIPS = 0.06

@@ -19,7 +19,7 @@ from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
 from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, success
-from robomme_interference_data.evaluate.score.plots.curves import FEW
+from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
 from robomme_interference_data.evaluate.score.rows.reading import Rows
 from robomme_interference_data.evaluate.score.scoring import Score
