@@ -82,11 +82,7 @@ class Responder(ABC):
 
     @abstractmethod
     def answer(self, prompted: Prompted) -> Answer:
-        """Answer.
-
-        Raises:
-            ModelError: See `ChatModel.reply`.
-        """
+        """Answer."""
 
     @abstractmethod
     def metadata(self) -> dict[str, Any]:
@@ -112,11 +108,7 @@ class Recaller(Responder):
     """`recall`: the ideal observer. It draws from the options that agree with what frames show."""
 
     def answer(self, prompted: Prompted) -> Answer:
-        """Draw from the options that cannot be ruled out; from all, if all can be.
-
-        Raises:
-            FormatError: The question's options are not answers that its scene allows.
-        """
+        """Draw from the options that cannot be ruled out; from all, if all can be."""
         question, scene = prompted.question, recorded_scene(prompted.query)
         if scene is None or max(question.answers) >= len(scene.answers):
             raise FormatError(
@@ -150,12 +142,7 @@ class ModelResponder(Responder):
         self._prompt, self._sha256 = load_prompt(prompt)
 
     def answer(self, prompted: Prompted) -> Answer:
-        """Ask the model.
-
-        Raises:
-            FormatError: The question's picture is damaged.
-            ModelError: See `ChatModel.reply`.
-        """
+        """Ask the model."""
         views: dict[str, list[Any]] = {"<history>": [], "<picture>": []}
         if self._control != "text":
             try:

@@ -51,9 +51,6 @@ def default_system(config: RunConfig) -> str:
     That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
     step behind it, such as `retrieval-replay-window-oracle`; with the simulator's subgoals
     `…-oracle`, and of `replay` that goes on `…-go-on`.
-
-    Raises:
-        InvalidOptionError: It does not follow from the policy, or from what writes its subgoals.
     """
     spec = parse_policy(config.policy)
     # Folders are called alike, and so are revisions; and served models.
@@ -75,14 +72,7 @@ def default_system(config: RunConfig) -> str:
 
 
 def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
-    """Check the settings against each other, the split and the policy.
-
-    Raises:
-        UnknownNameError: There is no such simulator or camera, or a name passes for a system.
-        InvalidOptionError: A setting is out of range or does not go with another: a shift with a
-            simulator that has none, for one.
-        MissingExtraError: A library for videos or retrieval is not installed.
-    """
+    """Check the settings against each other, the split and the policy."""
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
     check_shared(config)
@@ -158,13 +148,7 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
 def check_plan(
     config: RunConfig, system: System, split: Split, plan: Plan, items: Sequence[WorkItem]
 ) -> None:
-    """Check every rollout of a plan.
-
-    Raises:
-        InvalidOptionError: A condition does not apply, or the split is of another simulator.
-        UnknownNameError: The split has no buffers for a condition.
-        HistoryTooLongError: A buffer exceeds the system's position limit.
-    """
+    """Check every rollout of a plan."""
     recalls = parse_policy(config.policy).kind == "recall"
     own = ":" in config.simulator  # a simulator of one's own may serve any episodes
     for episode in dict.fromkeys(item.episode for item in items):

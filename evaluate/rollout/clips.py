@@ -51,11 +51,7 @@ _LINES = 14
 
 
 def check_drawing() -> None:
-    """Check that clips can be drawn.
-
-    Raises:
-        MissingExtraError: pillow, which draws the words, is not installed.
-    """
+    """Check that clips can be drawn."""
     try:
         import PIL  # noqa: F401
     except ImportError as error:

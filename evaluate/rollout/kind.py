@@ -85,12 +85,6 @@ class Rollouts(RunKind[RunConfig]):
         """Have a worker start the policy's server, and the simulator, before the first rollout.
 
         A simulator of the user's own is made at the first rollout.
-
-        Raises:
-            PolicyServerError: The server ends, cannot be reached, or is not what the system's is.
-            InvalidOptionError: It cannot be started, or nobody says which checkpoint it serves.
-            NoRendererError: This machine cannot draw the simulator's pictures.
-            SimulatorCrashError: The simulator cannot be made for another reason.
         """
         config = self.config
         if config.serve is not None:

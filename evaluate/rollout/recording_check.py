@@ -21,9 +21,6 @@ def check_episode(
 
     Seed, difficulty, length of the demonstration and goal must agree, and the first live state
     within `STATE_TOLERANCE`.
-
-    Raises:
-        RolloutError: One of them does not.
     """
     compared: dict[str, tuple[Any, Any]] = {
         "seed": (query.seed, info.seed),
@@ -57,9 +54,6 @@ def check_lesson(
     """Compare a recorded demonstration and first live observation with what the simulator played.
 
     Only cameras that the simulator drew are compared, and the first live views only if asked to.
-
-    Raises:
-        RolloutError: They differ in a bit; says where first.
     """
     dataset, episode, frames = query.dataset, query.record.episode_index, query.lesson_frames
     if not np.array_equal(dataset.read_vectors(episode, STATE, 0, frames), played.states):

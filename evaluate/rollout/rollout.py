@@ -78,12 +78,6 @@ def run_rollout(
 
     The policy never gets what the simulator returns of the demonstration: its history comes from
     the dataset, and is what the condition says (protocol, rules 2 and 6).
-
-    Raises:
-        RolloutError: Simulator and dataset speak of different episodes.
-        HistoryTooLongError: What retrieval chose exceeds the system's position limit.
-        PolicyError: The policy broke, or returned no actions.
-        SimulatorCrashError: The simulator broke.
     """
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)  # no time limit

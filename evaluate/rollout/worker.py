@@ -74,12 +74,7 @@ class RolloutTask:
         self._selector: Selector | None = None
 
     def __call__(self, task: Job | Opening, worker: Worker) -> Any:
-        """Run a rollout; return its row, and what befell its clip, or None. Or open something.
-
-        Raises:
-            WorkerRetiredError: The policy's server is gone, or another than when the run began.
-            Exception: Whatever broke in the rollout.
-        """
+        """Run a rollout; return its row, and what befell its clip, or None. Or open something."""
         try:
             if isinstance(task, Opening):
                 return self._open(task, worker)

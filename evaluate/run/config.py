@@ -142,11 +142,7 @@ class CeilingConfig(RetrievalConfig):
 
 
 def check_shared(config: WorkConfig) -> None:
-    """Check the settings that both kinds of work share, by themselves.
-
-    Raises:
-        InvalidOptionError: One is not what it may be.
-    """
+    """Check the settings that both kinds of work share, by themselves."""
     from robomme_interference_data.retrieval.select import Rule
 
     for name in ("workers", "history_chunk", "max_errors", "rollout_timeout", "simulator_timeout"):
@@ -162,11 +158,7 @@ def check_shared(config: WorkConfig) -> None:
 
 
 def non_default_retrieval(config: RetrievalConfig) -> dict[str, str]:
-    """Return the settings of the retrieval step that are not the paper's.
-
-    Raises:
-        InvalidOptionError: There are some, and no retrieval step.
-    """
+    """Return the settings of the retrieval step that are not the paper's."""
     defaults = {one.name: one.default for one in fields(RetrievalConfig) if one.name != "retrieval"}
     found = {name: value for name in defaults if (value := getattr(config, name)) != defaults[name]}
     for name in found if config.retrieval is None else ():

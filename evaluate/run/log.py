@@ -140,11 +140,7 @@ class RunLog:
         self._write_header(header.standing(self.rows, "running"))
 
     def append(self, row: Rollout, trace: str | None = None) -> None:
-        """Write a row, and where it broke; when this returns, the row is on the disk.
-
-        Raises:
-            OSError: The file cannot be written; it is named.
-        """
+        """Write a row, and where it broke; when this returns, the row is on the disk."""
         path = self.folder / RUN_RECORD
         try:
             with path.open("ab") as file:
@@ -192,12 +188,6 @@ def open_log(
         identity: What makes the run the one that it is, as plain values.
         split: Label of the split in rows; a run that is there keeps its own.
         resume: Whether a run that is there may be gone on with.
-
-    Raises:
-        RunFolderError: The folder holds another run or something else, is being written by
-            another process, or may not be resumed.
-        MissingFileError: The record is gone.
-        FormatError: Its files are damaged or of another format version.
     """
     folder.mkdir(parents=True, exist_ok=True)
     there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
@@ -227,12 +217,7 @@ def open_log(
 
 
 def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
-    """Read a run: its header, standing as its record says, and its rows.
-
-    Raises:
-        RunFolderError: The folder holds no run, or its record is gone.
-        FormatError: Its files are damaged or of another format version.
-    """
+    """Read a run: its header, standing as its record says, and its rows."""
     for name in (RUN_HEADER, RUN_RECORD):
         if not (folder / name).is_file():
             raise RunFolderError(
@@ -244,11 +229,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
 
 
 def read_record(folder: Path) -> dict[WorkItem, Rollout]:
-    """Read a run's record: the row that counts of each rollout; empty where there is none.
-
-    Raises:
-        FormatError: A line is damaged, or a finished rollout has two rows.
-    """
+    """Read a run's record: the row that counts of each rollout; empty where there is none."""
     path = folder / RUN_RECORD
     rows: dict[WorkItem, Rollout] = {}
     if not path.exists():
@@ -271,11 +252,7 @@ def read_record(folder: Path) -> dict[WorkItem, Rollout]:
 
 
 def row_of(line: bytes) -> Rollout:
-    """Read a line of a record.
-
-    Raises:
-        ValueError: It is no row, or holds what no table can hold.
-    """
+    """Read a line of a record."""
     row = from_dict(Rollout, parse_json(line, "its text"), "its fields", strict=True)
     if b"\\u" in line:  # half of a character
         canonical_json(to_dict(row)).encode()
@@ -294,11 +271,7 @@ def whole_lines(record: Path) -> bytes:
 
 
 def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Check that a folder's run is the one that is wanted, by their identities.
-
-    Raises:
-        RunFolderError: It is another; names every difference.
-    """
+    """Check that a folder's run is the one that is wanted, by their identities."""
     there, here = _flat(found), _flat(wanted)
     told = [
         f"{name} is {there.get(name, 'unknown')} there, {here.get(name, 'unknown')} here"

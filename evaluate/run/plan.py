@@ -19,9 +19,6 @@ class WorkItem:
     """One rollout: within a run, the key of its row.
 
     They sort in the canonical order, by episode and condition.
-
-    Raises:
-        InvalidIdError: There is no such condition.
     """
 
     condition: str
@@ -55,9 +52,6 @@ class Plan:
             numbers, such as `0-49`.
         conditions: Names.
         shard: The part of them that is run: `2/8` is the second of eight.
-
-    Raises:
-        InvalidOptionError: Numbers or shard do not read as such.
     """
 
     episodes: dict[str, str]
@@ -113,13 +107,7 @@ def plan_work(
     episode_split: str = "test",
     shard: str = "1/1",
 ) -> Plan:
-    """Return the plan of a run over the query episodes of a split: `known`; see `RunConfig`.
-
-    Raises:
-        InvalidIdError: A condition is none.
-        InvalidOptionError: Numbers or shard do not read as such, or there is nothing to run.
-        UnknownNameError: The split lacks a family or episode that is asked for.
-    """
+    """Return the plan of a run over the query episodes of a split: `known`; see `RunConfig`."""
     there = sorted(known)
     here: dict[str, list[int]] = {episode.family: [] for episode in there}
     for episode in there:

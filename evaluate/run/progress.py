@@ -1,17 +1,12 @@
 """Show how a run goes: success rates by family and condition, and the time left."""
 
-import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import timedelta
 from typing import Self
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
-from rich.text import Text
-
+from robomme_interference_data.errors import visible
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.rollouts import Rollout, Status
 from robomme_interference_data.viz.tables import Table
@@ -24,10 +19,9 @@ Cell = tuple[str, str]
 
 
 class RunProgress:
-    """A table of successes so far, a bar, and the time left, on stderr.
+    """A table of successes so far above a progress bar, on stderr; use as a context manager.
 
-    Use as a context manager. Where stderr is no terminal, a line is written whenever a family's
-    condition is done.
+    Where stderr is no terminal, a line is written whenever a family's condition is done.
 
     Args:
         quiet: Show nothing.
@@ -36,36 +30,27 @@ class RunProgress:
 
     def __init__(self, *, quiet: bool = False, unit: str = "rollouts"):
         self._unit = unit
-        self._console = Console(stderr=True, quiet=quiet)
-        self._bar = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn(f"{unit}, {{task.fields[left]}}"),
-            console=self._console,
-        )
-        self._task = self._bar.add_task("evaluate", total=None, left="")
-        self._nodes: dict[str, TaskID] = {}
+        self._bar = WorkProgress(unit=unit, quiet=quiet, above=self.rates)
+        self._console = self._bar.console
         self._planned: Counter[Cell] = Counter()
         self._ended: dict[Cell, Counter[str]] = {}  # by status: whole rows would be too many
-        self._left = self._new = 0  # rollouts that are still to end, and that ended in this run
-        self._began = self._last = time.monotonic()
-        self._live = Live(console=self._console, get_renderable=self.draw, refresh_per_second=2)
+        self._left = 0  # rollouts that are still to end
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
-            self._live.start()
+            self._bar.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
         if self._console.is_terminal:
-            self._live.stop()
+            self._bar.__exit__(*exception)
 
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
-        """Take what was asked for, and the rows that an earlier run finished."""
+        """Take what is planned, and the rows that an earlier run finished."""
         self._planned = Counter((item.episode.family, item.condition) for item in items)
-        self._ended, self._left, self._new = _count(done), len(items) - len(done), 0
-        self._bar.reset(self._task, total=len(items), completed=len(done))
-        self._began = time.monotonic()
+        self._ended, self._left = _count(done), len(items) - len(done)
+        self._bar.start("evaluate", len(items))
+        self._bar.advance(len(done), before=True)
         if done and not self._console.is_terminal:
             self._console.print(f"{len(done)} of {len(items)} {self._unit} are done already")
 
@@ -74,36 +59,19 @@ class RunProgress:
         cell = (row.family, row.condition)
         ended = self._ended.setdefault(cell, Counter())
         ended[row.status] += 1
-        self._left, self._new = self._left - 1, self._new + 1
-        total = self._planned.total()
-        if node is not None:
-            if node not in self._nodes:
-                self._nodes[node] = self._bar.add_task("", total=total, left=node)
-            self._bar.advance(self._nodes[node])
-        self._last = time.monotonic()
-        self._bar.advance(self._task)
+        self._left -= 1
+        self._bar.advance(1, node=node)
         if not is_done(row):
-            self._console.print(f"{WorkItem.of(row)} broke: {row.error}", style="red", markup=False)
+            error = visible(f"{WorkItem.of(row)} broke: {row.error}")
+            self._console.print(error, style="red", markup=False)
         if not self._console.is_terminal and ended.total() == self._planned[cell]:
+            total = self._planned.total()
             so_far = f"{total - self._left} of {total}"
             self._console.print(f"{row.family} {row.condition}: {_rate(ended)}  ({so_far})")
 
-    def left(self) -> float | None:
-        """Return the seconds left, by the mean time that a rollout of this run took so far.
-
-        Whatever the workers do side by side is in that mean. None until one rollout has ended.
-        """
-        if not self._new:
-            return None
-        mean = (self._last - self._began) / self._new
-        return max(0.0, mean * self._left - (time.monotonic() - self._last))
-
-    def draw(self) -> Group:
-        """Return what is shown."""
-        left = self.left()
-        told = "" if left is None else f"{timedelta(seconds=round(left))} left"
-        self._bar.update(self._task, left=told)
-        return Group(Text(_table(self._ended).text() if self._ended else ""), self._bar)
+    def rates(self) -> str:
+        """Return the table of successes so far."""
+        return _table(self._ended).text() if self._ended else ""
 
 
 def rate_table(rows: Iterable[Rollout]) -> Table:

@@ -95,10 +95,6 @@ class Executor(ABC):
 
         Args:
             function: What to do with each task.
-
-        Raises:
-            WorkerError: There is no cluster, it is this machine and has no room, nodes differ
-                from this process, or workers cannot be made.
         """
 
     def run(
@@ -115,12 +111,6 @@ class Executor(ABC):
             function: What to do with each task.
             tasks: Picklable tasks.
             limits: See `Limits`.
-
-        Raises:
-            WorkerError: A worker ended before its first task, as it does when the script that it
-                imports starts work outside `if __name__ == "__main__":`.
-            WorkerRetiredError: No worker is left for the remaining tasks; why the last retired.
-            WorkerError: See `session`.
         """
         end_if_starting()
         todo = list(tasks)
@@ -168,9 +158,6 @@ class Processes(Executor):
 
     Attributes:
         workers: How many.
-
-    Raises:
-        InvalidOptionError: `workers` is not positive.
     """
 
     workers: int

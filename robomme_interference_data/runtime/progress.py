@@ -1,10 +1,10 @@
 """A progress bar for long work, on stderr."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Self
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -25,7 +25,19 @@ class _Speed(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        return Text(f"{speed:,.0f} {self._unit}/s" if speed else "", style="progress.data.speed")
+        rate = f"{speed:,.0f} {self._unit}/s" if speed and speed >= 1 else ""
+        if speed and speed < 1:
+            rate = f"{60 * speed:.2g} {self._unit}/min"
+        return Text(rate, style="progress.data.speed")
+
+
+class _Bars(Progress):
+    above: Callable[[], str] | None = None
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        if self.above is not None:
+            yield Text(self.above())
+        yield from super().get_renderables()
 
 
 class WorkProgress:
@@ -34,19 +46,31 @@ class WorkProgress:
     Args:
         unit: What is counted.
         quiet: Show nothing.
+        above: Returns text to show above the bars, whenever they are drawn.
+
+    Attributes:
+        console: Where to print lines while the bars are shown.
     """
 
-    def __init__(self, *, unit: str = "frames", quiet: bool = False):
-        self._progress = Progress(
+    def __init__(
+        self,
+        *,
+        unit: str = "frames",
+        quiet: bool = False,
+        above: Callable[[], str] | None = None,
+    ):
+        self.console = Console(stderr=True, quiet=quiet)
+        self._progress = _Bars(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn(unit),
             _Speed(unit),
             TimeRemainingColumn(),
-            console=Console(stderr=True, quiet=quiet),
+            console=self.console,
             speed_estimate_period=3600,  # s; one piece of work may take half of it
         )
+        self._progress.above = above
         self._task: TaskID | None = None
         self._nodes: dict[str, TaskID] = {}
 

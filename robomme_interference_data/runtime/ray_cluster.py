@@ -72,9 +72,6 @@ class RayWorkers(Executor):
             `local` for one that lasts as long as the work.
         cpus: Processors that each takes, of those that Ray counts.
         gpus: Share of a GPU that each takes.
-
-    Raises:
-        InvalidOptionError: A number is not what it may be.
     """
 
     workers: int
@@ -126,9 +123,6 @@ class RayWorkers(Executor):
         """Compare all nodes that have room for a worker with this process; return their ids.
 
         One that is lost meanwhile is left out.
-
-        Raises:
-            WorkerError: Some differ; or there is none, and none can come.
         """
         asked: dict[str, Any] = {}
         for node in _nodes():
@@ -214,11 +208,7 @@ class _RayWorker:
         self.call = self.actor.begin.remote(self.number, *self._all.given, self._all.known)
 
     def settle(self) -> None:
-        """Take note that it has begun; where it cannot, begin elsewhere.
-
-        Raises:
-            WorkerError: It cannot, again and again.
-        """
+        """Take note that it has begun; where it cannot, begin elsewhere."""
         try:
             self._node, self._home, found = ray.get(self.call)
         except RayTaskError as error:
@@ -338,11 +328,7 @@ def _enter(folder: str) -> None:
 
 @contextmanager
 def _connected(address: str) -> Iterator[None]:
-    """Be a driver of a cluster in the block, unless this process is one already.
-
-    Raises:
-        WorkerError: There is none at the address.
-    """
+    """Be a driver of a cluster in the block, unless this process is one already."""
     if ray.is_initialized():
         yield
         return

@@ -1,11 +1,6 @@
 """What a run shows while it goes on."""
 
-import io
-import time
-from typing import Any
-
 import pytest
-from rich.console import Console
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.evaluate.run.plan import WorkItem
@@ -27,46 +22,14 @@ def row(item: WorkItem, status: str) -> Rollout:
     return Rollout(
         *("mine", "world", "split", "r", item.episode.family, item.condition, "test"),
         *(item.episode.index, "none", 0, 1, 7, "easy", "a goal", status, success, 0, 0, 0, None),
-        error="it broke" if status == "error" else None,
+        error="it \x1b[2Jbroke" if status == "error" else None,
     )
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The time, in its one item."""
-    now = [1000.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    return now
-
-
-def shown(what: Any, width: int) -> list[str]:
-    console = Console(file=io.StringIO(), width=width, color_system=None)
-    console.print(what)
-    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
-
-
-def test_the_time_left_is_by_the_mean_rollout(clock: list[float]) -> None:
-    """However far apart rollouts end: 2 250 of them, 200 done before, 4 workers or one."""
-    progress = RunProgress(quiet=True)
-    progress.start(PLAN, [row(item, "fail") for item in PLAN[:200]])
-    assert progress.left() is None
-    clock[0] += 400  # the first ends after 400 s: 2 049 to go
-    progress.row(row(PLAN[200], "success"))
-    assert progress.left() == 2049 * 400
-    clock[0] += 100  # three more within 100 s: 4 in 500 s, 2 046 to go
-    for item in PLAN[201:204]:
-        progress.row(row(item, "fail"))
-    assert progress.left() == 2046 * 125
-    clock[0] += 60  # time goes by
-    lines = shown(progress.draw(), 100)
-    # 255 690 s are 2 days, 23 h 1 min 30 s.
-    assert "204/2250" in lines[-1] and lines[-1].endswith("2 days, 23:01:30 left")
 
 
 def test_nine_families_and_five_conditions_fit_into_80_columns() -> None:
     progress = RunProgress(quiet=True)
     progress.start(PLAN, [row(item, "success") for item in PLAN])
-    lines = shown(progress.draw(), 80)
+    lines = progress.rates().splitlines()
     assert max(map(len, lines)) <= 80
     for family in FAMILIES:
         (line,) = [line for line in lines if line.startswith(f"{family} ")]
@@ -98,6 +61,6 @@ def test_without_a_terminal_a_line_is_written_for_each_cell(
     assert capsys.readouterr().err.splitlines() == [
         "1 of 3 rollouts are done already",
         "MoveCube k0: 1/1 100%  (2 of 3)",
-        "MoveCube/test/0 under k1 broke: it broke",
+        r"MoveCube/test/0 under k1 broke: it \x1b[2Jbroke",
         "MoveCube k1: 1 broke  (3 of 3)",
     ]
