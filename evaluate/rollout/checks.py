@@ -58,7 +58,7 @@ def default_system(config: RunConfig) -> str:
     if learned not in (None, ORACLE):
         raise InvalidOptionError(
             f"the rows of {learned} need a name: it does not tell one checkpoint from another",
-            "Give --system, such as perceptual-framesamp-modul, or a name of your own: see "
+            "Set `system`, such as perceptual-framesamp-modul, or a name of your own: see "
             "docs/systems.md.",
         )
     name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
@@ -104,27 +104,26 @@ def _check_name(config: RunConfig, system: System) -> None:
     elif kind not in ("websocket", "python"):
         why = f"the policy {config.policy} is not the paper's system {system.name}"
     elif (system.subgoals is None) is (config.subgoals is not None) and kind == "websocket":
-        needs = "no subgoals" if system.subgoals is None else "subgoals of a model (--subgoals)"
-        why = f"system {system.name} acts on {needs}, and --subgoals is {config.subgoals}"
+        needs = "no subgoals" if system.subgoals is None else "subgoals of a model (`subgoals`)"
+        why = f"system {system.name} acts on {needs}, and `subgoals` is {config.subgoals}"
     elif config.subgoals == ORACLE:
         why = f"the subgoals of {system.name} are a model's, and {ORACLE} knows the answer"
     elif system.retrieval != step:
         has, given = ("a", "none is given") if system.retrieval else ("no", "one is given")
-        why = f"system {system.name} has {has} retrieval step, and {given} (--retrieval)"
+        why = f"system {system.name} has {has} retrieval step, and {given} (`retrieval`)"
     elif step and Rule.parse(config.retrieval_rule).method != "max":
         why = f"the retrieval step of {system.name} chooses by max, not by {config.retrieval_rule}"
     if why is not None:
-        raise InvalidOptionError(why, "Give --system a name of your own: see docs/systems.md.")
+        raise InvalidOptionError(why, "Set `system` to a name of your own: see docs/systems.md.")
 
 
 def _check_subgoals(config: RunConfig, system: System) -> None:
     """Refuse subgoals that nobody reads, and settings of them that say nothing."""
     for name in ("subgoal_prompt", "subgoal_options"):
         if getattr(config, name) and config.subgoals in (None, ORACLE):
-            option = {"subgoal_options": "--subgoal-option"}.get(name, "--subgoal-prompt")
             raise InvalidOptionError(
-                f"{option} says nothing without a model that writes subgoals",
-                "Add --subgoals openai:URL#MODEL, or leave it out.",
+                f"`{name}` has no effect without a model that writes subgoals",
+                'Set subgoals="openai:URL#MODEL", or leave it out.',
             )
     if config.subgoals is None:
         return
@@ -132,7 +131,7 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
     if kind not in READS_SUBGOALS:
         raise InvalidOptionError(
             f"the policy {config.policy} reads no subgoals",
-            f"Take {', '.join(READS_SUBGOALS)}, or leave out --subgoals.",
+            f"Take {', '.join(READS_SUBGOALS)}, or leave out `subgoals`.",
         )
     if config.subgoals != ORACLE:
         keeps = load_prompt(config.subgoal_prompt or system.prompt)[0].watches
@@ -141,7 +140,7 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
                 f"the prompt {config.subgoal_prompt} shows the model "
                 f"{'' if keeps else 'no '}recent frames; that of {system.name} "
                 f"{'does not' if keeps else 'does'}",
-                "Give that system's prompt, or --system a name of your own.",
+                "Give that system's prompt, or set `system` to a name of your own.",
             )
 
 
@@ -163,7 +162,7 @@ def check_plan(
         if not own and recorded not in (None, config.simulator):
             raise InvalidOptionError(
                 f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
-                f"Give --simulator {recorded}, or a split of {config.simulator}."
+                f'Set simulator="{recorded}", or give a split of {config.simulator}.'
                 if recorded in SIMULATORS
                 else "No simulator plays the episodes of this split: give one whose demonstrations "
                 f"are of {' or '.join(SIMULATORS)}, or a simulator of your own that plays them.",
@@ -185,7 +184,7 @@ def condition_refusal(
         who = "the policy" if system.with_history else system.name
         return InvalidOptionError(
             f"{who} takes no history, so {condition} says nothing of it",
-            f"Give --conditions {NO_HISTORY}.",
+            f"Set `conditions` to {NO_HISTORY}.",
         )
     if not system.applies(condition):
         return InvalidOptionError(

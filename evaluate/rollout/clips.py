@@ -55,7 +55,7 @@ def check_drawing() -> None:
     try:
         import PIL  # noqa: F401
     except ImportError as error:
-        raise MissingExtraError.needs("--videos", "pillow", "retrieval") from error
+        raise MissingExtraError.needs("`videos`", "pillow", "retrieval") from error
 
 
 def _harmless[**P](method: Callable[P, None]) -> Callable[P, None]:

@@ -196,10 +196,10 @@ def open_log(
     if there and RUN_HEADER not in there:
         raise RunFolderError(
             f"{folder} holds other files ({', '.join(there[:3])}) and no {RUN_HEADER}",
-            "Give a new folder to --out.",
+            "Set `out` to a new folder.",
         )
     busy = RunFolderError(
-        f"another process is writing {folder}", "Wait for it to end, or give another --out."
+        f"another process is writing {folder}", "Wait for it to end, or set another `out`."
     )
     with file_lock(folder / ".lock", busy):
         if not there:
@@ -208,7 +208,7 @@ def open_log(
             write_json(folder / RUN_HEADER, to_dict(header))
         elif not resume:
             raise RunFolderError(
-                f"{folder} holds a run already", "Give another --out, or leave out --no-resume."
+                f"{folder} holds a run already", "Set another `out`, or leave out `no_resume`."
             )
         header, rows = read_run(folder)
         check_same_run(folder, header.identity, identity)
@@ -281,7 +281,7 @@ def check_same_run(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, 
     if told:
         raise RunFolderError(
             f"{folder} holds another run: {'; '.join(told)}",
-            f"Give another --out, or the settings of the run that is there (see {RUN_HEADER}).",
+            f"Set another `out`, or the settings of the run that is there (see {RUN_HEADER}).",
         )
 
 

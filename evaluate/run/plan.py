@@ -93,7 +93,7 @@ def _read_shard(text: str) -> tuple[int, int]:
     shard = _SHARD.fullmatch(text)
     if shard is None or not 1 <= int(shard[1]) <= int(shard[2]):
         raise InvalidOptionError.expected(
-            "--shard", text, "NUMBER/OF, such as 2/8 for the second of eight"
+            "shard", text, "NUMBER/OF, such as 2/8 for the second of eight"
         )
     return int(shard[1]), int(shard[2])
 
@@ -125,10 +125,10 @@ def plan_work(
             raise UnknownNameError(
                 f"the split has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"It has episodes {format_numbers(numbers)} of {group}; --episode-split asks for "
+                f"It has episodes {format_numbers(numbers)} of {group}; `episode_split` asks for "
                 "others."
                 if numbers
-                else f"It has none of {group}: see --episode-split.",
+                else f"It has none of {group}: see `episode_split`.",
             )
         if numbers:
             chosen[group] = format_numbers(asked or numbers)
@@ -137,7 +137,7 @@ def plan_work(
         splits = sorted({one.split for one in there})
         raise InvalidOptionError(
             f"there is nothing to run: the split has no {episode_split} episode",
-            f"Give --episode-split; there are {', '.join(splits)}.",
+            f"Set `episode_split`; there are {', '.join(splits)}.",
         )
     return Plan(chosen, names, shard)
 

@@ -132,7 +132,7 @@ def test_a_missing_split_is_refused(tmp_path: Path) -> None:
 
 def test_videos_without_pillow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(MissingExtraError, match="--videos needs pillow"):
+    with pytest.raises(MissingExtraError, match="`videos` needs pillow"):
         run_one(tmp_path / "run", videos=True)
     assert not (tmp_path / "run").exists()
 

@@ -64,11 +64,11 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
             "It has none of MoveCube/val",
         ),
         ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
-        ({"episode_split": "train"}, InvalidOptionError, "no train episode\nGive --episode-split"),
+        ({"episode_split": "train"}, InvalidOptionError, "no train episode\nSet `episode_split`"),
         ({"episodes": "3-1"}, InvalidOptionError, "not a list of episode numbers"),
         ({"conditions": ["k0", "k64"]}, InvalidIdError, "'k64' is not a condition"),
         ({"conditions": ["k0", "k0"]}, InvalidOptionError, "each once"),
-        ({"shard": "9/8"}, InvalidOptionError, "--shard '9/8'"),
+        ({"shard": "9/8"}, InvalidOptionError, "shard '9/8'"),
     ],
 )
 def test_what_cannot_be_planned(

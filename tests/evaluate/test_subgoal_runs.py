@@ -175,7 +175,7 @@ def test_what_goes_together(tiny_split: Path, system: str, changes: dict[str, An
         ("memer", {**MODEL, "subgoal_prompt": "grounded"}, "no recent frames"),
         ("perceptual-framesamp-modul", MODEL, "acts on no subgoals"),
         ("mine", {**MODEL, "policy": "replay"}, "replay reads no subgoals"),
-        ("mine", {"subgoal_prompt": "simple"}, "says nothing without a model"),
+        ("mine", {"subgoal_prompt": "simple"}, "has no effect without a model"),
         ("mine", {"subgoals": "oracle", "subgoal_options": ("frames=3",)}, "--subgoal-option"),
         ("mine", {**MODEL, "subgoal_prompt": "nowhere.toml"}, "no prompt"),
     ],
