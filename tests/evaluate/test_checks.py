@@ -120,9 +120,9 @@ def test_only_simulators_that_exist_are_offered(
             run(tmp_path / "run", simulator="tabletop")
         return str(raised.value.hint)
 
-    assert "--simulator" not in hint() and "tabletop or robomme" in hint()
+    assert "Set simulator" not in hint() and "tabletop or robomme" in hint()
     monkeypatch.setitem(SIMULATORS, "sample", SIMULATORS["tabletop"])
-    assert "Give --simulator sample" in hint()
+    assert 'Set simulator="sample"' in hint()
 
 
 def test_a_missing_split_is_refused(tmp_path: Path) -> None:
