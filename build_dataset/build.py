@@ -26,7 +26,8 @@ from robomme_interference_data.runtime.executor import Executor, Outcome
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.encode import get_codec
-from robomme_interference_data.storage.files import canonical_json, replace_folder, staging_dir
+from robomme_interference_data.storage.files import canonical_json
+from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
 from .config import BuildPlan
 from .existing import ExistingDataset, open_existing

@@ -44,15 +44,10 @@ from robomme_interference_data.schema.manifest import (
     ManifestDataset,
     ManifestHeader,
 )
-from robomme_interference_data.storage.files import (
-    Files,
-    LocalFiles,
-    sha256_file,
-    staging_dir,
-    write_json,
-)
+from robomme_interference_data.storage.files import Files, LocalFiles, sha256_file, write_json
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.storage.parquet import writing
+from robomme_interference_data.storage.staging import staging_dir
 
 _BATCH = 1024
 """Rows in a row group: few bytes find one buffer."""

@@ -18,13 +18,9 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
 )
 from robomme_interference_data.errors import HubError, PublishError
-from robomme_interference_data.storage.files import (
-    all_files,
-    replace_folder,
-    sha256_file,
-    staging_dir,
-)
+from robomme_interference_data.storage.files import all_files, sha256_file
 from robomme_interference_data.storage.hub_errors import HubCall, busy_for
+from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
 from .publication import Version, versions_of
 

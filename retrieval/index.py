@@ -54,14 +54,12 @@ from robomme_interference_data.storage.files import (
     atomic_path,
     canonical_json,
     format_sums,
-    replace_folder,
     sha256_file,
-    staging_dir,
-    staging_path,
     write_json,
     write_text,
 )
 from robomme_interference_data.storage.hub import HubFiles
+from robomme_interference_data.storage.staging import replace_folder, staging_dir, staging_path
 
 from .encoders import Encoder, check_encoder, encoder_digest
 from .segment import typical_cosine

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 from robomme_interference_data.errors import PolicyServerError
 from robomme_interference_data.storage.cache import default_cache_folder
-from robomme_interference_data.storage.files import file_lock
+from robomme_interference_data.storage.staging import file_lock
 
 logger = logging.getLogger(__name__)
 

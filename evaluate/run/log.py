@@ -23,13 +23,13 @@ from robomme_interference_data.schema.rollouts import FINAL, Rollout, Status
 from robomme_interference_data.storage.files import (
     atomic_path,
     canonical_json,
-    file_lock,
     parse_json,
     read_bytes,
     write_json,
 )
 from robomme_interference_data.storage.headers import read_header
 from robomme_interference_data.storage.parquet import writing
+from robomme_interference_data.storage.staging import file_lock
 
 from .plan import Plan, WorkItem
 

@@ -31,7 +31,8 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.runtime.progress import WorkProgress
-from robomme_interference_data.storage.files import LocalFiles, file_lock, read_json, staging_path
+from robomme_interference_data.storage.files import LocalFiles, read_json
+from robomme_interference_data.storage.staging import file_lock, staging_path
 
 TRAIN = {f"{family}/train/{index}": (260, None) for family in ("A", "B") for index in range(2)}
 

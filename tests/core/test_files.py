@@ -14,13 +14,13 @@ from robomme_interference_data.storage.files import (
     LocalFiles,
     atomic_path,
     canonical_json,
-    file_lock,
     format_sums,
     parse_json,
     read_json,
     read_sums,
     write_json,
 )
+from robomme_interference_data.storage.staging import file_lock
 
 values = st.recursive(
     st.none()

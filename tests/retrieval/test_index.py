@@ -29,7 +29,7 @@ from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.retrieval.select import measure
-from robomme_interference_data.storage.files import file_lock, staging_path
+from robomme_interference_data.storage.staging import file_lock, staging_path
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 

@@ -15,7 +15,7 @@ from support.few import few
 from support.splits import contents
 
 from robomme_interference_data.build_dataset.stage import read_staged
-from robomme_interference_data.storage.files import staging_path
+from robomme_interference_data.storage.staging import staging_path
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
 
