@@ -77,6 +77,8 @@ class TransformersModel(ChatModel):
             processors: Any = transformers.AutoProcessor
             self._processor = processors.from_pretrained(self._folder)
             transformers.AutoConfig.from_pretrained(self._folder)
+            if not any(self._folder.glob("*.safetensors")):
+                raise OSError("it has no weights, *.safetensors")
         self._model: Any = None
 
     @contextmanager

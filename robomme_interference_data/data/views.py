@@ -56,13 +56,13 @@ def live_embedding(
 def _views(split: Split) -> Dataset:
     if SHIFTED not in split.datasets:
         what = f"{split.location} has no first live views under shifts"
-        if "tabletop" not in split.datasets[DEMONSTRATIONS].identity.simulators:
-            raise MissingFileError(what, "Only a split that was built from tabletop can have them.")
         if not isinstance(split.files, LocalFiles):
             raise MissingFileError(what, "Ask its publisher to add them.")
+        source = next(iter(split.datasets[DEMONSTRATIONS].identity.simulators), "SIMULATOR")
         raise MissingFileError(
             what,
-            "Build them, then build manifests and index again.",
-            f"build {SHIFTED} --source tabletop --split test --out {split.location}/{SHIFTED}",
+            "Build them, if the simulator of its demonstrations has shifts; then build manifests "
+            "and index again.",
+            f"build {SHIFTED} --source {source} --split test --out {split.location}/{SHIFTED}",
         )
     return split.datasets[SHIFTED]

@@ -1,6 +1,7 @@
 """Models in this process: a tiny one with random weights, saved and loaded as real ones are."""
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,10 @@ def test_digests_follow_the_files(tmp_path: Path) -> None:
 def test_what_cannot_be_loaded(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ModelError, match="cannot load the model"):
+        make_model(f"transformers:{tmp_path / 'empty'}")
+    for file in tiny.glob("*.json"):
+        shutil.copy(file, tmp_path / "empty")
+    with pytest.raises(ModelError, match="it has no weights"):
         make_model(f"transformers:{tmp_path / 'empty'}")
     with pytest.raises(InvalidOptionError, match="neither a folder"):
         make_model("transformers:nowhere at all")

@@ -153,7 +153,7 @@ def test_the_projection_is_that_of_the_camera(
 
 
 def test_the_point_is_on_the_thing(tabletop: TabletopSimulator) -> None:
-    for index in range(3):
+    for index in range(2):
         _, first, _ = tabletop.reset(f"VideoPlaceButton/test/{index}", demonstration=False)
         subgoal = tabletop.subgoal()
         colour = subgoal.text.split()[3]
