@@ -17,7 +17,7 @@ from robomme_interference_data.storage.files import canonical_json, indented_jso
 from robomme_interference_data.storage.hub import HubFiles
 from robomme_interference_data.viz.tables import Table
 
-from .publication import Version, VersionConfig
+from .publication import Version, VersionConfig, versions_of
 from .render import README, is_card
 from .repo import (
     Difference,
@@ -161,7 +161,7 @@ class Publisher:
         state = repository.state()
         files_at = cache(repository.files)  # what a commit holds never changes
         existing = files_at(state.head) if state else {}
-        versions = state.versions if state else {}
+        versions = versions_of(state.tags) if state else {}
         if not versions:
             _check_ours(content, repository, existing)
         newest = max(versions, default=self._wanted or content.first)

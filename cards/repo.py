@@ -22,8 +22,6 @@ from robomme_interference_data.storage.files import all_files, sha256_file
 from robomme_interference_data.storage.hub_errors import HubCall, busy_for
 from robomme_interference_data.storage.staging import replace_folder, staging_dir
 
-from .publication import Version, versions_of
-
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile as RemoteFile
 
@@ -169,11 +167,6 @@ class RepoState:
 
     head: str
     tags: dict[str, str]
-
-    @property
-    def versions(self) -> dict[Version, str]:
-        """The published versions, in order, and their commits."""
-        return versions_of(self.tags)
 
 
 class HubRepository:
