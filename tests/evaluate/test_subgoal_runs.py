@@ -11,6 +11,7 @@ from support.chat_server import (
     BROKEN,
     BUSY,
     CLOSED,
+    DRIPS,
     EMPTY,
     GARBAGE,
     REFUSED,
@@ -104,6 +105,13 @@ def test_a_run_with_a_faulty_endpoint_loses_no_row(tmp_path: Path) -> None:
     assert len([*(tmp_path / "subgoals").iterdir()]) == 4
 
 
+def test_an_answer_that_never_ends_is_an_error_row(tmp_path: Path) -> None:
+    options = ("repeats=0", "connect_s=0.2", "response_s=0.1")
+    with ChatServer(faults=[DRIPS]) as server:
+        [row] = run_one(tmp_path, **asking(server, subgoal_options=options)).rows
+    assert row.status == "error" and "no answer in time" in str(row.error)
+
+
 def test_an_endpoint_that_goes_away_costs_no_row(tmp_path: Path) -> None:
     with ChatServer() as server:
         settings = asking(server, subgoal_options=("repeats=0", "frames=4"))
@@ -176,7 +184,7 @@ def test_what_goes_together(tiny_split: Path, system: str, changes: dict[str, An
         ("perceptual-framesamp-modul", MODEL, "acts on no subgoals"),
         ("mine", {**MODEL, "policy": "replay"}, "replay reads no subgoals"),
         ("mine", {"subgoal_prompt": "simple"}, "has no effect without a model"),
-        ("mine", {"subgoals": "oracle", "subgoal_options": ("frames=3",)}, "--subgoal-option"),
+        ("mine", {"subgoals": "oracle", "subgoal_options": ("frames=3",)}, "`subgoal_options` has"),
         ("mine", {**MODEL, "subgoal_prompt": "nowhere.toml"}, "no prompt"),
     ],
 )

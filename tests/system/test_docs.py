@@ -13,7 +13,6 @@ from support.hub import push_split, running_hub
 from support.splits import GOLDEN, QUERIES
 from support.tabletop import copy_tabletop
 
-from robomme_interference_data.evaluate.questions import ask as ask_module
 from robomme_interference_data.evaluate.run import evaluation as run_module
 from robomme_interference_data.runtime.executor import Serial
 
@@ -50,8 +49,7 @@ def test_the_readmes_commands_run(
     (tmp_path / "demo" / "split").symlink_to(demo)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WORLDS_SPLIT", "S")
-    for module in (run_module, ask_module):
-        monkeypatch.setattr(module, "make_executor", lambda config: Serial())
+    monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
     for line in command_lines(ROOT / "README.md"):
         given = line.replace("robomme-h5:recordings/", "sample")
         if line.startswith("evaluate "):
@@ -117,8 +115,7 @@ def test_the_commands_of_the_pages_run(
         (tmp_path / name).symlink_to(split)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WORLDS_SPLIT", str(tiny_split))
-    for module in (run_module, ask_module):
-        monkeypatch.setattr(module, "make_executor", lambda config: Serial())
+    monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
     for name, prompt in re.findall(
         r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S
     ):
