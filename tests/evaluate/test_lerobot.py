@@ -8,33 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.lazy import lazy
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("lerobot")
-
-from support.lerobot_policies import (  # noqa: E402
-    SEED,
-    edit,
-    loaded,
-    play,
-    prepared,
-    save_policy,
-)
-
-from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST  # noqa: E402
-from robomme_interference_data.errors import (  # noqa: E402
+from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
+from robomme_interference_data.errors import (
     HubError,
     InvalidOptionError,
     MissingFileError,
     PolicyError,
 )
-from robomme_interference_data.evaluate.policies.lerobot import (  # noqa: E402
-    LeRobotPolicy,
-    find_policy,
-)
-from robomme_interference_data.evaluate.policies.policy import RolloutInfo  # noqa: E402
-from robomme_interference_data.evaluate.policies.registry import make_policy, pin_policy  # noqa: E402
+from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.evaluate.policies.registry import make_policy, pin_policy
 
+torch, _ = lazy("torch"), lazy("lerobot")
+lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot")
+small = lazy("support.lerobot_policies")
 pytestmark = pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT")
 
 
@@ -49,21 +37,21 @@ def _one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_policy(tmp_path_factory.mktemp("act"), "act")
+    return small.save_policy(tmp_path_factory.mktemp("act"), "act")
 
 
 @pytest.fixture(scope="module")
 def vqbet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_policy(tmp_path_factory.mktemp("vqbet"), "vqbet", (FRONT,))
+    return small.save_policy(tmp_path_factory.mktemp("vqbet"), "vqbet", (FRONT,))
 
 
-def made(folder: Path) -> LeRobotPolicy:
-    return LeRobotPolicy(str(folder), device="cpu")
+def made(folder: Path) -> Any:
+    return lerobot.LeRobotPolicy(str(folder), device="cpu")
 
 
 def window(before: Any, numbers: list[int]) -> dict[str, Any]:
     """The last observations as a model takes them, without any queue."""
-    batches = [before(prepared(number)) for number in numbers]
+    batches = [before(small.prepared(number)) for number in numbers]
     return {
         STATE: torch.stack([batch[STATE] for batch in batches], 1),
         "observation.images": torch.stack([batch[FRONT][:, None] for batch in batches], 1),
@@ -77,29 +65,31 @@ def test_act_gives_what_lerobots_own_loop_gives(act: Path, tmp_path: Path) -> No
     policy = made(act)
     assert (policy.wants_history, policy.every_frame, policy.privileged) == (False, False, False)
     assert (policy.cameras, policy.history_cameras) == (("front", "wrist"), ())
-    found = play(policy, 0, [1, 1])
-    model, before, after = loaded(act)
+    found = small.play(policy, 0, [1, 1])
+    model, before, after = small.loaded(act)
     for number in (0, 1):
         model.reset()
         expected = []
         for _ in range(16):  # of 20: more are never executed
             with torch.inference_mode():
-                expected.append(after(model.select_action(before(prepared(number)))).numpy()[0])
+                expected.append(
+                    after(model.select_action(before(small.prepared(number)))).numpy()[0]
+                )
         assert found[number].shape == (16, 8)
         assert found[number].dtype == np.float32
         np.testing.assert_allclose(found[number], np.stack(expected), rtol=1e-5, atol=1e-6)
     assert not np.allclose(found[0], found[1])
     # Fewer action steps are respected.
     folder = shutil.copytree(act, tmp_path / "short")
-    edit(folder, lambda config: config.update(n_action_steps=3))
-    np.testing.assert_array_equal(play(made(folder), 0, [1])[0], found[0][:3])
+    small.edit(folder, lambda config: config.update(n_action_steps=3))
+    np.testing.assert_array_equal(small.play(made(folder), 0, [1])[0], found[0][:3])
     policy.close()
 
 
 def test_temporal_ensembling_gives_one_averaged_action(act: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(act, tmp_path / "ensemble")
-    edit(folder, lambda config: config.update(n_action_steps=1, temporal_ensemble_coeff=0.01))
-    chunk, found = play(made(act), 0, [1, 1]), play(made(folder), 0, [1, 1])
+    small.edit(folder, lambda config: config.update(n_action_steps=1, temporal_ensemble_coeff=0.01))
+    chunk, found = small.play(made(act), 0, [1, 1]), small.play(made(folder), 0, [1, 1])
     assert [part.shape for part in found] == [(1, 8), (1, 8)]
     np.testing.assert_allclose(found[0][0], chunk[0][0], rtol=1e-5, atol=1e-6)
     # Second step: weights 1 for the older chunk and exp(-0.01) for the newer.
@@ -112,28 +102,28 @@ def test_a_queue_is_filled_with_the_end_of_the_history(vqbet: Path) -> None:
     policy = made(vqbet)
     assert (policy.wants_history, policy.every_frame) == (True, True)
     assert (policy.cameras, policy.history_cameras) == (("front",), ("front",))
-    model, before, after = loaded(vqbet)
+    model, before, after = small.loaded(vqbet)
 
     def check(found: np.ndarray, numbers: list[int], asked: int) -> None:
-        torch.manual_seed((SEED << 16) + asked)
+        torch.manual_seed((small.SEED << 16) + asked)
         with torch.inference_mode():
             chunk = model.vqbet(window(before, numbers), rollout=True)[0, :5]
             expected = np.stack([after(action[None]).numpy()[0] for action in chunk])
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
     # The first live observation is number 6: history 5 comes before it.
-    found = play(policy, 6, [1, 5, 1])
+    found = small.play(policy, 6, [1, 5, 1])
     for asked, numbers in enumerate([[5, 6], [10, 11], [11, 12]]):
         check(found[asked], numbers, asked)
     # Without history the first observation fills the queue.
-    check(play(policy, 0, [1])[0], [0, 0], 0)
+    check(small.play(policy, 0, [1])[0], [0, 0], 0)
 
 
 def test_diffusion_gives_what_its_model_gives_for_the_window(tmp_path: Path) -> None:
-    folder = save_policy(tmp_path, "diffusion", (FRONT,))
-    found = play(made(folder), 3, [1])[0]
-    model, before, after = loaded(folder)
-    torch.manual_seed(SEED << 16)
+    folder = small.save_policy(tmp_path, "diffusion", (FRONT,))
+    found = small.play(made(folder), 3, [1])[0]
+    model, before, after = small.loaded(folder)
+    torch.manual_seed(small.SEED << 16)
     with torch.inference_mode():
         chunk = model.diffusion.generate_actions(window(before, [2, 3]))[0]
         expected = np.stack([after(action[None]).numpy()[0] for action in chunk])
@@ -143,15 +133,15 @@ def test_diffusion_gives_what_its_model_gives_for_the_window(tmp_path: Path) -> 
 
 def test_rollouts_repeat_and_do_not_touch_the_global_generator(vqbet: Path) -> None:
     policy = made(vqbet)
-    first = play(policy, 4, [1, 3])
+    first = small.play(policy, 4, [1, 3])
     torch.manual_seed(99)
     state = torch.get_rng_state()
-    second = play(policy, 4, [1, 3])
+    second = small.play(policy, 4, [1, 3])
     assert torch.equal(torch.get_rng_state(), state)
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one, other)
     # What came before in the history is in the queue, and makes a difference.
-    assert not np.array_equal(first[0], play(policy, 3, [1])[0])
+    assert not np.array_equal(first[0], small.play(policy, 3, [1])[0])
 
 
 # --- what does not fit -------------------------------------------------------------------------
@@ -182,7 +172,7 @@ def test_what_does_not_fit_is_refused_when_it_is_made(
     act: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
 ) -> None:
     folder = shutil.copytree(act, tmp_path / "policy")
-    edit(folder, change)
+    small.edit(folder, change)
     with pytest.raises(PolicyError) as raised:
         made(folder)
     assert words in raised.value.message
@@ -191,7 +181,7 @@ def test_what_does_not_fit_is_refused_when_it_is_made(
 
 def test_renamed_observations_fit(tmp_path: Path) -> None:
     top = "observation.images.top"
-    folder = save_policy(tmp_path, "act", (top,))
+    folder = small.save_policy(tmp_path, "act", (top,))
     path = folder / "policy_preprocessor.json"
     settings = json.loads(path.read_text(encoding="utf-8"))
     for step in settings["steps"]:
@@ -200,7 +190,7 @@ def test_renamed_observations_fit(tmp_path: Path) -> None:
     path.write_text(json.dumps(settings), encoding="utf-8")
     policy = made(folder)
     assert policy.cameras == ("front",)
-    assert play(policy, 0, [1])[0].shape == (16, 8)
+    assert small.play(policy, 0, [1])[0].shape == (16, 8)
 
 
 def test_files_and_devices_that_are_not_there(act: Path, vqbet: Path, tmp_path: Path) -> None:
@@ -215,10 +205,10 @@ def test_files_and_devices_that_are_not_there(act: Path, vqbet: Path, tmp_path: 
     with pytest.raises(InvalidOptionError, match="neither a folder nor a model repository"):
         made(tmp_path / "none")
     with pytest.raises(HubError, match="not in the cache"):
-        LeRobotPolicy("nobody/nothing")
+        lerobot.LeRobotPolicy("nobody/nothing")
     for device in ("cuda:99", "tpu", "cpu:1", "cuda:x"):
         with pytest.raises(InvalidOptionError, match=f"'{device}' is none of cpu"):
-            LeRobotPolicy(str(act), device=device)
+            lerobot.LeRobotPolicy(str(act), device=device)
 
 
 # --- what it is known by -----------------------------------------------------------------------
@@ -240,7 +230,7 @@ def test_a_model_of_the_hub_is_known_by_its_commit(
         return str(snapshot)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    assert find_policy("me/act") == (snapshot, f"me/act@{commit}")
+    assert lerobot.find_policy("me/act") == (snapshot, f"me/act@{commit}")
     # A run asks once what a branch or tag stands for; its workers then ask for the commit.
     assert pin_policy("lerobot:me/act@v1") == f"lerobot:me/act@{commit}"
     policy = make_policy(f"lerobot:me/act@{commit}", ["device=cpu"])
@@ -266,7 +256,7 @@ def test_it_is_known_by_the_digest_of_weights_and_configuration(act: Path, tmp_p
     (copy / "config.json").write_text((copy / "config.json").read_text() + "\n")
     assert len({digest, changed, made(copy).metadata()["sha256"]}) == 3
     # The saved policies of these tests are always the same.
-    save_policy(tmp_path / "again", "act")
+    small.save_policy(tmp_path / "again", "act")
     assert (tmp_path / "again" / "model.safetensors").read_bytes() == (
         act / "model.safetensors"
     ).read_bytes()
