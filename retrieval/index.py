@@ -143,13 +143,11 @@ def look_on_hub(split: Split, encoder: Encoder, camera: str = "front") -> Iterat
             told = f"whether {files.describe()} has embeddings cannot be told: {error.message}"
             yield "\n".join([told, *filter(None, [error.hint])])
         except InterferenceError as error:
-            option = "" if camera == "front" else f" --camera {camera}"
             yield (
                 f"retrieval will not find the {name}: {error.message}\n"
-                "Ask their publisher for embeddings, or fetch them and make your own:\n"
+                "Ask their publisher for embeddings, or fetch them and embed their frames too:\n"
                 f"  hf download {files.repo_id} --repo-type dataset --revision {files.commit} "
-                f"--local-dir {split.location}/{name}\n"
-                f"  robomme-interference index {split.location} --encoder {encoder.name}{option}"
+                f"--local-dir {split.location}/{name}"
             )
         else:
             yield f"{files.describe()} has embeddings by the same encoder: retrieval finds them"

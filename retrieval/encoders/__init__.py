@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import PAPER_ENCODER
-from robomme_interference_data.data.embeddings import EncoderRecord, encoder_id
+from robomme_interference_data.data.embeddings import EncoderRecord, Remedy, encoder_id
 from robomme_interference_data.errors import InvalidOptionError, MissingIndexError
 from robomme_interference_data.runtime.specs import Kind, Registry
 from robomme_interference_data.storage.files import canonical_json
@@ -66,7 +66,7 @@ def encoder_digest(encoder: Encoder) -> str:
     return sha256(canonical_json(encoder.fingerprint).encode()).hexdigest()
 
 
-def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: str) -> None:
+def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: Remedy) -> None:
     """Check that embeddings were made with this very encoder.
 
     Args:
@@ -78,7 +78,7 @@ def check_encoder(recorded: EncoderRecord, encoder: Encoder, remedy: str) -> Non
         raise MissingIndexError(
             f"the embeddings of {encoder.name!r} beside the data were made with another version "
             "of the encoder: its weights, settings, preprocessing or code differ",
-            f"Make them again. {remedy}",
+            *remedy,
         )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import DISTRACTORS
 from robomme_interference_data.errors import MissingIndexError
 
-from .embeddings import EncoderRecord
+from .embeddings import EncoderRecord, Remedy
 
 if TYPE_CHECKING:
     from .dataset import Dataset
@@ -62,7 +62,7 @@ class SplitIndex:
                 raise MissingIndexError(
                     f"the embeddings of encoder {encoder!r} were made differently in "
                     f"{' and in '.join(places)}",
-                    f"Make them again. {index.remedy}",
+                    *index.remedy,
                 )
 
     @property
@@ -71,8 +71,8 @@ class SplitIndex:
         return self._units.header.encoder
 
     @property
-    def remedy(self) -> str:
-        """What to type so that they are made."""
+    def remedy(self) -> Remedy:
+        """How they are made."""
         return self._units.remedy
 
     @property

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +159,13 @@ def centre_of(episodes: Iterable[NDArray[np.float16]]) -> NDArray[np.float32]:
     return np.asarray(sum(means) / max(len(means), 1), np.float32)
 
 
+class Remedy(NamedTuple):
+    """How embeddings are made: hint and command of an error."""
+
+    hint: str
+    command: str
+
+
 class EmbeddingIndex:
     """The features of every stored frame of a dataset, of one camera and one encoder.
 
@@ -182,23 +189,24 @@ class EmbeddingIndex:
         try:
             path = files.path(f"{self._folder}/{INDEX_HEADER}")
         except MissingFileError:
-            raise MissingIndexError(f"{root} has no embeddings of {of}", self.remedy) from None
+            raise MissingIndexError(f"{root} has no embeddings of {of}", *self.remedy) from None
         try:
             self.header = read_header(path, IndexHeader)
         except FormatError as error:
-            raise FormatError(error.message, self.remedy) from None
+            raise FormatError(error.message, *self.remedy) from None
         made = self.header.encoder.name, self.header.camera
         if made != (encoder_id(encoder), camera):
             raise MissingIndexError(
                 f"the embeddings in {self._place} are of encoder {made[0]!r} and "
                 f"camera {made[1]!r}; expected {encoder_id(encoder)!r} and {camera!r}",
-                f"Give the encoder as {made[0]!r}, or make them anew. {self.remedy}",
+                f"Give the encoder as {made[0]!r}. {self.remedy.hint}",
+                self.remedy.command,
             )
         if self.header.revision != revision:
             raise MissingIndexError(
                 f"the embeddings of {of} in {root} were made of data with "
                 f"revision {self.header.revision[:12]}…; the data now has {revision[:12]}…",
-                f"Make them again. {self.remedy}",
+                *self.remedy,
             )
 
     @property
@@ -235,7 +243,7 @@ class EmbeddingIndex:
             raise UnknownNameError(
                 f"frames {start} to {stop - 1} of episode {episode_index} are not in "
                 f"{self._place}, which has {len(found)} frames of that episode",
-                f"It is damaged: make it again. {self.remedy}",
+                *self.remedy,
             )
         return np.asarray(found)[start:stop].copy()
 
@@ -290,17 +298,17 @@ class EmbeddingIndex:
             raise self._damaged(error.message) from None
 
     def _damaged(self, what: str) -> FormatError:
-        return FormatError(f"{self._place}: {what}", self.remedy)
+        return FormatError(f"{self._place}: {what}", *self.remedy)
 
 
-def _remedy(files: Files, options: str) -> str:
-    """Return what to type so that a dataset has an index; a split's are indexed together."""
-    command = "robomme-interference index"
+def _remedy(files: Files, options: str) -> Remedy:
+    """Return how a dataset gets an index; a split's are indexed together."""
     if not isinstance(files, LocalFiles):
-        return (
-            f"Fetch {files.describe()} to a folder and type: {command} FOLDER {options}. Or ask "
-            "its publisher to add them."
+        hint = (
+            f"Fetch {files.describe()} to a folder and embed its frames, or ask its publisher to "
+            "add embeddings."
         )
+        return Remedy(hint, f"index FOLDER {options}")
     root = files.root
     split = root.parent if root.name in DATASETS else root
-    return f"Type: {command} {split} {options}"
+    return Remedy("Embed the frames of all its datasets (again).", f"index {split} {options}")

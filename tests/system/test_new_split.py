@@ -94,14 +94,14 @@ def test_published_demonstrations_without_an_index(
     code, _, err = run("index", out)
     assert code == 0 and "retrieval will not find the demonstrations" in err
     assert run("retrieve", "MoveCube/test/0", "k1", "--split", out)[0] == 1
-    download, index = (line.split() for line in err.splitlines() if line.startswith("  "))
+    (download,) = (line.split() for line in err.splitlines() if line.startswith("  "))
     subprocess.run(
         [Path(sys.executable).parent / download[0], *download[1:]],
         env={**os.environ, "HF_ENDPOINT": hub.endpoint, "HF_HUB_OFFLINE": "0"},
         check=True,
         capture_output=True,
     )
-    assert run(*index[1:])[0] == 0
+    assert run("index", out)[0] == 0
     assert run("retrieve", "MoveCube/test/0", "k1", "--split", out)[0] == 0
     assert [*verify_split(load_split(out))] == []
     shutil.rmtree(out / "demonstrations")
