@@ -7,7 +7,6 @@ from typing import Any
 
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
-    IDENTITY_PATH,
     MANIFEST_ROWS,
     MANIFESTS,
     QUESTIONS_PATH,
@@ -25,9 +24,16 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json, sha256_file
 
 from .film import film_of_lesson, film_of_split
-from .limits import data_limits
-from .markdown import code, escape
-from .publication import Publication, check_repo_id, is_commit
+from .markdown import code
+from .publication import Publication
+from .sources import (
+    Rows,
+    data_limits,
+    dataset_rows,
+    repositories_of,
+    source_details,
+    source_kinds_of,
+)
 from .tables import condition_table, count_table, goal_table, unit_table
 
 _LOSSY_SOURCE = "lerobot/robomme"
@@ -35,8 +41,6 @@ _LOSSY_SOURCE = "lerobot/robomme"
 
 _BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
 _FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
-
-Rows = list[tuple[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
     records = records_of(dataset)
     film = film_of_lesson(dataset, records)
     frames, skipped = sum(record.length for record in records), _skipped(dataset)
-    families, repositories = _families(records), _repositories(dataset)
+    families, repositories = _families(records), repositories_of(dataset)
     more = (
         f"{skipped:,} recorded episodes yielded no demonstration, or were of no use: "
         f"{REPORT_PATH} names each and says why."
@@ -130,7 +134,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
         families=families,
         simulators=dataset.identity.simulators,
         limits=data_limits(records, dataset.identity.simulators, [more] * bool(skipped)),
-        provenance=lambda about: _dataset_rows(dataset),
+        provenance=lambda about: dataset_rows(dataset),
         pictures=film.pictures,
         values={
             "film": film,
@@ -150,8 +154,8 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
             "lossy_name": _LOSSY_SOURCE,
         },
         repositories=repositories,
-        source_kinds=_source_kinds([dataset]),
-        details=_sources({DEMONSTRATIONS: dataset}),
+        source_kinds=source_kinds_of([dataset]),
+        details=source_details({DEMONSTRATIONS: dataset}),
         file_sets=_FILE_SETS,
     )
 
@@ -169,7 +173,7 @@ def split_facts(split: Split) -> Facts:
     film = film_of_split(split, queries, manifests)
     same_family = count_same_family(manifests)
     simulators = sorted({name for one in datasets.values() for name in one.identity.simulators})
-    repositories = {k: v for one in datasets.values() for k, v in _repositories(one).items()}
+    repositories = {k: v for one in datasets.values() for k, v in repositories_of(one).items()}
     more = (
         f"{same_family:,} buffers hold distractors of the query's own family, which the "
         "paper's protocol rules out: results stand beside none of the benchmark."
@@ -188,7 +192,7 @@ def split_facts(split: Split) -> Facts:
             ("revision of the split", code(split.revision)),
             (f"SHA-256 of `{_BUFFERS}`", code(header.rows)),
         ]
-        rows += [row for name, one in datasets.items() for row in _dataset_rows(one, name)]
+        rows += [row for name, one in datasets.items() for row in dataset_rows(one, name)]
         return [*rows, ("version of the draw", code(header.rule_version))]
 
     return Facts(
@@ -231,8 +235,8 @@ def split_facts(split: Split) -> Facts:
         },
         base=header.datasets[DEMONSTRATIONS].place,
         repositories=repositories,
-        source_kinds=_source_kinds(datasets.values()),
-        details=_sources(datasets),
+        source_kinds=source_kinds_of(datasets.values()),
+        details=source_details(datasets),
         file_sets={**_FILE_SETS, "manifest": f"{MANIFESTS}/*.json"},
     )
 
@@ -282,39 +286,6 @@ def _skipped(dataset: Dataset) -> int:
     """Return how many recorded episodes yielded nothing."""
     skipped = read_json(dataset.files.path(REPORT_PATH)).get("skipped")
     return len(skipped) if isinstance(skipped, list) else 0
-
-
-def _repositories(dataset: Dataset) -> dict[str, str | None]:
-    found: dict[str, str | None] = {}
-    for one in dataset.identity.sources:
-        repo, revision = one.get("repo"), one.get("revision")
-        with suppress(InvalidOptionError):  # whoever wrote the data may have written anything
-            found[check_repo_id(repo)] = str(revision) if is_commit(revision) else None
-    return found
-
-
-def _source_kinds(datasets: Iterable[Dataset]) -> list[str]:
-    kinds = {one.get("kind") for dataset in datasets for one in dataset.identity.sources}
-    return sorted(kind for kind in kinds if isinstance(kind, str))
-
-
-def _sources(datasets: Mapping[str, Dataset]) -> dict[str, Any]:
-    found = {name: list(dataset.identity.sources) for name, dataset in datasets.items()}
-    return {f"Sources of the {name}": sources for name, sources in found.items() if sources}
-
-
-def _dataset_rows(dataset: Dataset, name: str = "") -> Rows:
-    identity, of = dataset.identity, f" of the {escape(name)}" if name else ""
-    digest = sha256_file(dataset.files.path(IDENTITY_PATH))
-    return [
-        (f"revision of the content{of}", code(identity.revision)),
-        (f"SHA-256 of `{IDENTITY_PATH}`{of}", code(digest)),
-        (f"codec{of}", code(identity.codec)),
-        *(
-            (f"source{of}", code(f"{repo}@{commit}" if commit else repo))
-            for repo, commit in _repositories(dataset).items()
-        ),
-    ]
 
 
 def _beyond_paper(conditions: Iterable[str]) -> list[tuple[list[str], str]]:

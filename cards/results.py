@@ -28,13 +28,13 @@ from robomme_interference_data.storage.files import sha256_file
 from robomme_interference_data.viz.figure import open_figure, save_figure
 from robomme_interference_data.viz.tables import Table
 
-from .facts import CardTable, Facts, Rows
-from .limits import origin_limit
+from .facts import CardTable, Facts
 from .markdown import Raw, code, escape
 from .publication import Publication, Version, VersionConfig
 from .publisher import RepoContent, digest
 from .render import card_files
 from .repo import LocalFile, RepoFiles
+from .sources import Rows, origin_limit
 
 _GRIDS = {
     Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",

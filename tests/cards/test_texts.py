@@ -22,10 +22,10 @@ from robomme_interference_data.cards.facts import (
     split_facts,
 )
 from robomme_interference_data.cards.film import film_of_split
-from robomme_interference_data.cards.limits import is_whole_grid
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_files, card_text
 from robomme_interference_data.cards.results import results_facts
+from robomme_interference_data.cards.sources import is_whole_grid
 from robomme_interference_data.constants import (
     FAMILIES,
     IDENTITY_PATH,
