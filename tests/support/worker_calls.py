@@ -59,20 +59,16 @@ def behave(task: tuple[str, Any], worker: Worker) -> Any:
         case "die once":
             if once(more):
                 os._exit(7)
-        case "end the parent once":
-            if once(more):
-                os.kill(os.getppid(), signal.SIGKILL)
-                time.sleep(FOREVER)
         case "hang":
             Path(more, str(os.getpid())).touch()
             time.sleep(FOREVER)
         case "hang in a part":
-            with worker.limit(1.0, "a part"):
+            with worker.limit(0.3, "a part"):
                 ctypes.PyDLL(None).sleep(int(FOREVER))  # in C, with the interpreter's lock held
         case "parts":
             for _ in range(3):
-                with worker.limit(2.0, "a part"):
-                    time.sleep(0.8)
+                with worker.limit(0.5, "a part"):
+                    time.sleep(0.2)
         case "start":
             folder, end = more
             fork: Any = multiprocessing.get_context("fork")

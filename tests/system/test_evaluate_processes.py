@@ -141,10 +141,10 @@ def test_the_command_may_be_killed_or_stopped_at_any_moment(
 def test_a_simulator_that_hangs_or_takes_its_process_along_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "VideoRepick-0").write_text("die")
     (tmp_path / "MoveCube-0").write_text("hang")
-    options = {"conditions": ("no-history",), "simulator_timeout": 6.0}
+    options = {"conditions": ("no-history",), "simulator_timeout": 2.0}
     died, hung = runs.run(tmp_path / "run", Processes(2), **options).rows
     assert (died.error, died.attempt) == ("the worker process died (exit code -9)", 2)
-    assert (hung.error, hung.attempt) == ("the simulator's steps took more than 6 s", 2)
+    assert (hung.error, hung.attempt) == ("the simulator's steps took more than 2 s", 2)
     log = (tmp_path / "run" / "errors.log").read_text()
     assert "MoveCube/test/0 under no-history, attempt 2" in log
     assert "worlds.py" in log and "in step" in log  # where it hung
