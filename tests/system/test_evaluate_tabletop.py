@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from support.runs import untimed
+from support.tabletop import TABLETOP
 
 from robomme_interference_data.errors import NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.rollout.checks import check_simulator
 from robomme_interference_data.runtime.executor import Processes
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
@@ -18,12 +18,14 @@ pytestmark = pytest.mark.slow
 COMMAND = Path(sys.executable).parent / "robomme-interference"
 
 
-def test_a_machine_that_cannot_draw_is_told_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_that_cannot_draw_is_told_so_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
         monkeypatch.setenv(name, "/nowhere.json")
     with pytest.raises(NoRendererError) as raised:
-        check_simulator(RunConfig("hold", Path("S"), Path("R")), ("front",), Processes(1))
-    assert raised.value.hint
+        run_evaluation(RunConfig("replay", str(TABLETOP), tmp_path / "run"), executor=Processes(1))
+    assert raised.value.hint and not (tmp_path / "run").exists()
 
 
 @pytest.fixture(scope="module")
