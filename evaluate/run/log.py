@@ -222,7 +222,7 @@ def read_run(folder: Path) -> tuple[RunHeader, dict[WorkItem, Rollout]]:
         if not (folder / name).is_file():
             raise RunFolderError(
                 f"{folder} holds no run: {name} is missing",
-                "Give a folder that robomme-interference evaluate wrote, all of it.",
+                "Give a folder that an evaluation wrote, all of it.",
             )
     header, rows = read_header(folder / RUN_HEADER, RunHeader), read_record(folder)
     return header.standing(rows), rows
