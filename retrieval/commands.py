@@ -227,6 +227,7 @@ def calibrate(
     families: Families = [],  # noqa: B006
     conditions: Conditions = [],  # noqa: B006
     camera: Camera = "front",
+    out: Picture = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit the cosine below which histories are cut, and show what others would give.
@@ -237,20 +238,24 @@ def calibrate(
     Examples:
     ```
     robomme-interference calibrate my-split
-    robomme-interference calibrate my-split --sweep 0.30 0.99
+    robomme-interference calibrate my-split --sweep 0.30 0.99 --out thresholds.png
     ```
     """
     from robomme_interference_data.schema.codec import to_dict
 
     from . import calibrate as fitting
-    from . import encoders, select
+    from . import charts, encoders, select
 
+    check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
     about, measured = _measured(split, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
     found = fitting.calibrate(measured, rule, thresholds)
     title = f"Threshold of {name}, camera {camera}, on {about['split']}"
+    if out is not None:
+        charts.draw_calibration(found, title, out)
+        say(f"{out} written")
     if as_json:
         print_json(about | to_dict(found))
     else:

@@ -219,9 +219,10 @@ def test_why_wherever_the_lesson_lies(
 # --- calibrate ---------------------------------------------------------------------------------
 
 
-def test_calibration(run: Run, indexed: Path) -> None:
-    code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2")
-    assert code == 0
+def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
+    figure = tmp_path / "thresholds.svg"
+    code, out, err = run("calibrate", indexed, "--sweep", "0.1", "0.2", "--out", figure)
+    assert code == 0 and f"{figure} written" in err and figure.read_text().startswith("<?xml")
     assert "Fitted by the released rule: " in out and "in use (max/adaptive): " in out
     assert all(f"\n{family} " in out for family in FAMILIES)
     lines = out.splitlines()
