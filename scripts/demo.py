@@ -51,7 +51,7 @@ RESULTS = {
 NEXT = (
     "robomme-interference verify demo/split",
     "robomme-interference evaluate --policy guess --split demo/split --out demo/runs/guess",
-    "robomme-interference build all --help",
+    "robomme-interference list demo/split",
 )
 
 

@@ -1,6 +1,7 @@
 """What README and docs show must work: examples run, and every command line is a valid one."""
 
 import re
+import runpy
 import shlex
 import tomllib
 from pathlib import Path
@@ -31,7 +32,10 @@ def command_lines(page: Path) -> list[str]:
     return [match[1] for line in lines if (match := pattern.match(line.strip()))]
 
 
+DEMO = runpy.run_path(str(ROOT / "scripts" / "demo.py"))
 ALL = [(page.name, line) for page in PAGES for line in command_lines(page)]
+ALL += [("demo.py", line) for line in DEMO["STEPS"].values()]
+ALL += [("demo.py", line.removeprefix("robomme-interference ")) for line in DEMO["NEXT"]]
 
 
 @pytest.mark.parametrize(("page", "line"), ALL)

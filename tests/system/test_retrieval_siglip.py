@@ -157,7 +157,7 @@ def test_weights_that_are_not_there(tmp_path: Path) -> None:
     pytest.importorskip("transformers")
     with pytest.raises(HubError, match="google/siglip-so400m-patch14-384") as caught:
         make_encoder("siglip")
-    assert "hf download google/siglip-so400m-patch14-384" in str(caught.value.hint)
+    assert "hf download --repo-type model google/siglip-so400m-" in str(caught.value.hint)
     with pytest.raises(InvalidOptionError, match="'nothing' is neither a folder nor a model"):
         make_encoder("siglip:nothing")
     with pytest.raises(FormatError, match="cannot be loaded"):
