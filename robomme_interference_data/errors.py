@@ -80,11 +80,7 @@ class UnknownNameError(InterferenceError, LookupError):
 class InvalidOptionError(InterferenceError, ValueError):
     """An option or argument outside what it may be.
 
-    Args:
-        message: As for every error.
-        hint: As for every error.
-        command: As for every error.
-        option: Name of the setting in Python, such as `workers`, if the message contains it.
+    `option` is the name of the setting in Python, such as `workers`, if the message contains it.
     """
 
     def __init__(

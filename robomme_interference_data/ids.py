@@ -104,9 +104,6 @@ def whole_number(option: str, given: Any, expected: str) -> int:
         option: Name of the argument.
         given: The argument.
         expected: What it is to be, for the message.
-
-    Raises:
-        InvalidOptionError: It is none.
     """
     try:
         if not isinstance(given, bool):
@@ -121,19 +118,12 @@ def parse_numbers(text: str) -> tuple[int, ...]:
 
     Returns:
         The numbers, ascending, each once.
-
-    Raises:
-        InvalidOptionError: The text is something else, or names over a million numbers.
     """
     return tuple(sorted({number for span in _spans(text) for number in span}))
 
 
 def count_numbers(text: str) -> int:
-    """Count what `parse_numbers` would read, without reading it; what comes twice counts twice.
-
-    Raises:
-        InvalidOptionError: As `parse_numbers`.
-    """
+    """Count what `parse_numbers` would read, without reading it; what comes twice counts twice."""
     return sum(map(len, _spans(text)))
 
 

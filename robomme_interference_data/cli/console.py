@@ -58,11 +58,7 @@ def log_to_stderr() -> None:
 
 
 def check_output(*paths: Path | None) -> None:
-    """Refuse to write into a dataset or the manifests of a split, every file of which is hashed.
-
-    Raises:
-        InvalidOptionError: A path lies in one.
-    """
+    """Refuse to write into a dataset or the manifests of a split, every file of which is hashed."""
     for path in filter(None, paths):
         for folder in (path.resolve(), *path.resolve().parents):
             manifests = (folder / name for name in (MANIFEST_HEADER, MANIFEST_ROWS))
