@@ -28,7 +28,8 @@ from nothing import Nothing
 
 from evaluate import seconds_a_rollout
 from robomme_interference_data.constants import FAMILIES, MAX_STEPS
-from robomme_interference_data.evaluate.run.config import Run, RunConfig
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.log import open_log
 from robomme_interference_data.evaluate.run.plan import WorkItem, shuffle_work
 from robomme_interference_data.evaluate.run.progress import RunProgress

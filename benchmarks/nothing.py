@@ -1,6 +1,7 @@
 """A rollout that does nothing, in a module of its own: workers import it."""
 
-from robomme_interference_data.evaluate.run.config import Run, RunConfig
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.kind import Run
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.rollouts import Rollout
