@@ -2,12 +2,11 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from support.cards import CARDS, OF_DEMONSTRATIONS, OF_SPLIT, without_version
+from support.cards import CARDS, OF_SPLIT, without_version
 from support.splits import GOLDEN
 
 from robomme_interference_data import load_split
@@ -52,51 +51,6 @@ def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> Non
 
 
 # --- front matter ---------------------------------------------------------------------------------
-
-
-def front_matter(text: str) -> dict[str, Any]:
-    from huggingface_hub import DatasetCard
-
-    card = DatasetCard(text)
-    assert card.text.lstrip().startswith("# ")
-    return dict(card.data.to_dict())
-
-
-def test_the_front_matter_of_a_split(made: dict[str, dict[str, bytes]]) -> None:
-    found = front_matter(made["split"][README].decode())
-    assert found["tags"][0] == "LeRobot"
-    assert found["task_categories"] == ["robotics"]
-    assert found["size_categories"] == ["n<1K"]
-    assert found["license"] == "cc-by-4.0"
-    assert found["source_datasets"] == [OF_DEMONSTRATIONS.repo_id]
-    assert "tiny-split" in found["pretty_name"]
-
-
-def test_front_matter_of_what_was_made_from_nothing_published(
-    made: dict[str, dict[str, bytes]],
-) -> None:
-    found = front_matter(made["demonstrations"][README].decode())
-    assert (found["license"], found["source_datasets"]) == ("other", ["original"])
-
-
-@pytest.mark.parametrize(
-    ("name", "configs", "default"),
-    [
-        ("demonstrations", {"episodes"}, "episodes"),
-        ("split", {"buffers", "episodes"}, "buffers"),
-        ("results", {"rollouts"}, "rollouts"),
-    ],
-)
-def test_configs(
-    made: dict[str, dict[str, bytes]], name: str, configs: set[str], default: str
-) -> None:
-    from datasets.utils.metadata import MetadataConfigs
-    from huggingface_hub import DatasetCard
-
-    card = DatasetCard(made[name][README].decode())
-    found = MetadataConfigs.from_dataset_card_data(card.data)
-    assert found.keys() == configs
-    assert found.get_default_config_name() == default
 
 
 @pytest.mark.parametrize(

@@ -117,16 +117,6 @@ def test_columns_are_described_without_docstrings() -> None:
     assert done.stdout == "True\n"
 
 
-def test_records_in_columns_have_their_parts() -> None:
-    columns = {one.name: one for one in columns_of(BufferManifest)}
-    assert [one.name for one in columns["query"].parts] == [
-        *("dataset", "revision", "episode_index", "frame")
-    ]
-    assert columns["sessions"].words == "list of records"
-    assert columns["goals"].words == "list of text"
-    assert columns["query"].words == "record"
-
-
 @pytest.mark.parametrize(("split", "has_questions"), [(TABLETOP, True), (GOLDEN, False)])
 def test_questions_are_a_table_of_their_own(split: Path, has_questions: bool) -> None:
     facts = split_facts(load_split(split))

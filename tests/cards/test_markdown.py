@@ -1,7 +1,6 @@
 """What a stranger wrote is shown as it is, whatever Markdown could make of it."""
 
 import ast
-import re
 import unicodedata
 from typing import Any
 
@@ -14,7 +13,6 @@ from robomme_interference_data.cards.markdown import Raw, block, code, escape, q
 from robomme_interference_data.viz.tables import Table
 
 READER = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-HOSTILE = "pick up | the `red` cube\n\n# {{ goal }} <script>alert(1)</script> ![x](http://a.b)"
 NASTY = st.text(st.sampled_from(" \t\n#+-=*_~`|<>&$![](){}\\:/@.1aB\u202e\x00\ud800é"), max_size=40)
 
 
@@ -71,13 +69,6 @@ def test_quoted_text_is_a_literal_in_a_block_of_code(text: str) -> None:
     assert "\n" not in line
     assert "`" not in line
     assert ast.literal_eval(line.removeprefix("load")) == text
-
-
-def test_a_hostile_goal() -> None:
-    shown = escape(HOSTILE)
-    assert "\n" not in shown
-    assert not re.search(r"[<>|]|://|(?<!\\)[`\[]", shown)
-    assert "{{ goal }}" in shown  # no template is filled in twice
 
 
 @pytest.mark.parametrize(

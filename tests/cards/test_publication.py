@@ -17,14 +17,6 @@ from robomme_interference_data.errors import InvalidOptionError
 COMMIT = "0123456789" * 4
 
 
-def test_what_follows_from_it() -> None:
-    about = Publication("people/tiny", "1.2.0", base=f"people/demos@{COMMIT}")
-    assert (about.namespace, about.name, about.tag) == ("people", "tiny", "data-1.2.0")
-    assert about.url == "https://huggingface.co/datasets/people/tiny"
-    assert (about.base_repo, about.base_commit) == ("people/demos", COMMIT)
-    assert Publication("people/tiny").base_repo is None
-
-
 @pytest.mark.parametrize(
     "wrong",
     [

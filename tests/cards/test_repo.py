@@ -11,13 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.hub_repositories import Blob
 from support.machine import full_disk
-from support.publishing import content_of, plain_cards, plan_again
+from support.publishing import content_of, plain_cards
 from support.splits import GOLDEN, contents, copy_split
 
 from robomme_interference_data import load_buffer, load_split
 from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.cards.publication import Version
-from robomme_interference_data.cards.publish import parts_of_buffers, parts_of_dataset
 from robomme_interference_data.cards.repo import (
     LocalFile,
     RepoFiles,
@@ -83,22 +81,6 @@ def test_the_files_of_a_split(tmp_path: Path) -> None:
     before = (GOLDEN / "manifests/manifest.json").read_text(encoding="utf-8")
     added = [line.strip() for line in header.splitlines() if line not in before.splitlines()]
     assert added == [f'"place": "{BASE}",', '"place": ".",']
-
-
-def test_parts_are_episodes_and_buffers(tmp_path: Path) -> None:
-    split = load_split(GOLDEN)
-    families = ("MoveCube", "PatternLock", "VideoRepick")
-    lessons = parts_of_dataset(split.datasets["demonstrations"])
-    assert sorted(lessons) == [f"demonstrations {family}/test/0" for family in families]
-    before = parts_of_buffers(split.manifests())
-    root = copy_split(tmp_path / "split")
-    plan_again(root, ["k0", "k1", "k2", "k3", "k7", "no-history"])
-    more = parts_of_buffers(load_split(root).manifests())
-    assert Version(1, 0, 0).following(before, more) == (1, 1, 0)
-    plan_again(root, split.conditions, seed=1)
-    drawn = parts_of_buffers(load_split(root).manifests())
-    same = {name.rpartition(" ")[2] for name in before if drawn[name] == before[name]}
-    assert drawn.keys() == before.keys() and same == {"no-history", "k0"}
 
 
 # --- in a folder ---------------------------------------------------------------------------------

@@ -154,14 +154,12 @@ class LoopbackServer(ABC):
         asked: Every request so far.
         down: Answer 503 to everything.
         latency: Seconds that every answer takes longer.
-        clock: Seconds by which the `Date` of every answer is ahead.
     """
 
     def __init__(self) -> None:
         self.asked: list[Request] = []
         self.down = False
         self.latency = 0.0
-        self.clock = 0.0
         self._faults: list[Fault] = []
         self._lock = threading.RLock()
         self._server = _Threads(("127.0.0.1", 0), _handler(self))
@@ -268,9 +266,6 @@ def _handler(server: LoopbackServer) -> type[BaseHTTPRequestHandler]:
         def hang_up(self) -> None:
             self.close_connection = True
             self.connection.shutdown(socket.SHUT_RDWR)
-
-        def date_time_string(self, timestamp: float | None = None) -> str:
-            return super().date_time_string((timestamp or time.time()) + server.clock)
 
         def log_message(self, *_: Any) -> None:
             pass
