@@ -59,22 +59,15 @@ class UnknownNameError(InterferenceError, LookupError):
     """An episode, family, condition or camera that the data does not hold."""
 
     @classmethod
-    def among(
-        cls,
-        what: str,
-        given: object,
-        where: object,
-        known: Iterable[object],
-        command: str | None = None,
-    ) -> Self:
+    def among(cls, what: str, given: object, where: object, known: Iterable[object]) -> Self:
         """Return the error for a name that is not there: `what` it names, and what there is."""
         hint = nearest(str(given), map(str, known))
-        return cls(f"{what} {given!r} is not in {where}", hint, command)
+        return cls(f"{what} {given!r} is not in {where}", hint)
 
     @classmethod
-    def none(cls, what: str, given: str, known: Iterable[str], command: str | None = None) -> Self:
+    def none(cls, what: str, given: str, known: Iterable[str]) -> Self:
         """Return the error for a name that nothing has: `what` it names, and what there is."""
-        return cls(f"there is no {what} {given!r}", nearest(given, known), command)
+        return cls(f"there is no {what} {given!r}", nearest(given, known))
 
 
 class InvalidOptionError(InterferenceError, ValueError):
@@ -94,37 +87,27 @@ class InvalidOptionError(InterferenceError, ValueError):
         self.option = option
 
     @classmethod
-    def expected(
-        cls,
-        option: str,
-        given: object,
-        expected: str,
-        hint: str | None = None,
-        command: str | None = None,
-    ) -> Self:
+    def expected(cls, option: str, given: object, expected: str, hint: str | None = None) -> Self:
         """Return the error for a setting: its Python name, what was given, what was expected."""
-        return cls(f"{option} {given!r}; expected {expected}", hint, command, option)
+        return cls(f"{option} {given!r}; expected {expected}", hint, option=option)
 
     @classmethod
-    def one_of(
-        cls, option: str, given: object, known: Iterable[str], command: str | None = None
-    ) -> Self:
+    def one_of(cls, option: str, given: object, known: Iterable[str]) -> Self:
         """Return the error for a setting that is none of the known names."""
         names = list(known)
         message = f"{option} {given!r} is none of {', '.join(names)}"
-        return cls(message, nearest(str(given), names, more=""), command, option)
+        return cls(message, nearest(str(given), names, more=""), option=option)
 
 
 class MissingExtraError(InterferenceError, ImportError):
     """A library of an optional extra is not installed."""
 
     @classmethod
-    def needs(cls, what: str, library: str, extra: str, command: str | None = None) -> Self:
+    def needs(cls, what: str, library: str, extra: str) -> Self:
         """Return the error for work that needs a library of an extra."""
         return cls(
             f"{what} needs {library}, which is not installed",
             f'Install it: pip install "robomme-interference-data[{extra}]"',
-            command,
         )
 
 
@@ -144,10 +127,10 @@ class FormatError(InterferenceError, ValueError):
     """A file that is not what it should be: damaged, inconsistent, or of an unknown version."""
 
     @classmethod
-    def damaged(cls, path: object, what: object, command: str | None = None) -> Self:
+    def damaged(cls, path: object, what: object) -> Self:
         """Return the error for a file that holds what it should not: its path, and what."""
         hint = "The file is damaged: download or build it again."
-        return cls(f"{path}: {what}", hint, command)
+        return cls(f"{path}: {what}", hint)
 
 
 class HashMismatchError(InterferenceError, ValueError):
@@ -219,15 +202,12 @@ class WorkerRetiredError(InterferenceError, RuntimeError):
 
 
 def nearest(given: str, known: Iterable[str], *, more: str = "Known: ") -> str:
-    """Return a sentence that offers the nearest valid names.
+    """Return a sentence that offers the nearest valid names, or else lists at most 10 of them.
 
     Args:
         given: The unknown name.
-        known: All valid names; at most 10 of them are listed when none is near.
+        known: All valid names.
         more: What the list begins with; empty for no list.
-
-    Returns:
-        `"Did you mean 'a' or 'b'?"`, `"Known: …"`, or an empty string if there is nothing to say.
     """
     names = sorted(known)
     folded = {name.lower(): name for name in names}
