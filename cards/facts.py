@@ -36,9 +36,6 @@ from .sources import (
 )
 from .tables import condition_table, count_table, goal_table, unit_table
 
-_LOSSY_SOURCE = "lerobot/robomme"
-"""A published dataset of the same episodes whose pictures are lossily compressed."""
-
 _BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
 _FILE_SETS = {"frames": "data/*/*.parquet", "videos": "videos/*/*/*.mp4"}
 
@@ -118,7 +115,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
     records = records_of(dataset)
     film = film_of_lesson(dataset, records)
     frames, skipped = sum(record.length for record in records), _skipped(dataset)
-    families, repositories = _families(records), repositories_of(dataset)
+    families = _families(records)
     more = (
         f"{skipped:,} recorded episodes yielded no demonstration, or were of no use: "
         f"{REPORT_PATH} names each and says why."
@@ -148,12 +145,8 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
             "same_family": 0,
             "skipped": skipped,
             "inexact": sum(not record.exact for record in records),
-            "exact_of": len(records),
-            "exact_what": "episodes",
-            "lossy_source": _LOSSY_SOURCE in repositories,
-            "lossy_name": _LOSSY_SOURCE,
         },
-        repositories=repositories,
+        repositories=repositories_of(dataset),
         source_kinds=source_kinds_of([dataset]),
         details=source_details({DEMONSTRATIONS: dataset}),
         file_sets=_FILE_SETS,
@@ -173,7 +166,6 @@ def split_facts(split: Split) -> Facts:
     film = film_of_split(split, queries, manifests)
     same_family = count_same_family(manifests)
     simulators = sorted({name for one in datasets.values() for name in one.identity.simulators})
-    repositories = {k: v for one in datasets.values() for k, v in repositories_of(one).items()}
     more = (
         f"{same_family:,} buffers hold distractors of the query's own family, which the "
         "paper's protocol rules out: results stand beside none of the benchmark."
@@ -228,13 +220,9 @@ def split_facts(split: Split) -> Facts:
             "same_family": same_family,
             "skipped": sum(_skipped(datasets[name]) for name in units),
             "inexact": sum(not one.exact for one in manifests),
-            "exact_of": len(manifests),
-            "exact_what": "buffers",
-            "lossy_source": _LOSSY_SOURCE in repositories,
-            "lossy_name": _LOSSY_SOURCE,
         },
         base=header.datasets[DEMONSTRATIONS].place,
-        repositories=repositories,
+        repositories={k: v for one in datasets.values() for k, v in repositories_of(one).items()},
         source_kinds=source_kinds_of(datasets.values()),
         details=source_details(datasets),
         file_sets={**_FILE_SETS, "manifest": f"{MANIFESTS}/*.json"},

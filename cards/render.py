@@ -78,6 +78,7 @@ def card_text(facts: Facts, about: Publication) -> str:
         **_PROTOCOL,
         **facts.values,
         "about": about,
+        "repositories": facts.repositories,
         "paper": PAPER,
         "bibtex": BIBTEX,
         "other": OTHER,
