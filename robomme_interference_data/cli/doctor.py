@@ -115,9 +115,9 @@ def _problems(requirement: Requirement) -> Iterator[str]:
             yield from _problems(nested)
 
 
-def check_video(decoder: str = "libdav1d", encoder: str = "libaom-av1") -> Check:
+def check_video() -> Check:
     """Check that PyAV can decode videos of datasets, and encode them, which only builds need."""
-    name = "Video (PyAV)"
+    name, decoder, encoder = "Video (PyAV)", "libdav1d", "libaom-av1"
     fix = 'pip install --force-reinstall --only-binary av "av>=14"'
     try:
         import av

@@ -109,7 +109,6 @@ class Fault:
         lost: Do what is asked, and close the connection instead of answering.
         cut: Leave out so many bytes at the end of the answer, as if there were no more.
         wrong: Change the last byte of the answer.
-        delay: Seconds to wait.
         call: What happens just before, such as a commit by somebody else.
     """
 
@@ -123,7 +122,6 @@ class Fault:
     lost: bool = False
     cut: int | None = None
     wrong: bool = False
-    delay: float = 0.0
     call: Callable[[], object] | None = None
 
     def meets(self, request: Request) -> bool:
@@ -183,11 +181,6 @@ class LoopbackServer(ABC):
         """Bytes of all requests' bodies so far."""
         return sum(len(one.body) for one in self.asked)
 
-    @property
-    def sent(self) -> int:
-        """Bytes of all answers' bodies so far, as they went over the wire."""
-        return sum(one.sent for one in self.asked)
-
     def fault(self, method: str, path: str, **what: Any) -> Fault:
         """Let something go wrong; see `Fault`."""
         self._faults.append(Fault(method, path, **what))
@@ -216,7 +209,7 @@ class LoopbackServer(ABC):
 
     def finish(self, request: Request, fault: Fault) -> Answer:
         """Return the answer to a request whose body has come."""
-        time.sleep(self.latency + fault.delay)
+        time.sleep(self.latency)
         if fault.status is not None or self.down:
             told = {"error": "something went wrong"}
             answer = Answer.json(told, fault.status or 503, fault.headers)

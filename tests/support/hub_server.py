@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, unquote, urlencode
+from urllib.parse import quote, unquote
 
 from support.hub_http import Answer, LoopbackServer, Request
 from support.hub_repositories import GITATTRIBUTES, Blob, Refused, Repository
@@ -26,15 +26,10 @@ _WRITES = ("auth-check", "commit", "preupload", "tag")
 
 @dataclass(frozen=True)
 class User:
-    """Whom a token belongs to: whether it may write, and in the name of which others."""
+    """Whom a token belongs to, and whether it may write."""
 
     name: str
     write: bool = True
-    orgs: tuple[str, ...] = ()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (self.name, *self.orgs)
 
 
 class HubServer(LoopbackServer):
@@ -45,7 +40,6 @@ class HubServer(LoopbackServer):
         tokens: Users by token; without a token one may read what is public.
         gated: Names of repositories whose files only their owner may download.
         renamed: New names by old ones.
-        page: Entries on a page of a tree.
     """
 
     def __init__(self) -> None:
@@ -54,7 +48,6 @@ class HubServer(LoopbackServer):
         self.tokens: dict[str, User] = {}
         self.gated: set[str] = set()
         self.renamed: dict[str, str] = {}
-        self.page = 1000
 
     def push(self, repo: str, files: Path | dict[str, bytes], ref: str = "main") -> str:
         """Make a commit of a folder's files, let a branch point to it, and return its hash."""
@@ -109,7 +102,7 @@ class HubServer(LoopbackServer):
 
     def _repository(self, name: str, user: User | None) -> Repository:
         found = self.repositories.get(name)
-        if found is None or (found.private and not (user and found.owner in user.names)):
+        if found is None or (found.private and not (user and found.owner == user.name)):
             raise Refused(404 if user else 401, "RepoNotFound", "Repository not found")
         return found
 
@@ -129,8 +122,7 @@ class HubServer(LoopbackServer):
             raise Refused(401, "", "Invalid username or password.")
         if request.path == "/api/whoami-v2":
             auth = {"accessToken": {"role": "write" if user.write else "read"}}
-            orgs = [{"name": name} for name in user.orgs]
-            return Answer.json({"type": "user", "name": user.name, "orgs": orgs, "auth": auth})
+            return Answer.json({"type": "user", "name": user.name, "orgs": [], "auth": auth})
         if request.path != "/api/repos/create":
             raise Refused(404, "", "Not found")
         asked = request.json()
@@ -185,18 +177,13 @@ class HubServer(LoopbackServer):
             raise Refused(404, "", "Not found")
         recursive = request.query.get("recursive", "").lower() == "true"
         entries = commit.entries(unquote(folder), recursive)
-        first = int(request.query.get("cursor", 0))
-        last, headers = first + self.page, {}
-        if last < len(entries):
-            query = urlencode({**request.query, "cursor": last})
-            headers["Link"] = f'<{self.endpoint}{request.path}?{query}>; rel="next"'
-        return Answer.json(entries[first:last], headers=headers)
+        return Answer.json(entries)
 
     def _file(
         self, request: Request, repo: Repository, user: User | None, match: re.Match[str]
     ) -> Answer:
         """Serve a file, or tell where a large one is."""
-        if repo.name in self.gated and not (user and repo.owner in user.names):
+        if repo.name in self.gated and not (user and repo.owner == user.name):
             raise Refused(403 if user else 401, "GatedRepo", f"Access to {repo.id} is restricted")
         commit, path = repo.find(unquote(match["revision"])), unquote(match["path"])
         blob = commit.file(path)
@@ -241,5 +228,5 @@ class HubServer(LoopbackServer):
 def _check_write(user: User | None, repo: Repository) -> None:
     if user is None:
         raise Refused(401, "", "Invalid username or password.")
-    if not user.write or repo.owner not in user.names:
+    if not user.write or repo.owner != user.name:
         raise Refused(403, "", f"this token may not write to repositories of {repo.owner}")

@@ -6,14 +6,11 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from collections.abc import Callable, Iterator
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import typer
 from support.splits import QUERIES, contents
@@ -63,11 +60,6 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
         *("Scores", "score", "compare", "power"),
         *("Publish", "card", "publish", "publish-results"),
     ]
-
-
-def test_the_version_is_that_of_the_project_file(run: Run) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert run("--version") == (0, f"robomme-interference {project['version']}\n", "")
 
 
 GROUPS = ("Data", "Look", "Retrieval", "Rollouts", "Scores", "Publish")
@@ -240,19 +232,6 @@ def test_show_as_json_and_as_a_picture(run: Run, tiny_split: Path, tmp_path: Pat
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_goals_are_shown_as_they_are(run: Run, own_split: Path) -> None:
-    """Brackets and colons in them are not taken for markup."""
-    goal = "put [red] :fire: into [/b] the [bold]box"
-    path = own_split / "manifests" / "buffers.parquet"
-    table = pq.read_table(path)
-    place = table.schema.get_field_index("goals")
-    goals = pa.array([[goal]] * len(table), table.schema.field(place).type)
-    pq.write_table(table.set_column(place, table.schema.field(place), goals), path)
-    code, out, err = run("show", EPISODE, "k1", "--split", own_split)
-    assert (code, err) == (0, "")
-    assert goal in " ".join(out.split())
-
-
 def test_verify(run: Run, own_split: Path) -> None:
     code, out, _ = run("verify", own_split, "--json", "--no-decode")
     assert (code, json.loads(out)) == (0, [])
@@ -261,14 +240,6 @@ def test_verify(run: Run, own_split: Path) -> None:
     code, out, err = run("verify", own_split, "--no-decode")
     assert code == 1
     assert video.name in out and "Traceback" not in err
-
-
-def test_audit(run: Run, tiny_split: Path) -> None:
-    code, out, _ = run("audit", tiny_split)
-    assert code == 0 and "Uses of a unit" in out
-    code, out, err = run("audit", tiny_split, "--json")
-    assert (code, err) == (0, "")
-    assert json.loads(out)["leaks"] == []
 
 
 # --- as a program ---------------------------------------------------------------------------------

@@ -92,18 +92,6 @@ def test_requirements_of_the_core_and_of_an_extra(
     assert (found.ok, found.detail, found.fix) == row
 
 
-def test_only_a_missing_decoder_fails() -> None:
-    """Data can be loaded without an encoder."""
-    for codecs, ok, detail in (
-        ({}, True, "with libdav1d and libaom-av1"),
-        ({"decoder": "libnothing"}, False, "has no decoder libnothing"),
-        ({"encoder": "libnothing"}, None, "has no encoder libnothing"),
-    ):
-        row = doctor.check_video(**codecs)
-        assert (row.ok, row.fix is None) == (ok, ok is True)
-        assert row.detail.endswith(detail)
-
-
 @pytest.mark.parametrize(
     ("program", "ok", "detail"),
     [
