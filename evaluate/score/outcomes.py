@@ -131,11 +131,7 @@ def counting(status: Statuses) -> Flags:
 
 
 def success(status: Statuses) -> NDArray[np.float64]:
-    """Return the mean success of an episode's repeats, NaN where none counts.
-
-    Args:
-        status: Repeats on the last axis, `(…, M) int8`.
-    """
+    """Return the mean success of an episode's repeats, the last axis, NaN where none counts."""
     with np.errstate(invalid="ignore"):
         return np.asarray((status == _SUCCESS).sum(-1) / counting(status).sum(-1))
 

@@ -53,13 +53,7 @@ class Plan:
 
 
 def plan(margin: float, episodes: int, flips: float) -> Plan:
-    """Return what episodes can show.
-
-    Args:
-        margin: A difference of interest, a fraction.
-        episodes: Their number.
-        flips: Share of them that flips by itself.
-    """
+    """Return what episodes can show; the margin is a fraction."""
     if not 0 < margin <= 1:
         expected = "points, more than 0 up to 100"
         raise InvalidOptionError.expected("margin", float(f"{100 * margin:g}"), expected)
@@ -114,10 +108,6 @@ def needed(margin: float, flips: float) -> int:
 
     Source: Connor (1987), Sample size for testing differences in proportions for the paired-sample
     design, Biometrics 43, 207–211; the correction: Edwards (1948), Psychometrika 13, 185–187.
-
-    Args:
-        margin: The difference, a fraction.
-        flips: Share of the episodes that flips by itself.
     """
     both = flips + margin
     wide = z_of(1 - ALPHA) * math.sqrt(both) + z_of(2 * POWER - 1) * math.sqrt(both - margin**2)
@@ -150,11 +140,8 @@ def smallest(episodes: int, flips: float) -> float | None:
 def note(counts: Iterable[tuple[int, int, int]]) -> str:
     """Return in a sentence what comparisons like some could show; nothing where none is paired.
 
-    Their episodes are those of the most, and the flips the median of what goes both ways: twice
-    the fewer of gained and lost.
-
-    Args:
-        counts: Pairs, gained and lost of each comparison.
+    `counts` are pairs, gained and lost of each. Their episodes are those of the most, and the flips
+    the median of what goes both ways: twice the fewer of gained and lost.
     """
     found = [one for one in counts if one[0]]
     if not found:

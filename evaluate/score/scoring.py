@@ -59,12 +59,7 @@ class Score:
 
 
 def score(settings: Settings, draws: int = DRAWS) -> Score:
-    """Score rows.
-
-    Args:
-        settings: What is scored, and how.
-        draws: Bootstrap samples.
-    """
+    """Score rows, with so many bootstrap samples."""
     rows = read_rows(settings.rows, settings.system, settings.lenient)
     if not len(rows):
         where = f"in {', '.join(map(str, settings.rows))}"

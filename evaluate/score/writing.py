@@ -26,17 +26,8 @@ def write_score(
     """Write tables, figures and the report, each atomically and the report last.
 
     What can be refused is refused before anything is written. Tables and figures of an earlier
-    score that this one does not have are removed; files of other names stay.
-
-    Args:
-        score: What is written.
-        out: Folder for `tables/`, `figures/`, `methods.md`, `methods.bib` and `report.html`.
-        export_to: Folder for the rows in the released layout (see `export`); None writes none.
-        command: The command line that made the score, for the report.
-        png: Whether figures are written as PNG, too, not as SVG alone.
-
-    Returns:
-        The exported files.
+    score that this one does not have are removed; files of other names stay. Returns the files of
+    rows that were written to `export_to` in the released layout.
     """
     with open_figure():
         load_jinja2("the report")

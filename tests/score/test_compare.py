@@ -81,7 +81,7 @@ def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
     )
     both = made.write_csv(tmp_path / "b.csv", made.changed(own(k0="ss"), simulator="robomme"))
     (note,) = compare(both, released).notes
-    assert "Only one of the runs names the revision" in note
+    assert "different splits (revisions abab" in note
 
 
 def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:

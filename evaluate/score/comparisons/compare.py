@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from robomme_interference_data.constants import FAMILIES
@@ -48,16 +48,9 @@ def compare(
 
     A system that both runs hold is compared with itself, as a repeat is. If they hold none in
     common and one each, these two are compared, as a system with and without retrieval are. Runs
-    under different shifts are compared as well: their scenes are the same.
-
-    Args:
-        first: Folder or file of rows.
-        second: The other one. Differences are its rate − the first's. None compares two
-            conditions of the first.
-        systems: Names of the systems of rows that name none.
-        lenient: Leave bad rows out, and count them.
-        conditions: The condition of the first and that of the second; none compares each
-            condition with itself.
+    under different shifts are compared as well: their scenes are the same. Differences are the
+    second's rate − the first's; without a second one, two `conditions` of the first are compared,
+    and without `conditions` each with itself.
     """
     _check_arguments(first, second, conditions)
     one = read_rows([first], systems[0], lenient)
@@ -99,9 +92,9 @@ def compare(
         "a to b. {how}",
         lambda c: (c.simulator, bool(c.family)),
         "the rows of all families, and those of single ones, of a simulator",
-        before=f"a: {first}; b: {second or first}. ",
     )
     table = comparison_table("compare", found, spec)
+    table = replace(table, note=f"a: {first}; b: {second or first}. {table.note}")
     return RunComparison(table, tuple(notes), (one,) if other is one else (one, other))
 
 
@@ -118,9 +111,7 @@ def _check_arguments(first: Path, second: Path | None, conditions: Sequence[str]
         parse_condition(name)
     if second is not None and first.exists() and second.exists() and first.samefile(second):
         raise InvalidOptionError(
-            f"{first} is given twice",
-            "Compare two conditions of it:",
-            command,
+            f"{first} is given twice", "Compare two conditions of it:", command
         )
 
 
@@ -232,17 +223,11 @@ def _differing(one: Rows, other: Rows, matched: Iterable[tuple[_Side, _Side]]) -
                 "is what the shift costs."
             )
         revisions = [rows.revisions.get(name) for rows, name in zip((one, other), two, strict=True)]
-        if revisions[0] == revisions[1]:
-            continue
-        if None in revisions:
+        if revisions[0] != revisions[1]:
             yield (
-                f"Only one of the runs names the revision of its split of {two[0]}: the "
-                "histories may differ."
-            )
-        else:
-            yield (
-                f"The rows of {two[0]} are of different splits (revisions {revisions[0]} and "
-                f"{revisions[1]}): the histories differ."
+                f"The rows of {two[0]} are of different splits (revisions "
+                f"{' and '.join(one or 'not known' for one in revisions)}): the histories may "
+                "differ."
             )
 
 
@@ -269,10 +254,7 @@ def _noise(a: _Side, b: _Side, pairs: Mapping[str, Pairs]) -> list[str]:
 def _left_out(
     name: str, sides: Iterable[_Side], matched: Mapping[_Side, _Side], conditions: Sequence[str]
 ) -> list[str]:
-    """Say what one run has and the comparison leaves out, nothing if that is nothing.
-
-    `conditions` are this run's and the other's, or none where each is compared with itself.
-    """
+    """Say what one run has and the comparison leaves out, nothing if that is nothing."""
     parts = []
     for side in sides:
         other = matched[side].counted if side in matched else (lambda condition: set())

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from robomme_interference_data.schema.conditions import KINDS, NO_HISTORY, parse_condition
 from robomme_interference_data.stats.bootstrap import Interval
@@ -13,35 +14,25 @@ START = "k0"
 """The condition that retention and contrasts begin at."""
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Two kinds of conditions that are compared, with equally many sessions.
+class Comparison(NamedTuple):
+    """The kind that another is compared with, the first side, and what that measures."""
 
-    Attributes:
-        kind: Name of the kind whose conditions are compared.
-        reference: Name of the kind that they are compared with: the first side.
-        asks: What the comparison measures.
-    """
-
-    kind: str
     reference: str
     asks: str
 
 
-_COMPARISONS = (
-    Comparison("k", "held", "content beyond dilution"),
-    Comparison("before", "k", "order"),
-    Comparison("middle", "k", "position"),
-    Comparison("same", "k", "similarity"),
-    Comparison("parts", "k", "scattered evidence"),
-    Comparison("raw", "k", "full rate"),
-    Comparison("absent", NO_HISTORY, "false memory"),
-    Comparison("stale", "k", "updating"),
-    Comparison("misled", NO_HISTORY, "belief"),
-)
-
-COMPARISONS: dict[str, Comparison] = {one.kind: one for one in _COMPARISONS}
-"""Kind to what its conditions are compared for, in the order of tables."""
+COMPARISONS = {
+    "k": Comparison("held", "content beyond dilution"),
+    "before": Comparison("k", "order"),
+    "middle": Comparison("k", "position"),
+    "same": Comparison("k", "similarity"),
+    "parts": Comparison("k", "scattered evidence"),
+    "raw": Comparison("k", "full rate"),
+    "absent": Comparison(NO_HISTORY, "false memory"),
+    "stale": Comparison("k", "updating"),
+    "misled": Comparison(NO_HISTORY, "belief"),
+}
+"""Kind to what its conditions are compared for with equally many sessions, as tables order it."""
 
 
 NO_RETENTION = Interval(math.nan)
@@ -85,10 +76,7 @@ def comparable(
 ) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield each condition that `COMPARISONS` has, with the system and condition it is against.
 
-    Args:
-        system: Name of a system.
-        conditions: Those under which it has rows.
-        floor: The system and condition that are its `no-history`, if there is one.
+    `floor` is the system and condition that are the system's `no-history`, if there is one.
     """
     own = [parse_condition(name) for name in conditions]
     cells = {(one.kind.name, one.k): (system, one.name) for one in own}

@@ -35,19 +35,9 @@ def effects_of(
     """Compare a system's conditions with each other, all intervals from the same draws.
 
     Each `k<n>` is compared with `no-history` and with k0, kinds of conditions as `COMPARISONS` has
-    it, and under each condition a system with retrieval with the one without, and any with the
-    ceiling of its memory.
-
-    Args:
-        outcomes: What came of the rollouts.
-        system: Name of the system.
-        base: For a system with retrieval the one without: its `no-history` is both systems'. None
-            if the two are not paired.
-        ceiling: The ideal observer with the same memory (see `access.ceiling_of`), or None.
-        draws: Bootstrap samples.
-
-    Returns:
-        The comparisons, and the row of `decay_table`, if there are at least two `k<n>`.
+    it, and under each condition a system with retrieval with its `base`, the one without, whose
+    `no-history` is both systems', and any with the `ceiling` of its memory. Returns comparisons and
+    the row of `decay_table`, if there are at least two `k<n>`.
     """
     cells = [(name, c) for name in (system, base, ceiling) if name for c in outcomes.ran(name)]
     at = {cell: place for place, cell in enumerate(cells)}
@@ -99,11 +89,8 @@ def retained(values: Floats, lift: Interval, fall: Interval) -> Interval:
 
     Where the condition equals no-history, or k0, in every episode, the ratio is 0, or 1, without
     any spread: there the interval is that of the lift, or of the fall, divided by the lift at k0.
-
-    Args:
-        values: Success under no-history, k0 and the condition, `(E, 3) float64`.
-        lift: The condition's change from no-history.
-        fall: Its change from k0.
+    `values` are success under no-history, k0 and the condition, `(E, 3)`; `lift` is the condition's
+    change from no-history, `fall` that from k0.
     """
     none, start, end = values.T
     whole, share = (start - none), (end - none)

@@ -164,13 +164,7 @@ def _over(
 
 
 def _resampled(values: Floats, often: NDArray[np.int64], generator: np.random.Generator) -> Floats:
-    """Return the sums of so many resampled means of a family's episodes, `(D, K)`.
-
-    Args:
-        values: Of the family, `(N, K) float64`; equal rows are drawn together.
-        often: How many means each draw adds up, `(D,) int64`.
-        generator: Random numbers.
-    """
+    """Return the sums of `often` resampled means of a family's `(N, K)` values, `(D, K)`."""
     rows, counts = np.unique(values, axis=0, return_counts=True)
     drawn = generator.multinomial(often * len(values), counts / len(values))
     return np.asarray(drawn @ rows / len(values))

@@ -20,8 +20,9 @@ def interactions_of(outcomes: Outcomes) -> list[Contrast]:
     The change is to the most sessions under which both have rows. Systems whose histories may
     differ are left out, and so are bounds.
     """
-    leader = _leader(outcomes)
-    found = []
+    leader, found = None, []
+    if systems := dict(ranked(outcomes)).get(START):
+        leader, _ = to_best(outcomes, START, systems, np.ones(len(outcomes.episodes), bool))
     for system in outcomes.systems:
         if is_bound(system):
             continue
@@ -30,15 +31,6 @@ def interactions_of(outcomes: Outcomes) -> list[Contrast]:
             if other in outcomes.systems and outcomes.pairable(system, other):
                 found += _contrasts(outcomes, system, other)
     return found
-
-
-def _leader(outcomes: Outcomes) -> str | None:
-    """Return the system that leads at k0, None where no cell there is complete."""
-    systems = dict(ranked(outcomes)).get(START)
-    if not systems:
-        return None
-    compared = to_best(outcomes, START, systems, np.ones(len(outcomes.episodes), bool))
-    return next(system for system, pairs in compared.items() if pairs is None)
 
 
 def _contrasts(outcomes: Outcomes, system: str, other: str) -> list[Contrast]:
@@ -58,15 +50,10 @@ def changes(first: Statuses, second: Statuses) -> Pairs:
     """Compare the change of one side with that of another, over the episodes that count in all.
 
     The interval is `mover_interval` of both changes' own, with the correlation of the changes over
-    episodes; the test is the exact sign-flip test of the episodes' differences of differences.
-
-    Args:
-        first: Outcomes before and after of the first side, `(2, E, M) int8`.
-        second: Of the second side.
-
-    Returns:
-        `first`, `second` and `change` are the changes and their difference; `pairs` are episodes,
-        gained and lost those whose change is higher, or lower, on the second side.
+    episodes; the test is the exact sign-flip test of the episodes' differences of differences. Each
+    side is the outcomes before and after, `(2, E, M) int8`. In what comes of it `first`, `second`
+    and `change` are the changes and their difference; `pairs` are episodes, gained and lost those
+    whose change is higher, or lower, on the second side.
     """
     values = success(np.stack([*first, *second]))
     known = ~np.isnan(values).any(axis=0)

@@ -22,15 +22,7 @@ from .pairs import Pairs, compare_unpaired, pair
 
 
 def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flags) -> Pairs:
-    """Compare a system with another one under a condition, unpaired where their histories differ.
-
-    Args:
-        outcomes: What came of the rollouts.
-        condition: Name of the condition.
-        one: The system; differences are its rate − the other's.
-        other: The other one.
-        here: The episodes that are compared, `(E,) bool`.
-    """
+    """Compare `one` with the `other`, unpaired where histories differ, over some episodes."""
     sides = [outcomes.status[outcomes.cell(name, condition)][here] for name in (other, one)]
     if outcomes.pairable(one, other):
         return pair(*sides)
@@ -39,33 +31,23 @@ def against(outcomes: Outcomes, condition: str, one: str, other: str, here: Flag
 
 def to_best(
     outcomes: Outcomes, condition: str, systems: Sequence[str], here: Flags
-) -> dict[str, Pairs | None]:
-    """Compare systems with the one of the highest rate, of equal ones the first.
+) -> tuple[str, dict[str, Pairs]]:
+    """Return the first system of the highest rate, and the others' comparisons with it.
 
-    Args:
-        outcomes: What came of the rollouts.
-        condition: Name of the condition, under which each system has a complete cell.
-        systems: Their names, in the order of tables.
-        here: The episodes that are compared, `(E,) bool`.
-
-    Returns:
-        System to its comparison, and the best to None.
+    Each has a complete cell under the condition; the episodes that are compared are `(E,) bool`.
     """
     cells = [outcomes.status[outcomes.cell(one, condition)][here] for one in systems]
     rates = [rate_of(cell).value for cell in cells]
     best = systems[rates.index(max(rates))]
-    return {s: None if s == best else against(outcomes, condition, s, best, here) for s in systems}
+    others = [system for system in systems if system != best]
+    return best, {one: against(outcomes, condition, one, best, here) for one in others}
 
 
-def tied_with_best(compared: Mapping[str, Pairs | None]) -> set[str]:
-    """Return the systems that cannot be told from the best, itself included; none of one alone.
-
-    Args:
-        compared: As `to_best` returns it.
-    """
-    others = {system: pairs.p for system, pairs in compared.items() if pairs}
-    near = {s for s, p in zip(others, holm([*others.values()]), strict=True) if not p < ALPHA}
-    return near | {*compared} - {*others} if others else set()
+def tied_with_best(best: str, others: Mapping[str, Pairs]) -> set[str]:
+    """Return the systems that cannot be told from the best, itself included; none of one alone."""
+    ps = holm([pairs.p for pairs in others.values()])
+    near = {system for system, p in zip(others, ps, strict=True) if not p < ALPHA}
+    return near | {best} if others else set()
 
 
 def ranked(outcomes: Outcomes) -> Iterator[tuple[str, list[str]]]:
@@ -92,9 +74,8 @@ def systems_of(outcomes: Outcomes) -> list[Contrast]:
             names = (outcomes.simulator, system, condition, (other, condition))
             return Contrast(*names, table, pairs, complete=True)
 
-        compared = to_best(outcomes, condition, systems, every)
-        best = next(system for system, pairs in compared.items() if pairs is None)
-        found += [contrast(s, best, "systems", pairs) for s, pairs in compared.items() if pairs]
+        best, compared = to_best(outcomes, condition, systems, every)
+        found += [contrast(s, best, "systems", pairs) for s, pairs in compared.items()]
         for two in combinations(systems, 2):
             pairs = against(outcomes, condition, *two, every)
             matrix.append(contrast(*two, "matrix", pairs))

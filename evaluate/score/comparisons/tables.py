@@ -63,7 +63,6 @@ class TableSpec:
         group: The comparisons that Holm's correction counts together have the same of this.
         among: The same in words.
         power: Whether the note ends with what so many episodes can show.
-        before: What the note begins with, as it is.
     """
 
     title: str
@@ -72,7 +71,6 @@ class TableSpec:
     group: Callable[[Contrast], Hashable] = attrgetter("simulator")
     among: str = "the tests of this table in one simulator"
     power: bool = field(default=True, kw_only=True)
-    before: str = field(default="", kw_only=True)
 
 
 _EFFECT = f"{CELLS} n rate against_rate difference {TEST} cohens_h complete"
@@ -151,13 +149,10 @@ def comparison_table(
     spec: TableSpec | None = None,
     more: Sequence[Mapping[str, Any]] | None = None,
 ) -> Table:
-    """Return a table of comparisons.
+    """Return the table of the comparisons that name it.
 
-    Args:
-        name: Name of the table; without a specification it is one of `SPECS`.
-        contrasts: All comparisons; the table has those that name it.
-        spec: Its specification.
-        more: For each row the values of the columns that the specification adds.
+    Without a specification it is one of `SPECS`; `more` has for each row the values of the columns
+    that the specification adds.
     """
     spec = spec or SPECS[name]
     found = [one for one in contrasts if one.table == name]
@@ -169,7 +164,7 @@ def comparison_table(
         rows.append(
             tuple(added[key] if key in added else _VALUES[key][1](one) for _, key in columns)
         )
-    note = spec.before + spec.note.format(how=_how_to_read(found, spec.among))
+    note = spec.note.format(how=_how_to_read(found, spec.among))
     if spec.power:
         pairs = [one.pairs for one in found if not one.family]
         note += power.note((one.pairs, one.gained, one.lost) for one in pairs)

@@ -33,10 +33,7 @@ def curve(
     """Draw a system's rates over the conditions, in a part of the episodes or (empty) in all.
 
     Points of incomplete cells are hollow. no-history is joined by a thin line: it is the rate
-    without memory, not a smaller k.
-
-    Returns:
-        The system's last rate in percent; nothing without any rate.
+    without memory, not a smaller k. Returns the system's last rate in percent, if there is any.
     """
     style = data.styles[system]
     found = [c for one in data.conditions if (c := data.cells.get((system, one.name, part)))]
@@ -92,11 +89,7 @@ def points_with_bars(
 
 
 def chance_level(axes: Any, data: Data, part: str) -> dict[str, float]:
-    """Draw the share that guessing has in a part of the episodes, where they are questions.
-
-    Returns:
-        That share in percent, to be named as systems are; nothing where nothing was asked.
-    """
+    """Draw, and return in percent, what guessing has in a part, where all are questions."""
     if part not in data.chance:
         return {}
     level, style = 100 * data.chance[part], data.styles[CHANCE]

@@ -51,11 +51,6 @@ FIGURES = {
 def draw_figures(score: Score, folder: Path, *, png: bool = False) -> dict[str, Path]:
     """Draw every figure for which there is data, as `<figure>-<simulator>.svg`.
 
-    Args:
-        score: What is drawn.
-        folder: Where to write.
-        png: Whether to write each as `.png`, too.
-
     Returns:
         Name without suffix to the SVG, in the order of `FIGURES`.
     """

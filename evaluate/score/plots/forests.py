@@ -45,14 +45,9 @@ def draw_rows(
     value: Callable[[Contrast], Interval] = _points,
     guides: Mapping[float, str] | None = None,
 ) -> None:
-    """Draw values with their intervals, each in its row, over upright lines.
+    """Draw values with their intervals, each in its row, hollow where a cell is not complete.
 
-    Args:
-        axes: The panel.
-        data: What figures show: it has the styles of systems.
-        rows: Number of a row and its comparison; hollow where a cell is not complete.
-        value: What is drawn of a comparison; bounds that are NaN are left out.
-        guides: Value to the style of a line at it; None draws one at 0.
+    Bounds that are NaN are left out. `guides` has for values the styles of upright lines at them.
     """
     for place, line in (guides or {0: "-"}).items():
         axes.axvline(place, color=GREY, linewidth=0.8, linestyle=line, zorder=0)

@@ -54,11 +54,7 @@ def write_report(
 ) -> None:
     """Write the page: the same bytes for the same rows, options and command.
 
-    Args:
-        score: What it shows.
-        figures: Names and SVG files, as `draw_figures` returns them.
-        out: The HTML file.
-        command: The command line that made the score; None shows the call of `score`.
+    Without the command line that made the score, it shows the call of `score`.
     """
     names = {name for one in score.outcomes.values() for name in one.conditions}
     conditions = [one.name for one in in_order(names)]
@@ -103,19 +99,15 @@ def _inline(figures: Mapping[str, Path]) -> dict[str, str]:
     found = {}
     for number, (name, path) in enumerate(figures.items()):
         kind, _, simulator = name.partition("-")
-        found[name] = _part(
-            path.read_text(encoding="utf-8"), number, f"{FIGURES[kind]}, {simulator}"
-        )
+        text = path.read_text(encoding="utf-8")
+        text = text[text.index("<svg") :]
+        text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+        text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
+        text = re.sub(r' id="image[0-9a-f]+"', "", text)  # equal images share one
+        text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
+        label = escape(f"{FIGURES[kind]}, {simulator}")
+        found[name] = text.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
     return found
-
-
-def _part(text: str, number: int, title: str) -> str:
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'id="system:([^":]*):[0-9]+"', r'data-system="\1"', text)
-    text = re.sub(r' id="image[0-9a-f]+"', "", text)  # equal images share one
-    text = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>f{number}-", text)
-    return text.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
 
 
 def _names(score: Score) -> dict[str, str]:
@@ -164,12 +156,7 @@ def _address(video: Path, folder: Path) -> str:
 
 
 def flips(conditions: Sequence[str], rates: Sequence[float]) -> str:
-    """Return where an outcome changes between conditions of a kind, as `k3 lost, k7 gained`.
-
-    Args:
-        conditions: In the order of tables.
-        rates: Mean success under each; NaN, which is left out, where nothing counts.
-    """
+    """Return where an outcome changes between conditions of a kind, as `k3 lost, k7 gained`."""
     known = [(c, r) for c, r in zip(conditions, rates, strict=True) if not math.isnan(r)]
     return ", ".join(
         f"{condition} {'gained' if rate > before else 'lost'}"

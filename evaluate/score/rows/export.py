@@ -28,13 +28,6 @@ def export(rows: Rows, folder: Path) -> list[Path]:
     rows of another simulator than RoboMME have its name in one more, the last. A timeout is
     `ongoing`, as there. The rows keep the order of their files, and are the same bytes whatever
     files they come from.
-
-    Args:
-        rows: Rows that were read.
-        folder: Where to write.
-
-    Returns:
-        The files.
     """
     seeds = len(rows.names("model_seed"))
     other = sum(row.episode_split != "test" for row in rows)

@@ -77,10 +77,7 @@ def system_of(path: Path) -> str | None:
 def read_file(path: Path, names: Sequence[str], has_system: bool) -> Part:
     """Read columns of a file's rows, as far as the file has them.
 
-    Args:
-        path: The file: `.jsonl`, `.parquet` or `.csv`.
-        names: Names of the columns.
-        has_system: Whether the system of rows that name none is known.
+    It has to name systems itself unless the system of its rows is known (`has_system`).
     """
     readers = {".parquet": _read_parquet, ".csv": _read_csv, ".jsonl": _read_record}
     reader = readers.get(path.suffix.lower())

@@ -122,14 +122,7 @@ class _Checks:
         self._reasons: dict[tuple[int, int], str] = {}
 
     def add(self, path: Path, part: Part, system: str | None, run: Path | None) -> None:
-        """Add the rows of a file, each checked by itself.
-
-        Args:
-            path: The file.
-            part: What it holds.
-            system: The system of rows that name none.
-            run: The folder that videos are relative to, if it is known.
-        """
+        """Add the rows of a file, each checked by itself; videos are relative to `run`."""
         number, count = len(self._paths), len(part.lines)
         self._paths.append(path)
         default = {**dict.fromkeys(Row._fields), **DEFAULTS, "system": system}
@@ -204,14 +197,7 @@ class _Checks:
 
 
 def _parsed(name: str, values: Sequence[Any], run: Path | None, wrong: dict[int, str]) -> list[Any]:
-    """Return the values of a column as rows have them.
-
-    Args:
-        name: The column.
-        values: What the file has.
-        run: The folder that videos are relative to, if it is known.
-        wrong: Place of a row to the first reason against it, which are added.
-    """
+    """Return a column as rows have it; add the first reason against each bad place to `wrong`."""
     known, reasons = dict[Any, Any](), dict[Any, str]()
     for value in set(values):  # of one type, and most occur in many rows
         try:

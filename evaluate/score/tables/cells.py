@@ -138,8 +138,8 @@ def _ranked(outcomes: Outcomes, cells: list[Cell], parts: Mapping[str, Flags]) -
             groups[cell.condition, cell.part].append(place)
     for (condition, part), places in groups.items():
         own = [cells[place] for place in places]
-        against = to_best(outcomes, condition, [cell.system for cell in own], parts[part])
-        best = tied_with_best(against)
+        systems = [cell.system for cell in own]
+        best = tied_with_best(*to_best(outcomes, condition, systems, parts[part]))
         for place, cell in zip(places, own, strict=True):
             rank = 1 + sum(other.rate > cell.rate for other in own)
             cells[place] = replace(cell, rank=rank, best=cell.system in best)

@@ -30,12 +30,7 @@ _EARLY = " p†: provisional, as a cell is not complete."
 
 
 def chance_table(outcomes: Mapping[str, Outcomes], cells: Iterable[Cell]) -> Table:
-    """Return how far each cell is above chance, of those whose episodes are all questions.
-
-    Args:
-        outcomes: What came of the rollouts, by simulator.
-        cells: Those of the outcomes; parts of the episodes are left out.
-    """
+    """Return how far each cell is above chance, of those whose episodes are all questions."""
     found = [one for one in cells if not (one.part or math.isnan(one.chance))]
     ps = [_p(outcomes[one.simulator], one) for one in found]
     tests = zip(found, ps, corrected(ps, [one.simulator for one in found]), strict=True)

@@ -24,13 +24,7 @@ def equivalence_table(
     """Return which differences are shown to be within a margin.
 
     Each k is compared with k0, and a system with retrieval with the one without, under the same
-    condition and at k0; where that one has no rows, with its published k0.
-
-    Args:
-        contrasts: All comparisons; those of the tables `effects` and `equivalence` count.
-        cells: Our cells.
-        published: Published ones, if the score is compared with them.
-        margin: Points.
+    condition and at k0; where that one has no rows, with its published k0. The margin is in points.
     """
     found = [one for one in contrasts if one.table in ("effects", "equivalence")]
     paired = {(one.simulator, one.system) for one in found if one.system != one.against[0]}

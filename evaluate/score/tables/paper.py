@@ -1,7 +1,6 @@
 """The rates that the paper reports, and how ours compare."""
 
 import csv
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -48,25 +47,17 @@ def published() -> tuple[Cell, ...]:
         n = int(row["episodes"])
         won = round(float(row["percent"]) * n / 100)
         cells.append(_cell(row["simulator"], row["system"], row["condition"], "", won, n))
-    best = {one for group in _by_condition(cells) for one in _best(group)}
+    best = set[tuple[str, str]]()
+    for condition in {cell.condition for cell in cells}:
+        best |= _best([cell for cell in cells if cell.condition == condition])
     return tuple(replace(cell, best=(cell.system, cell.condition) in best) for cell in cells)
-
-
-def _by_condition(cells: Iterable[Cell]) -> list[list[Cell]]:
-    found = defaultdict[str, list[Cell]](list)
-    for cell in cells:
-        found[cell.condition].append(cell)
-    return [*found.values()]
 
 
 def _best(cells: Sequence[Cell]) -> set[tuple[str, str]]:
     """Return system and condition of the published cells that cannot be told from the best."""
     best = max(cells, key=lambda cell: cell.rate)
-    compared = {
-        cell.system: None if cell is best else compare_unpaired(best.as_rate, cell.as_rate)
-        for cell in cells
-    }
-    return {(system, best.condition) for system in tied_with_best(compared)}
+    others = {c.system: compare_unpaired(best.as_rate, c.as_rate) for c in cells if c is not best}
+    return {(system, best.condition) for system in tied_with_best(best.system, others)}
 
 
 @cache
@@ -141,16 +132,12 @@ _CHANGE = "difference:points difference_low:points difference_high:points comple
 
 
 def paper_table(cells: Sequence[Cell]) -> Table:
-    """Return our rates beside the published ones.
-
-    Args:
-        cells: Ours, with completeness by the benchmark's grid, which the published rates are over.
-    """
+    """Return our rates, complete by the benchmark's grid, beside the published ones."""
     whole = [one for one in cells if not one.part]
-    rows = []
-    for cell, paper in _comparable(whole):
-        sides, change = _beside(cell, paper)
-        rows.append((cell.system, cell.condition, *sides, paper.best, *change))
+    rows = [
+        (cell.system, cell.condition, *_sides(cell, paper), paper.best, *_change(cell, paper))
+        for cell, paper in _comparable(whole)
+    ]
     note = " ".join([_NOTE, *not_compared(whole)])
     columns = f"system condition {_SIDES} published_best:flag {_CHANGE}"
     return Table.make("paper", "Beside the published rates", columns, rows, note)
@@ -159,10 +146,10 @@ def paper_table(cells: Sequence[Cell]) -> Table:
 def paper_family_table(cells: Sequence[Cell]) -> Table:
     """Return our rates by family beside those of the paper's repository; see `paper_table`."""
     parts = [one for one in cells if one.part]
-    rows = []
-    for cell, paper in _comparable(parts):
-        sides, change = _beside(cell, paper)
-        rows.append((cell.system, cell.condition, cell.part, *sides, *change))
+    rows = [
+        (cell.system, cell.condition, cell.part, *_sides(cell, paper), *_change(cell, paper))
+        for cell, paper in _comparable(parts)
+    ]
     ours = {name for cell in parts for name in (cell.system, base_of(cell.system))}
     others: dict[str, list[str]] = {}
     for system, condition in differing():
@@ -176,11 +163,13 @@ def paper_family_table(cells: Sequence[Cell]) -> Table:
     return Table.make("paper_family", "Beside the published rates, by family", columns, rows, note)
 
 
-def _beside(cell: Cell, paper: Cell) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Return the values of the columns of both sides, and of their difference."""
-    sides = (paper.system, cell.n, cell.rate, *cell.interval, paper.n, paper.rate, *paper.interval)
+def _sides(cell: Cell, paper: Cell) -> tuple[Any, ...]:
+    return paper.system, cell.n, cell.rate, *cell.interval, paper.n, paper.rate, *paper.interval
+
+
+def _change(cell: Cell, paper: Cell) -> tuple[Any, ...]:
     won = (cell.rate * cell.trials, cell.trials, round(paper.rate * paper.n), paper.n)
-    return sides, (cell.rate - paper.rate, *newcombe(*won), cell.complete)
+    return cell.rate - paper.rate, *newcombe(*won), cell.complete
 
 
 def not_compared(cells: Sequence[Cell]) -> list[str]:
