@@ -2,7 +2,7 @@
 
 import math
 
-from robomme_interference_data.viz.tables import Table, percent, points
+from robomme_interference_data.viz.tables import Table
 
 TABLE = Table.make(
     "rates",
@@ -47,9 +47,3 @@ def test_csv_has_fractions_and_json_no_nan() -> None:
         **{"system": "c", "n": None, "rate": None, "change": -0.0000001, "kept": -0.001},
         **{"p": 1.0, "complete": False},
     }
-
-
-def test_points_and_percent() -> None:
-    shown = [points(value) for value in (0.271, -0.03, 0.0004, -0.0004)]
-    assert shown == ["+27.1", "−3.0", "0.0", "0.0"]
-    assert percent(0.44889) == "44.9%"

@@ -15,23 +15,6 @@ def grid_of(found: Score) -> list[tuple[str, ...]]:
     return [row for grid in found.grids for row in grid.rows]
 
 
-def test_an_error_is_neither_and_an_incomplete_cell_is_never_ranked(small: Score) -> None:
-    cell = record(small, "main", system=made.OWN, condition="k0")
-    assert (cell["n"], cell["successes"], cell["errors"], cell["missing"]) == (10, 2, 1, 2)
-    assert cell["rate"] == 0.2
-    assert (cell["complete"], cell["rank"]) == (False, None)
-    # Both others have 7 of 12: two first places, and no third.
-    assert record(small, "main", system=made.BASE, condition="k0")["rank"] == 1
-    assert record(small, "main", system=made.RETRIEVAL, condition="k0")["rank"] == 1
-    # MoveCube lacks episodes 2 and 5; InsertPeg is whole, and there it is third.
-    lacking = record(small, "coverage", system=made.OWN, condition="k0", family="MoveCube")
-    assert (lacking["expected"], lacking["n"], lacking["errors"]) == (6, 4, 1)
-    assert (lacking["missing_episodes"], lacking["error_episodes"]) == ("test 2,5", "test 2")
-    assert record(small, "family", system=made.OWN, condition="k0", family="InsertPeg")["rank"] == 3
-    assert grid_of(small)[2][2] == "20.0%† [5.7, 51.0] n=10, errors: 1"
-    assert "Rollouts that broke: 1." in small.grids[0].note
-
-
 def test_best_is_each_that_cannot_be_told_from_the_highest_rate(tmp_path: Path) -> None:
     # Of 24 episodes the first has 12; the second loses one, the third six, the last seven.
     rates = {"one": 12, "two": 11, "three": 6, "four": 5}

@@ -1,6 +1,5 @@
 """`score` and `compare` as commands: what they print, write, export and leave alone."""
 
-import csv
 import html
 import json
 import re
@@ -8,12 +7,13 @@ import shlex
 import shutil
 import sys
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support import scoring as made
-from support.scoring import BASE, OWN, RETRIEVAL, run
+from support.scoring import OWN, RETRIEVAL, run
 
 from robomme_interference_data.errors import (
     FormatError,
@@ -108,10 +108,8 @@ def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     assert "1 bad rows left out" in done.stderr
     assert "my-memory  100.0% [20.7, 100.0]\n" in done.stdout
     assert "family &#39;MoveCub&#39;" in (tmp_path / "out" / "report.html").read_text()
-    assert isinstance(run("compare", path, again(path)).exception, FormatError)
     done = run("compare", path, again(path), "--lenient", "--json")
     assert json.loads(done.stdout)["bad_rows"] == [1, 1]
-    assert done.stderr.count("family 'MoveCub'") == 2
 
 
 # --- the folder of a score ---------------------------------------------------------------------
@@ -165,22 +163,13 @@ def test_without_a_library_nothing_is_written(
 def test_exported_runs_are_read_back_the_same(tmp_path: Path) -> None:
     rows = read_rows([made.write_parquet(tmp_path / "a.parquet", made.rows())])
     exported = export(rows, tmp_path / "export")
-    assert [path.name for path in exported] == [
-        f"{system}-tabletop_rollouts.csv" for system in (OWN, BASE, RETRIEVAL)
-    ]
-    with exported[0].open(newline="") as lines:
-        assert [row["status"] for row in csv.DictReader(lines)].count("error") == 1
-    found = made.score(exported[1])  # its name tells the system
-    cells = [cell for cell in found.cells if not cell.part]
-    assert [cell.counts[0] for cell in cells] == [1, 7, 5, 3, 2]
-    assert cells[2].counts == (5, 6, 1, 0)  # `ongoing` is a timeout
-    # Their simulator comes back, too: they never stand beside the paper's rates.
-    assert list(found.outcomes) == ["tabletop"]
-    assert made.score(exported[1], system=OWN).cells[0].system == OWN  # what is given goes first
-    assert {cell.system for cell in made.score(*exported).cells} == {OWN, BASE, RETRIEVAL}
+    again = read_rows(exported)  # their names tell the systems
+    columns = attrgetter("simulator", "system", "condition", "family", "episode", "status")
+    assert sorted(map(columns, again)) == sorted(map(columns, rows))
+    assert read_rows([exported[1]], OWN).names("system") == [OWN]  # what is given goes first
     odd = exported[1].rename(tmp_path / "a b-tabletop_rollouts.csv")
     with pytest.raises(InvalidIdError, match="'a b'"):
-        made.score(odd)
+        read_rows([odd])
 
 
 def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path) -> None:

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 from support import scoring as made
-from support.scoring import BASE, OWN, RETRIEVAL, cells
+from support.scoring import BASE, OWN, cells
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.score.comparisons.compare import RunComparison, compare
 from robomme_interference_data.schema.rollouts import Rollout
-from robomme_interference_data.stats.intervals import newcombe_paired, wilson
+from robomme_interference_data.stats.intervals import wilson
 
 
 def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> RunComparison:
@@ -21,32 +21,6 @@ def compared(tmp_path: Path, a: Sequence[Rollout], b: Sequence[Rollout]) -> RunC
 
 def own(seed: int = 0, **outcomes: str) -> list[Rollout]:
     return cells({(OWN, condition): text for condition, text in outcomes.items()}, seed)
-
-
-def test_two_systems_are_paired_by_episode(tmp_path: Path) -> None:
-    rows = made.rows()
-    found = compared(
-        tmp_path, [r for r in rows if r.system == BASE], [r for r in rows if r.system == RETRIEVAL]
-    )
-    assert found.notes == (
-        f"Only in a, and left out (episodes): {BASE} in tabletop, no-history (12), k1 (12), k3 "
-        "(12).",
-    )
-    records = found.table.records()
-    assert len(records) == 6  # both conditions in all, and in the two families
-    overall = {row["condition_a"]: row for row in records if row["family"] == "all"}
-    assert (overall["k0"]["gained"], overall["k0"]["lost"], overall["k0"]["p"]) == (1, 1, 1.0)
-    k7 = overall["k7"]
-    assert (k7["n"], k7["rate_a"], k7["rate_b"]) == (12, 2 / 12, 7 / 12)
-    assert (k7["gained"], k7["lost"], k7["p"]) == (5, 0, 2 / 32)
-    assert k7["difference"] == pytest.approx(5 / 12)
-    assert (k7["interval"], k7["pairs"], k7["flips"]) == ("newcombe", 12, 5 / 12)
-    assert (k7["low"], k7["high"]) == newcombe_paired(2, 5, 0, 5)
-    # Corrected among the two overall rows; those of families are corrected among themselves.
-    assert k7["p_holm"] == 2 * 2 / 32
-    family = next(r for r in records if (r["family"], r["condition_b"]) == ("MoveCube", "k7"))
-    assert (family["lost"], family["gained"], family["p"]) == (0, 3, 0.25)
-    assert family["p_holm"] == 4 * 0.25
 
 
 def test_two_runs_of_one_system_show_the_noise_floor(tmp_path: Path) -> None:

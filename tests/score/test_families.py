@@ -1,50 +1,12 @@
 """Comparisons by family: apart, with families weighing alike, and as a sample of such families."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from support import scoring as made
-from support.scoring import OWN, record, row
 
 from robomme_interference_data.evaluate.score.comparisons.families import over_families
-from robomme_interference_data.evaluate.score.scoring import Score
 
 MOVE, PEG = made.FAMILIES
-
-
-def scored(tmp_path: Path, **outcomes: tuple[str, str]) -> Score:
-    """Rows of one's own memory: outcomes in two families by condition."""
-    rows = [
-        row(OWN, condition, family, place, letter)
-        for condition, both in outcomes.items()
-        for family, letters in zip(made.FAMILIES, both, strict=True)
-        for place, letter in enumerate(letters)
-    ]
-    return made.score(made.write_csv(tmp_path / "a.csv", rows))
-
-
-def test_families_are_corrected_among_themselves(tmp_path: Path) -> None:
-    # MoveCube loses six of eight, InsertPeg nothing; an error makes InsertPeg incomplete.
-    found = scored(tmp_path, k0=("s" * 8, "ssse"), k7=("ssffffff", "ssss"))
-    move, peg = (record(found, "family_effects", family=family) for family in (MOVE, PEG))
-    assert (move["n"], move["lost"], move["gained"], move["p"]) == (8, 6, 0, 2 / 64)
-    assert (peg["n"], peg["lost"], peg["difference"], peg["p"]) == (3, 0, 0.0, 1.0)
-    assert (move["p_holm"], peg["p_holm"]) == (2 * 2 / 64, 1.0)
-    assert (move["complete"], peg["complete"]) == (True, False)
-    # The one test over all episodes is corrected for itself alone.
-    effect = record(found, "effects")
-    assert effect["p_holm"] == effect["p"] == 2 / 64
-
-
-def test_families_can_weigh_alike(tmp_path: Path) -> None:
-    # −6 of 8 and 0 of 4: −6/12 over episodes, −3/8 over families.
-    found = scored(tmp_path, k0=("s" * 8, "ssss"), k7=("ssffffff", "ssss"))
-    effect = record(found, "families")
-    assert (effect["n"], effect["families"]) == (12, 2)
-    assert (effect["difference"], effect["alike"]) == (-0.5, -0.375)
-    # Fewer than ten episodes differ: no draws to rely on.
-    assert effect["alike_low"] is effect["sample_high"] is None
 
 
 def test_a_sample_of_families_is_less_sure_than_these() -> None:

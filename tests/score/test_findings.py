@@ -8,11 +8,10 @@ from support.scoring import BASE, OWN, RETRIEVAL, cells, record
 
 from robomme_interference_data.evaluate.score.config import Grid
 from robomme_interference_data.evaluate.score.report.headline import headline
-from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.tables.paper import by_family, differing, published
 from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.schema.conditions import NO_HISTORY
-from robomme_interference_data.stats.intervals import newcombe, wilson
+from robomme_interference_data.stats.intervals import wilson
 
 PAPER = made.RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"
 
@@ -95,26 +94,10 @@ def test_headlines(
 # --- the paper ---------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def beside(tmp_path_factory: pytest.TempPathFactory) -> Score:
+def test_what_is_not_in_the_paper_is_told(tmp_path: Path) -> None:
     other = made.changed(made.rows(), simulator="robomme", revision="cd" * 32)
-    path = tmp_path_factory.mktemp("rows") / "a.csv"
-    return made.score(made.write_csv(path, [*made.rows(), *other]), paper=True)
-
-
-def test_rates_stand_beside_the_published_ones(beside: Score) -> None:
-    # Five cells of the base system; two of retrieval, each beside its own and the base's.
-    assert len(beside.tables["paper"].rows) == 9
-    base = record(beside, "paper", system=BASE, condition="k0")
-    assert (base["n"], base["published_n"]) == (12, 450)
-    # Only the benchmark's whole grid is complete, whatever the grid of the scoring.
-    assert not base["complete"]
-    assert base["published_rate"] == 204 / 450 and base["published_best"]
-    assert (base["difference_low"], base["difference_high"]) == newcombe(7, 12, 204, 450)
-
-
-def test_what_is_not_in_the_paper_is_told(beside: Score, tmp_path: Path) -> None:
-    assert beside.notes == (
+    path = made.write_csv(tmp_path / "both.csv", [*made.rows(), *other])
+    assert made.score(path, paper=True).notes == (
         "Rows of tabletop are not set against the paper's RoboMME.",
         f"Not in the paper under these conditions: {OWN}.",
     )

@@ -14,9 +14,6 @@ from robomme_interference_data.evaluate.score.comparisons.tables import correcte
 from robomme_interference_data.stats.intervals import mover_interval, newcombe, newcombe_paired
 from robomme_interference_data.stats.significance import holm, mcnemar, sign_flip, two_proportions
 
-# Of 24 episodes: 12, 11, 6 and 5, each a part of the one before.
-FALLING = {"one": 12, "two": 11, "three": 6, "four": 5}
-
 
 def scored(tmp_path: Path, outcomes: dict[tuple[str, str], str]) -> made.Score:
     return made.score(made.write_csv(tmp_path / "a.csv", cells(outcomes)), draws=2000)
@@ -24,25 +21,6 @@ def scored(tmp_path: Path, outcomes: dict[tuple[str, str], str]) -> made.Score:
 
 def first(won: int, of: int = 24) -> str:
     return "s" * won + "f" * (of - won)
-
-
-def test_systems_are_set_against_the_best_of_their_condition(tmp_path: Path) -> None:
-    given = {(name, "k0"): first(n) for name, n in FALLING.items()}
-    given |= {("oracle", "k0"): first(24), ("late", "k0"): "s" * 23, ("one", "k7"): first(3)}
-    found = scored(tmp_path, given)
-    # Neither a bound nor an incomplete cell leads, or is compared.
-    compared = records(found, "systems")
-    assert [(r["system"], r["against_system"]) for r in compared] == [
-        *(("four", "one"), ("three", "one"), ("two", "one"))
-    ]
-    three = record(found, "systems", system="three")
-    assert (three["gained"], three["lost"], three["difference"]) == (0, 6, -0.25)
-    assert (three["p"], three["p_mid"]) == mcnemar(0, 6)
-    assert (three["low"], three["high"]) == newcombe_paired(6, 0, 6, 12)
-    # Smallest first: 3 · 2/2⁷, 2 · 2/2⁶, 1.
-    assert [r["p_holm"] for r in compared] == [3 * 2 / 2**7, 2 * 2 / 2**6, 1.0]
-    pairs = {(r["system"], r["against_system"]): r["lost"] for r in records(found, "matrix")}
-    assert len(pairs) == 6 and pairs["four", "one"] == 7 and pairs["three", "two"] == 5
 
 
 def test_equal_rates_lead_by_the_order_of_tables(tmp_path: Path) -> None:

@@ -114,8 +114,6 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
 
         # Filtering a table by words.
         page.type("#table-family input", "retrieval insertpeg")
-        assert texts("#table-family tbody td:nth-child(2)") == ["Retrieval-FrameSamp-Modul"] * 2
-        assert texts("#table-family tbody td:nth-child(4)") == ["InsertPeg"] * 2
         assert texts("#table-family .count") == ["2 of 18 rows"]
         # An id of the CSVs finds what its name finds; a system and a condition can be chosen.
         page.run("document.querySelector('#table-family input').value = ''")
@@ -144,9 +142,7 @@ def test_the_report_works_in_a_browser(report: Path, small: Score) -> None:
         page.click("#flipped")
         assert len(texts(rows)) == 5 + 2
         page.type("#table-episodes input[type=search]", "Retrieval")
-        assert texts(f"{rows} td:nth-child(4)") == ["test/1", "test/2"]
         assert texts(f"{rows} td:last-child") == ["k7 gained", "k7 lost"]
-        assert texts(f"{rows}:first-child td")[5:10] == ["", "fail", "", "", "success"]
         page.click("#flipped")
         assert len(texts(rows)) == 12
 
