@@ -21,6 +21,12 @@ from .worker import ProcessWorker, Task, has_begun, left_behind, unpickled
 CLOSE_S = 10.0
 """Seconds that workers without work have to close what they hold."""
 
+START_S = 300.0
+"""Seconds that a worker has to start, which imports what its function needs."""
+
+_LOOK_S = 5.0
+"""Seconds after which workers that have not started yet are looked at."""
+
 _STARTED_AGAIN = 97
 """Exit code of a worker that came upon the call that started it."""
 
@@ -45,6 +51,7 @@ class WorkerProcess:
         context = multiprocessing.get_context("spawn")
         self.number = number
         self.pipe, theirs = context.Pipe()
+        self._late = time.monotonic() + START_S
         self._home = Path(tempfile.mkdtemp(prefix="robomme-interference-"))
         arguments = (function, theirs, number, self._home)
         self._process = context.Process(target=_serve, args=arguments, daemon=True)
@@ -64,6 +71,14 @@ class WorkerProcess:
         if data is None:
             return self._death()
         return Reply(*unpickled(data), left_behind(self._home)[2])
+
+    def check_start(self) -> None:
+        """Raise if it takes too long to start."""
+        if time.monotonic() > self._late and not has_begun(self._home):
+            raise WorkerError(
+                f"a worker process did not start within {START_S:g} s",
+                "Worker processes import the script that starts them, and what it imports.",
+            )
 
     def stop(self) -> None:
         """End it now; its guard ends what it started."""
@@ -108,7 +123,9 @@ class ProcessScheduler(Scheduler[WorkerProcess]):
 
     def wait(self, workers: Sequence[WorkerProcess]) -> Iterable[WorkerProcess]:
         """Wait for answers; a worker that died has one, too."""
-        answered = wait([one.pipe for one in workers])
+        answered = wait([one.pipe for one in workers], timeout=_LOOK_S)
+        for one in workers:
+            one.check_start()
         return [one for one in workers if one.pipe in answered]
 
     def close(self) -> None:

@@ -6,12 +6,13 @@ or was lost with its node, is replaced by another. Only the caller writes.
 
 import logging
 import os
+import pickle
 import shutil
 import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,18 +21,14 @@ from typing import Any
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
 
 import ray
+from ray import cloudpickle
 from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from robomme_interference_data.errors import (
-    InterferenceError,
-    InvalidOptionError,
-    WorkerError,
-    first_line,
-)
+from robomme_interference_data.errors import InvalidOptionError, WorkerError, first_line
 
 from .executor import Executor, Session, describe
-from .process import CLOSE_S, end_if_starting
+from .process import CLOSE_S, START_S, end_if_starting
 from .scheduler import Reply, Scheduler
 from .worker import ProcessWorker, Task, left_behind, unpickled
 
@@ -61,10 +58,9 @@ _WAIT_S = 30.0
 class RayWorkers(Executor):
     """Runs tasks in worker processes on the nodes of a Ray cluster; see `Executor`.
 
-    Every node that has room for a worker is asked first what it has installed, and what the tasks
-    say of themselves there (`Task.describe`): a difference to this process is an error. A node
-    that comes later is asked too, and left alone if it differs. Workers are in the folder that
-    this process is in, where a node has it.
+    A worker says, as it begins, what its node has installed, and what the tasks say of themselves
+    there (`Task.describe`): a difference to this process is an error. Workers are in the folder
+    that this process is in, where a node has it.
 
     Attributes:
         workers: How many, at most; those for which there is no room start when a node comes.
@@ -105,58 +101,22 @@ class RayWorkers(Executor):
         """
         end_if_starting()
         with _connected(self.address):
-            folder = str(Path.cwd())
-            own = describe(function)
-            known = self._check_nodes(function, own, folder)
-            actor: Any = WorkerActor
-            make = actor.options(num_cpus=self.cpus, num_gpus=self.gpus, max_restarts=0).remote
-            scheduler = _RayScheduler(make, (function, folder), own, known, self)
-            with closing(scheduler):
+            resources: Any = ray.cluster_resources
+            has = resources()
+            if self.address == "local" and not (
+                has.get("CPU", 0) >= self.cpus and has.get("GPU", 0) >= self.gpus
+            ):
+                raise WorkerError(
+                    f"this machine does not have {self.wanted} for a worker",
+                    "Set smaller cpus_per_worker and gpus_per_worker.",
+                )
+            with closing(_RayScheduler(function, self)) as scheduler:
                 yield scheduler
 
     @property
     def wanted(self) -> str:
         """What a worker takes, for messages."""
         return f"{self.cpus:g} CPUs" + (f" and {self.gpus:g} GPUs" if self.gpus else "")
-
-    def _check_nodes(self, function: Task, own: Mapping[str, str], folder: str) -> set[str]:
-        """Compare all nodes that have room for a worker with this process; return their ids.
-
-        One that is lost meanwhile is left out.
-        """
-        asked: dict[str, Any] = {}
-        for node in _nodes():
-            has = node["Resources"]
-            if node["Alive"] and has.get("CPU", 0) >= self.cpus and has.get("GPU", 0) >= self.gpus:
-                asked[node["NodeID"]] = _on_node(_describe, node["NodeID"]).remote(function, folder)
-        if not asked and self.address == "local":
-            raise WorkerError(
-                f"this machine does not have {self.wanted} for a worker",
-                "Set smaller cpus_per_worker and gpus_per_worker.",
-            )
-        wrong, known = [], set()
-        for node_id, answer in asked.items():
-            name = _name(node_id)
-            try:
-                wrong += _differences(name, ray.get(answer), own)
-                known.add(node_id)
-            except InterferenceError as error:
-                wrong.append(f"{name}: {error.message}")
-            except RayError as error:
-                if any(node["Alive"] for node in _nodes() if node["NodeID"] == node_id):
-                    wrong.append(f"{name}: {_cause(error)}")
-        if wrong:
-            raise WorkerError(
-                "nodes of the cluster are not as this process is:\n  " + "\n  ".join(wrong),
-                "Install the same on all nodes, and give a split that all of them see.",
-            )
-        return known
-
-
-@ray.remote
-def _describe(function: Task, folder: str) -> dict[str, str]:
-    _enter(folder)
-    return describe(function)
 
 
 @ray.remote
@@ -170,15 +130,21 @@ class WorkerActor:
     """A worker, on whatever node Ray starts it."""
 
     def begin(
-        self, number: int, function: Task, folder: str, known: Set[str]
-    ) -> tuple[str, Path, dict[str, str] | None]:
-        """Return the node's id, the worker's folder and, unless the node is known, `describe`."""
+        self, number: int, function: bytes, folder: str
+    ) -> tuple[str, Path, dict[str, str] | str]:
+        """Return the node's id, the worker's folder, and what `describe` says, or why it fails."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        _enter(folder)
-        home = Path(tempfile.mkdtemp(prefix="robomme-interference-"))
-        self._home, self._function, self._worker = home, function, ProcessWorker(number, home)
+        with suppress(OSError):  # relative paths mean what they mean in the caller's folder
+            os.chdir(folder)
+        self._home = Path(tempfile.mkdtemp(prefix="robomme-interference-"))
+        self._worker = ProcessWorker(number, self._home)
         node = ray.get_runtime_context().get_node_id()
-        return node, home, None if node in known else describe(function)
+        with self._worker.limit(START_S, "the worker's start"):
+            try:
+                self._function = pickle.loads(function)
+                return node, self._home, describe(self._function)
+            except Exception as error:
+                return node, self._home, first_line(error)
 
     def work(self, task: Any, time_limit: float | None) -> tuple[bytes, dict[str, bytes]]:
         """Return what came of a task, pickled, and the files that it sent."""
@@ -205,32 +171,31 @@ class _RayWorker:
 
     def _begin(self) -> None:
         self.actor = self._all.make()
-        self.call = self.actor.begin.remote(self.number, *self._all.given, self._all.known)
+        self.call = self.actor.begin.remote(self.number, *self._all.given)
 
     def settle(self) -> None:
-        """Take note that it has begun; where it cannot, begin elsewhere."""
+        """Take note that it has begun; where its process was lost, begin again."""
         try:
             self._node, self._home, found = ray.get(self.call)
-        except RayTaskError as error:
-            self._leave_out(_cause(error))
         except RayError as error:
             self._failures += 1
             if self._failures == _FAILURES:
                 raise WorkerError(f"a worker cannot begin: {_cause(error)}") from None
             self._begin()
-        else:
-            wrong = [] if found is None else _differences(_name(self._node), found, self._all.own)
-            if wrong:
-                self._leave_out("; ".join(wrong))
-            else:
-                self._all.known.add(self._node)
-                self.ready = True
-
-    def _leave_out(self, why: str) -> None:
-        """Do without an actor, which keeps its place, so that the next one is put elsewhere."""
-        logger.warning("A worker is left out: %s", why)
-        self._all.left_out.append(self.actor)
-        self._begin()
+            return
+        if found != (own := self._all.own):
+            wrong = found
+            if isinstance(found, dict):
+                wrong = "; ".join(
+                    f"{key} is {found.get(key, 'missing')} there, {own.get(key, 'missing')} here"
+                    for key in sorted({*found, *own})
+                    if found.get(key) != own.get(key)
+                )
+            raise WorkerError(
+                f"node {_name(self._node)} of the cluster is not as this process is: {wrong}",
+                "Install the same on all nodes, and give a split that all of them see.",
+            )
+        self.ready = True
 
     def send(self, task: Any, time_limit: float | None) -> None:
         """Let it work on a task."""
@@ -251,9 +216,9 @@ class _RayWorker:
         try:
             if isinstance(error, OutOfMemoryError):
                 raise error
-            late, trace, files = ray.get(
-                _on_node(_left_behind, self._node).remote(self._home), timeout=_COLLECT_S
-            )
+            there = NodeAffinitySchedulingStrategy(self._node, soft=False)
+            ask = _left_behind.options(num_cpus=0, scheduling_strategy=there)
+            late, trace, files = ray.get(ask.remote(self._home), timeout=_COLLECT_S)
         except RayError:
             lost = RuntimeError(f"the worker was lost with its node: {_cause(error)}")
             return Reply(error=lost, worker="lost")
@@ -269,25 +234,18 @@ class _RayScheduler(Scheduler[_RayWorker]):
     """Runs tasks on the cluster.
 
     Args:
-        make: Makes an actor.
-        given: Function and folder, for `WorkerActor.begin`.
-        own: What `describe` returns here.
-        known: Ids of nodes where it returns the same.
+        function: What to do with each task.
         config: How many workers there are, and what each takes.
     """
 
-    def __init__(
-        self,
-        make: Callable[[], Any],
-        given: tuple[Task, str],
-        own: Mapping[str, str],
-        known: set[str],
-        config: RayWorkers,
-    ):
+    def __init__(self, function: Task, config: RayWorkers):
         super().__init__(config.workers)
-        self.make, self.given, self.own, self.known = make, given, own, known
+        actor: Any = WorkerActor
+        dumps: Any = cloudpickle.dumps
+        options = {"num_cpus": config.cpus, "num_gpus": config.gpus, "max_restarts": 0}
+        self.make = actor.options(**options).remote
+        self.given, self.own = (dumps(function), str(Path.cwd())), describe(function)
         self._wanted = config.wanted
-        self.left_out: list[Any] = []  # actors on nodes that differ
 
     def start(self, number: int) -> _RayWorker:
         """Start a worker, now or when there is room for it."""
@@ -310,20 +268,8 @@ class _RayScheduler(Scheduler[_RayWorker]):
         ends = [one.actor.end.remote() for one in self.workers if one.ready]
         if ends:
             ray.wait(ends, num_returns=len(ends), timeout=CLOSE_S)
-        for actor in (*self.left_out, *(one.actor for one in self.workers)):
-            ray.kill(actor)
-
-
-def _on_node(function: Any, node_id: str) -> Any:
-    """Return a remote function that runs on one node, whatever else runs there."""
-    there = NodeAffinitySchedulingStrategy(node_id, soft=False)
-    return function.options(num_cpus=0, scheduling_strategy=there)
-
-
-def _enter(folder: str) -> None:
-    """Be in the folder of the caller, where relative paths mean what they mean there."""
-    with suppress(OSError):
-        os.chdir(folder)
+        for one in self.workers:
+            one.stop()
 
 
 @contextmanager
@@ -366,26 +312,11 @@ def _connected(address: str) -> Iterator[None]:
             ray.shutdown()
 
 
-def _nodes() -> list[dict[str, Any]]:
-    """Return what Ray knows of the nodes, those that are gone among them."""
-    nodes: Any = ray.nodes
-    found: list[dict[str, Any]] = nodes()
-    return found
-
-
 def _name(node_id: str) -> str:
     """Return what a node is called in messages: its address, and the beginning of its id."""
-    known = {node["NodeID"]: node["NodeManagerAddress"] for node in _nodes()}
+    nodes: Any = ray.nodes
+    known = {node["NodeID"]: node["NodeManagerAddress"] for node in nodes()}
     return f"{known[node_id]}-{node_id[:6]}"
-
-
-def _differences(name: str, found: Mapping[str, str], own: Mapping[str, str]) -> list[str]:
-    """Return in words in what a node is not as this process is."""
-    return [
-        f"{name}: {key} is {found.get(key, 'missing')} there, {own.get(key, 'missing')} here"
-        for key in sorted({*found, *own})
-        if found.get(key) != own.get(key)
-    ]
 
 
 def _cause(error: RayError) -> str:

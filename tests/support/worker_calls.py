@@ -109,18 +109,6 @@ class Marked:
         return {"mark": os.environ.get("MARK", "none")}
 
 
-class Placed:
-    """Says of itself which node of a cluster it is on: no two say the same."""
-
-    def __call__(self, task: Any, worker: Worker) -> Any:
-        return task
-
-    def describe(self) -> dict[str, str]:
-        import ray
-
-        return {"node": ray.get_runtime_context().get_node_id()}
-
-
 def is_alive(pid: int) -> bool:
     """Whether a process runs; one that ended and that nobody waited for does not."""
     try:

@@ -2,33 +2,27 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 from support import runs, worlds
-from support.asking import ask
 from support.made_up import MadeUpSource
 from support.ray_cluster import add_node, running_cluster
-from support.retrieval import QUIET
 from support.serve_policy import command
 from support.splits import GOLDEN, contents
-from support.worker_calls import Marked, Placed, behave, wait_until_gone
+from support.worker_calls import Marked, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan
 from robomme_interference_data.errors import WorkerError
 from robomme_interference_data.evaluate.run.log import read_record
-from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
-from robomme_interference_data.retrieval.index import build_index
 from robomme_interference_data.runtime.executor import Executor, Serial
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.runtime.ray_cluster import RayWorkers
@@ -138,10 +132,13 @@ def test_each_worker_of_a_node_starts_its_server(cluster: Any, tmp_path: Path) -
     assert len({log.split()[2] for log in logs}) == 2  # a port for each
 
 
-def test_nodes_that_differ_are_refused_before_the_first_task(cluster: Any) -> None:
-    with pytest.raises(WorkerError) as raised:
-        list(RayWorkers(3, cluster.address).run(Placed(), range(3)))
-    assert raised.value.message.count("node is ") == 3  # the driver is on the head
+def test_a_node_that_differs_is_one_error_that_says_how(cluster: Any) -> None:
+    node = add_node(cluster, cpus=2, MARK="other")
+    try:
+        with pytest.raises(WorkerError, match=r"node .*: mark is other there, none here"):
+            list(RayWorkers(1, cluster.address, cpus=2).run(Marked(), [7]))
+    finally:
+        cluster.remove_node(node, allow_graceful=False)
 
 
 def connect(address: str, **environment: str) -> str:
@@ -184,50 +181,6 @@ def test_a_build_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> N
     assert built("cluster", RayWorkers(3, cluster.address)) == built("one", Serial())
 
 
-def test_an_index_has_the_bytes_of_one_process(cluster: Any, tmp_path: Path) -> None:
-    for name, executor in (("one", Serial()), ("cluster", RayWorkers(3, cluster.address))):
-        units = shutil.copytree(GOLDEN / "distractors", tmp_path / name / "distractors")
-        build_index([units], Thumbnail(), QUIET, executor=executor)
-    assert contents(tmp_path / "cluster") == contents(tmp_path / "one")
-
-
-def test_answers_are_those_of_one_process(cluster: Any, tmp_path: Path) -> None:
-    one = ask(tmp_path / "one", frames=3)
-    there = ask(tmp_path / "cluster", executor=RayWorkers(3, cluster.address), frames=3)
-    assert runs.untimed(there.rows) == runs.untimed(one.rows)
-
-
-def test_a_worker_that_dies_costs_no_task(cluster: Any, tmp_path: Path) -> None:
-    tasks = [("die once", str(tmp_path / "killed")), ("value", 7)]
-    outcomes = list(RayWorkers(1, cluster.address).run(behave, tasks))
-    assert {(one.value, one.error, one.attempts) for one in outcomes} == {
-        (None, None, 2),
-        (7, None, 1),
-    }
-
-
-def test_a_node_that_joins_and_differs_is_left_out(
-    cluster: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    """And the worker that was to be there is made on the next one."""
-    nodes = []
-    with ThreadPoolExecutor(1) as pool:
-        work = RayWorkers(1, cluster.address, cpus=2).run(Marked(), [7])
-        done = pool.submit(list, work)
-        try:
-            nodes.append(add_node(cluster, cpus=2, MARK="other"))
-            said, end = "", time.monotonic() + 60
-            while "mark is other there, none here" not in said:
-                assert time.monotonic() < end and not done.done(), said
-                time.sleep(0.1)
-                said = caplog.text
-            nodes.append(add_node(cluster, cpus=2))
-            assert [outcome.value for outcome in done.result(timeout=60)] == [7]
-        finally:
-            for node in nodes:
-                cluster.remove_node(node, allow_graceful=False)
-
-
 def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
     """A worker begins when a node with room for it joins."""
     work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7)])
@@ -239,49 +192,3 @@ def test_processors_that_no_node_has_are_waited_for(cluster: Any) -> None:
         work.close()
         if node is not None:
             cluster.remove_node(node, allow_graceful=False)
-
-
-def test_a_node_with_notice_works_on_until_it_is_gone(cluster: Any) -> None:
-    """As a spot machine has, which Ray is told to drain."""
-    node = add_node(cluster, cpus=2)
-    work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("pid", n) for n in range(3)])
-    try:
-        first = next(work)
-        words = f"drain-node --address {cluster.address} --node-id {node.node_id} "
-        words += "--reason DRAIN_NODE_REASON_PREEMPTION --reason-message spot"
-        ray = Path(sys.executable).with_name("ray")
-        subprocess.run(
-            [ray, *words.split(), "--deadline-remaining-seconds", "120"], check=True, timeout=60
-        )
-        second = next(work)
-        assert (second.value, second.node) == (first.value, first.node)
-        cluster.remove_node(node, allow_graceful=False)
-        wait_until_gone([first.value])
-        node = add_node(cluster, cpus=2)
-        (third,) = work
-        assert third.error is None and third.node not in (None, first.node)
-    finally:
-        work.close()
-        cluster.remove_node(node, allow_graceful=False)
-
-
-def test_a_node_that_stalls_is_given_up(cluster: Any) -> None:
-    """As when its network does: nothing of it answers, and nothing ends."""
-    node = add_node(cluster, cpus=2)
-    work = RayWorkers(1, cluster.address, cpus=2).run(behave, [("value", 7), ("value", 8)])
-    first = next(work)
-    stalled = [one.process.pid for one in raylets(node)]
-    stalled += [child.pid for pid in stalled for child in psutil.Process(pid).children(True)]
-    for pid in stalled:
-        os.kill(pid, signal.SIGSTOP)
-    other = add_node(cluster, cpus=2)
-    try:
-        (second,) = work  # Ray takes a minute
-        assert {first.value, second.value} == {7, 8}
-        assert (first.attempts, second.attempts) == (1, 2) and first.node != second.node
-    finally:
-        work.close()
-        for pid in stalled:
-            os.kill(pid, signal.SIGCONT)
-        for one in (node, other):
-            cluster.remove_node(one, allow_graceful=False)

@@ -14,7 +14,8 @@ import pytest
 from support.ray_cluster import running_cluster
 from support.worker_calls import behave, is_alive, pids_in, wait_until_gone
 
-from robomme_interference_data.errors import SimulatorCrashError, WorkerRetiredError
+from robomme_interference_data.errors import SimulatorCrashError, WorkerError, WorkerRetiredError
+from robomme_interference_data.runtime import process
 from robomme_interference_data.runtime.executor import Outcome, Processes
 from robomme_interference_data.runtime.ray_cluster import RayWorkers
 
@@ -123,6 +124,16 @@ def test_a_worker_that_retires_leaves_its_task_to_the_others(run: Run) -> None:
     with pytest.raises(WorkerRetiredError, match=r"worker [01] is gone") as raised:
         run([("retire", (0, 1))] * 5, workers=2)
     assert raised.value.hint == "Start it."
+
+
+def test_a_worker_that_does_not_start_is_one_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It hangs in an import, of what its function needs."""
+    monkeypatch.setattr(process, "START_S", 0.1)
+    monkeypatch.setattr(process, "_LOOK_S", 0.1)
+    with pytest.raises(WorkerError, match=r"did not start within 0\.1 s"):
+        list(Processes(1).run(behave, [("value", 7)]))
 
 
 # --- the end -----------------------------------------------------------------------------------
