@@ -2,7 +2,6 @@
 
 import re
 import sys
-import threading
 from typing import Any
 
 import pytest
@@ -54,11 +53,6 @@ def test_outcomes_are_values_in_order() -> None:
     assert function.calls == [(1, 0), ("a", 0), "closed"]
 
 
-def test_a_value_need_not_be_picklable_here() -> None:
-    (outcome,) = Serial().run(lambda task, worker: threading.Lock(), [0])
-    assert outcome.value.acquire()
-
-
 def test_errors_of_this_package_are_themselves_others_are_told_in_words() -> None:
     (outcome,) = Serial().run(lambda task, worker: EpisodeId.parse(task), ["VideoRepick"])
     assert isinstance(outcome.error, InvalidIdError)
@@ -102,12 +96,6 @@ def test_work_that_is_given_up_closes_what_it_holds() -> None:
     assert function.calls == [(1, 0), "closed"]
 
 
-@pytest.mark.parametrize("workers", [0, -1])
-def test_workers_must_be_positive(workers: int) -> None:
-    with pytest.raises(InvalidOptionError, match=f"workers {workers}"):
-        Processes(workers)
-
-
 def test_what_is_handed_in_comes_with_the_outcome_however_the_task_ends() -> None:
     def write(task: str, worker: Worker) -> None:
         worker.send_file("a.txt", b"first")
@@ -146,14 +134,12 @@ def test_the_executor_that_is_asked_for() -> None:
         ({"executor": "rey"}, "'rey' is none of processes, ray"),
         ({"workers": 0}, "workers 0"),
         ({"gpus_per_worker": 0.5}, 'gpus_per_worker has no effect with executor="processes"'),
-        ({"ray_address": "local"}, 'ray_address has no effect with executor="processes"'),
-        ({"executor": "ray", "workers": 0}, "workers 0"),
         ({"executor": "ray", "gpus_per_worker": -1.0}, "gpus_per_worker -1"),
         ({"executor": "ray", "cpus_per_worker": float("nan")}, "cpus_per_worker nan"),
         ({"executor": "ray", "gpus_per_worker": 1.5}, "gpus_per_worker 1.5"),
         *(
             ({"executor": "ray", "ray_address": given}, f"ray_address {given!r}; expected auto")
-            for given in ("", "here", "here:", "10.0.0.1:head", "10.0.0.1:65536", "ray://a:1x")
+            for given in ("", "here", "10.0.0.1:65536", "ray://a:1x")
         ),
     ],
 )

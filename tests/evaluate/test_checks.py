@@ -30,7 +30,6 @@ from robomme_interference_data.errors import (
     PolicyError,
     UnknownNameError,
 )
-from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.rollout.checks import (
     check_plan,
@@ -51,26 +50,16 @@ SAYS = {"policy": "python:support.own_policies:says"}
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"policy": "orakel"}, UnknownNameError, "no policy 'orakel'"),
         ({"policy": "websocket://a:1", "system": None}, InvalidOptionError, "need a name"),
-        ({"policy": "lerobot:out/last", "system": None}, InvalidOptionError, "need a name"),
         ({"policy": "python:__main__:make"}, InvalidOptionError, "run another program"),
         ({"simulator": "tabeltop"}, UnknownNameError, "no simulator 'tabeltop'"),
-        ({"simulator": "nosuch:thing"}, InvalidOptionError, "importing nosuch failed"),
         ({"simulator": "tabletop"}, InvalidOptionError, "recorded on 'sample', the run is on"),
         ({"shift": "fog:1"}, InvalidOptionError, "shift 'fog:1'; expected none, or light"),
         ({"shift": "light:2"}, InvalidOptionError, "on support.worlds:World: it cannot"),
-        (
-            {"shift": "light:2", "simulator": "robomme"},
-            InvalidOptionError,
-            "shift light:2 on robomme: it cannot",
-        ),
-        ({"episodes": "0-9"}, UnknownNameError, "no query episode"),
         ({"episode_split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
         ({"workers": 0}, InvalidOptionError, "workers 0; expected more than 0"),
         ({"rollout_timeout": float("nan")}, InvalidOptionError, "rollout_timeout nan"),
-        ({"simulator_timeout": float("inf")}, InvalidOptionError, "simulator_timeout inf"),
         ({"system": "pi05_baseline"}, InvalidOptionError, "pi05_baseline takes no history, so k0"),
         (
             {"system": "retrieval-framesamp-modul", "retrieval": "thumbnail"},
@@ -78,13 +67,9 @@ SAYS = {"policy": "python:support.own_policies:says"}
             "has nothing to retrieve from under no-history",
         ),
         ({"system": "retrieval-framesamp-modul"}, InvalidOptionError, "and none is given"),
-        ({"system": "Perceptual_FrameSamp_Modul"}, UnknownNameError, "reads like the system"),
         ({"retrieval_rule": "oracle"}, InvalidOptionError, "`retrieval_rule` has no effect"),
-        ({"retrieval_camera": "wrist"}, InvalidOptionError, "`retrieval_camera` has no effect"),
         ({"retrieval": "thumbnail", "retrieval_camera": "nose"}, UnknownNameError, "camera 'nose'"),
-        ({"retrieval": "thumbnail", "retrieval_rule": "best!"}, UnknownNameError, "best!"),
         ({"retrieval": "thumbnail"}, MissingIndexError, "'thumbnail'"),
-        (SAYS | {"policy_options": ("what=text",)}, PolicyError, "returned a str"),
         (SAYS | {"policy_options": ("what=nan",)}, PolicyError, "holds nan"),
     ],
 )
@@ -110,24 +95,6 @@ def test_every_condition_must_have_its_indexes(tmp_path: Path) -> None:
         run(tmp_path / "run", **asked, conditions=("k0", "stale-k0"))
     assert not (tmp_path / "run").exists()
     assert run(tmp_path / "run", **asked, conditions=("k0",)).counts["error"] == 0
-
-
-def test_only_simulators_that_exist_are_offered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def hint() -> str:
-        with pytest.raises(InvalidOptionError) as raised:
-            run(tmp_path / "run", simulator="tabletop")
-        return str(raised.value.hint)
-
-    assert "Set simulator" not in hint() and "tabletop or robomme" in hint()
-    monkeypatch.setitem(SIMULATORS, "sample", SIMULATORS["tabletop"])
-    assert 'Set simulator="sample"' in hint()
-
-
-def test_a_missing_split_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptionError, match="neither a folder nor"):
-        run_evaluation(RunConfig("hold", tmp_path / "none", tmp_path / "run"))
 
 
 def test_videos_without_pillow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,17 +218,11 @@ def test_replay_that_goes_on_is_a_system_of_its_own(tiny_split: Path) -> None:
         ("oracle", "perceptual-framesamp-modul", "is not the paper's system"),
         ("lerobot:x/y", "pi05_baseline", "is not the paper's system"),
         ("replay:window", "replay-full", "replay:window is not the control"),
-        ("replay", "replay-window", "replay is not the control replay-window"),
         (CHEAT, "oracle", "is not the control oracle"),
-        ("replay", "retrieval-replay-full", "replay is not the control"),
         (CHEAT, "retrieval-replay-full-mean", "is not the control"),
         ("websocket://h:1", "memer", "acts on subgoals of a model"),
-        ("oracle", "oracle", None),
         ("oracle", "my-upper-end", None),
-        ("replay", "replay-full", None),
-        ("replay:window", "replay-window", None),
         ("websocket://h:1", "perceptual-framesamp-modul", None),
-        ("websocket://h:1", "without-subgoals", None),
         (CHEAT, "memer", None),
     ],
 )
@@ -280,8 +241,6 @@ def test_a_name_of_the_table_is_for_the_policy_that_it_stands_for(
     ("step", "name"),
     [
         ({}, "replay-window"),
-        ({"retrieval": "siglip"}, "retrieval-replay-window"),
-        ({"retrieval": "siglip", "retrieval_rule": "mean"}, "retrieval-replay-window-mean"),
         (
             {"retrieval": "siglip", "retrieval_rule": "max/0.9", "retrieval_camera": "wrist"},
             "retrieval-replay-window-max-0.9-wrist",

@@ -1,6 +1,5 @@
 """How a question is put to a model, and which option its answer names: pure rules, prompt files."""
 
-import hashlib
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robomme_interference_data.data.questions import LETTERS, Question
-from robomme_interference_data.errors import FormatError, UnknownNameError
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.questions.prompt import (
@@ -88,27 +87,20 @@ def test_forms_of_answers(form: str, letter: str, other: str) -> None:
     [
         ("", None),
         ("I cannot tell.", None),
-        ("I", None),
         ("E", None),  # of no option
-        ("The answer is E.", None),
         ("A or B", None),
         ("The answer is A or B.", None),
         ("Answer: A, B", None),
         ("A, B, C", None),
         ("option A or option B", None),
         ("A: no\nB: no", None),
-        ("The cube was pushed.", None),
-        ("a cube", None),
         ("The answer is a blue cube.", None),
         ("The answer is a blue cube, marked C", "C"),
-        ("A robot arm pushed it.", None),
         ("It's A's neighbour.", None),
         ("Answer: b", "B"),
         ("answer: a\nbecause it moved", "A"),
         ("A", "A"),
-        ("A is right", "A"),
         ("The answer is A because it moved.", "A"),
-        ("D.", "D"),
     ],
 )
 def test_answers_by_hand(said: str, expected: str | None) -> None:
@@ -179,29 +171,15 @@ def test_our_prompt_shows_all_and_asks_for_a_letter() -> None:
 # --- files -------------------------------------------------------------------------------------
 
 
-def test_a_prompt_of_ones_own(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(f'system = "s"\nquestion = "{PLACES}"\n')
-    prompt, digest = load_prompt(str(path))
-    assert prompt == QuestionPrompt("s", PLACES)
-    assert digest == hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("system = 's'", "lacks question"),
-        (f"question = '{PLACES}'", "lacks system"),
-        (f"system = 's'\nquestion = '{PLACES}'\ncolour = 'red'", "'colour'"),
-        (f"system = 3\nquestion = '{PLACES}'", "system is 3"),
-        ("system = 's'\nquestion = ['a']", "question is ['a']"),
         *(
             (f"system = 's'\nquestion = '{PLACES.replace(place, '')}'", f"lacks {place}")
             for place in ("<history>", "<picture>", "{question}", "{options}")
         ),
-        ("nonsense", "no prompt"),
         ("a = " + "[" * 5000, "no prompt"),
-        ("# " + "x" * (1 << 16), "at most"),
         (f"system = ' '\nquestion = '{PLACES}'", "system is empty"),
     ],
 )
@@ -219,10 +197,3 @@ def test_bytes_that_are_no_text(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FormatError, match="no prompt"):
         load_prompt(str(path))
-
-
-@pytest.mark.parametrize("name", ["choise", "", ".", "nowhere.toml"])
-def test_no_such_prompt(name: str) -> None:
-    with pytest.raises(UnknownNameError, match=f"no prompt '{name}'") as raised:
-        load_prompt(name)
-    assert "choice" in str(raised.value.hint)
