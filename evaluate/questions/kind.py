@@ -29,7 +29,7 @@ from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.sampling import MEMORIES
 from robomme_interference_data.simulators.registry import recorded_scene
 
-from .responders import CONTROLS, OWN, make_responder
+from .responders import CONTROLS, OWN, ModelResponder
 from .task import AskTask
 
 
@@ -41,11 +41,13 @@ class Questions(RunKind[AskConfig]):
         config = self.config
         _check_settings(config)
         self._questions = read_questions(self.split)
+        self.metadata, self._images = {"model": config.model}, None
         if config.model not in OWN:
             self.config = config = dataclasses.replace(config, model=pin_model(config.model))
         self.system = _name(config)
-        with closing(make_responder(config)) as responder:
-            self.metadata, self._images = responder.metadata(), responder.images
+        if config.model not in OWN:
+            with closing(ModelResponder(config)) as responder:
+                self.metadata, self._images = responder.metadata(), responder.images
 
     def refusal(self, condition: str) -> InterferenceError | None:
         """Return why a condition does not apply, or None."""

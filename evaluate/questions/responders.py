@@ -1,7 +1,6 @@
 """Who answers questions: the ideal observer, chance, or a model."""
 
 import hashlib
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ from robomme_interference_data.constants import FPS
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.models.model import ChatModel, Video
+from robomme_interference_data.evaluate.models.model import Video
 from robomme_interference_data.evaluate.models.prompts import told
 from robomme_interference_data.evaluate.models.registry import make_model
 from robomme_interference_data.evaluate.run.config import AskConfig
@@ -70,76 +69,45 @@ class Answer:
     seconds: float | None = None
 
 
-class Responder(ABC):
-    """Answers questions, one at a time, and keeps nothing from one to the next.
+def guess(prompted: Prompted) -> str:
+    """Draw one of all options."""
+    return prompted.draw(prompted.question.letters)
+
+
+def recall(prompted: Prompted) -> str:
+    """Answer as the ideal observer: draw one of the options that agree with what frames show.
+
+    It draws from all, if all can be ruled out.
+    """
+    question, scene = prompted.question, recorded_scene(prompted.query)
+    if scene is None or max(question.answers) >= len(scene.answers):
+        raise FormatError(
+            f"the options of {question.episode_id} are no answers that its scene allows",
+            "recall needs a simulator whose possible answers are known, such as tabletop.",
+        )
+    left = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
+    choices = [scene.choice(scene.answers[number]) for number in question.answers]
+    fits = [one for one, choice in zip(question.letters, choices, strict=True) if choice in left]
+    return prompted.draw("".join(fits) or question.letters)
+
+
+OWN = {"recall": recall, "guess": guess}
+"""Who answers without a model."""
+
+
+class ModelResponder:
+    """A vision-language model that answers, one question at a time.
 
     Attributes:
         images: Images that it can be shown with a question, the picture among them; None if there
             is no bound.
     """
 
-    images: int | None = None
-
-    @abstractmethod
-    def answer(self, prompted: Prompted) -> Answer:
-        """Answer."""
-
-    @abstractmethod
-    def metadata(self) -> dict[str, Any]:
-        """Return plain values that say who answers."""
-
-    def close(self) -> None:
-        """Release everything."""
-
-
-class Guesser(Responder):
-    """`guess`: draws an option."""
-
-    def answer(self, prompted: Prompted) -> Answer:
-        """Draw from all options."""
-        return Answer(prompted.draw(prompted.question.letters))
-
-    def metadata(self) -> dict[str, Any]:
-        """Return its name."""
-        return {"model": "guess"}
-
-
-class Recaller(Responder):
-    """`recall`: the ideal observer. It draws from the options that agree with what frames show."""
-
-    def answer(self, prompted: Prompted) -> Answer:
-        """Draw from the options that cannot be ruled out; from all, if all can be."""
-        question, scene = prompted.question, recorded_scene(prompted.query)
-        if scene is None or max(question.answers) >= len(scene.answers):
-            raise FormatError(
-                f"the options of {question.episode_id} are no answers that its scene allows",
-                "recall needs a simulator whose possible answers are known, such as tabletop.",
-            )
-        left = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
-        choices = [scene.choice(scene.answers[number]) for number in question.answers]
-        fits = [
-            one for one, choice in zip(question.letters, choices, strict=True) if choice in left
-        ]
-        return Answer(prompted.draw("".join(fits) or question.letters))
-
-    def metadata(self) -> dict[str, Any]:
-        """Return its name."""
-        return {"model": "recall"}
-
-
-class ModelResponder(Responder):
-    """A vision-language model.
-
-    Args:
-        model: The model.
-        prompt: How it is asked: see `load_prompt`.
-        control: One of `CONTROLS`.
-    """
-
-    def __init__(self, model: ChatModel, prompt: str, control: str):
-        self._model, self._control = model, control
-        self.images = None if control == "text" else model.images
-        self._prompt, self._sha256 = load_prompt(prompt)
+    def __init__(self, config: AskConfig):
+        self._model = make_model(config.model, config.model_options)
+        self._control = config.control
+        self.images = None if config.control == "text" else self._model.images
+        self._prompt, self._sha256 = load_prompt(config.prompt)
 
     def answer(self, prompted: Prompted) -> Answer:
         """Ask the model."""
@@ -167,15 +135,3 @@ class ModelResponder(Responder):
     def close(self) -> None:
         """Close the model."""
         self._model.close()
-
-
-OWN = {"recall": Recaller, "guess": Guesser}
-"""Who answers without a model."""
-
-
-def make_responder(config: AskConfig) -> Responder:
-    """Make who answers, in this process; see `make_model` and `load_prompt` for errors."""
-    if config.model in OWN:
-        return OWN[config.model]()
-    model = make_model(config.model, config.model_options)
-    return ModelResponder(model, config.prompt, config.control)

@@ -11,10 +11,10 @@ from robomme_interference_data.data.buffer_set import Split
 from robomme_interference_data.data.loading import load_split
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.evaluate.rollout.rollout import retrieval_columns
-from robomme_interference_data.evaluate.rollout.transcripts import transcript_file
 from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.evaluate.run.identity import make_selector, package_versions
 from robomme_interference_data.evaluate.run.kind import Job, Run, stored_count
+from robomme_interference_data.evaluate.run.log import transcript_file
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
@@ -27,7 +27,7 @@ from robomme_interference_data.schema.sampling import (
     lesson_share,
 )
 
-from .responders import Prompted, Responder, make_responder
+from .responders import OWN, Answer, ModelResponder, Prompted
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
@@ -44,7 +44,7 @@ class AskTask:
         self._split: Split | None = None
         self._questions: dict[EpisodeId, Question] = {}
         self._selector: Selector | None = None
-        self._responder: Responder | None = None
+        self._responder: ModelResponder | None = None
 
     def __call__(self, task: Job, worker: Worker) -> tuple[Rollout, None]:
         """Ask a question, and send its transcript; return its row."""
@@ -73,8 +73,8 @@ class AskTask:
             self._split = load_split(config.split, cache=config.cache, threads=1)
             self._questions = read_questions(self._split)
             self._selector = make_selector(config)
-        if self._responder is None:
-            self._responder = make_responder(config)
+        if self._responder is None and config.model not in OWN:
+            self._responder = ModelResponder(config)
         buffer, question = (
             self._split.load(item.episode, item.condition),
             self._questions[item.episode],
@@ -94,7 +94,10 @@ class AskTask:
 
         known = None if evidence is None else known_parts(evidence, kept)
         prompted = Prompted(question, buffer.query, config.model_seed, known, frames)
-        answer = self._responder.answer(prompted)
+        if self._responder is None:
+            answer = Answer(OWN[config.model](prompted))
+        else:
+            answer = self._responder.answer(prompted)
         right = answer.letter == question.letters[question.right]
         own = answer.calls is not None
         tokens = stored_count(answer.tokens)

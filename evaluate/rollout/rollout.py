@@ -257,10 +257,7 @@ def read_ahead[T](items: Generator[T], depth: int) -> Iterator[Iterator[T]]:
 
     What it gives yields the items in order; an error in making one is raised where that item
     would have come. The stream is closed at the end, read to its end or not.
-
-    Args:
-        items: The stream; no item is None.
-        depth: Items that are made ahead at most, 1 or more: so many wait in memory.
+    No item is None; at most `depth` items, 1 or more, wait in memory.
     """
     pool = ThreadPoolExecutor(1, "read-ahead")  # one thread: a stream is made in its order
     made = deque(pool.submit(next, items, None) for _ in range(depth))

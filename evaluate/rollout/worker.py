@@ -21,7 +21,7 @@ from robomme_interference_data.evaluate.policies.registry import make_policy
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.identity import make_selector, package_versions
 from robomme_interference_data.evaluate.run.kind import Job, Run
-from robomme_interference_data.evaluate.run.log import clip_name
+from robomme_interference_data.evaluate.run.log import clip_name, transcript_file
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.subgoals.registry import make_writer
 from robomme_interference_data.evaluate.subgoals.writer import CAMERA, ORACLE, SubgoalWriter
@@ -38,7 +38,6 @@ from robomme_interference_data.simulators.registry import (
 
 from .clips import Clip
 from .rollout import run_rollout
-from .transcripts import transcript_file
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
@@ -58,9 +57,6 @@ class RolloutTask:
 
     What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
     that broke is used again. Clips, subgoals and the log of a server that it started are sent.
-
-    Args:
-        run: The run.
     """
 
     def __init__(self, run: Run[RunConfig]):

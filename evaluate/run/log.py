@@ -52,6 +52,14 @@ def clip_name(item: WorkItem) -> str:
     return f"videos/{item_name(item)}.mp4"
 
 
+def transcript_file(
+    kind: str, item: WorkItem, lines: Iterable[Mapping[str, Any]]
+) -> tuple[str, bytes]:
+    """Return path and bytes of what models were asked and answered in a rollout."""
+    text = "".join(canonical_json(dict(line)) + "\n" for line in lines)
+    return f"{kind}/{item_name(item)}.jsonl", text.encode("utf-8", "backslashreplace")
+
+
 @dataclass(frozen=True)
 class Invocation:
     """One invocation of the command: its settings, its plan, and where it ran.
@@ -181,14 +189,7 @@ class RunLog:
 def open_log(
     folder: Path, identity: Mapping[str, Any], split: str, *, resume: bool = True
 ) -> Iterator[RunLog]:
-    """Open or make the folder of a run, and hold it.
-
-    Args:
-        folder: The folder.
-        identity: What makes the run the one that it is, as plain values.
-        split: Label of the split in rows; a run that is there keeps its own.
-        resume: Whether a run that is there may be gone on with.
-    """
+    """Open or make the folder of a run, and hold it; a run that is there keeps its label."""
     folder.mkdir(parents=True, exist_ok=True)
     there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     if there == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:

@@ -64,12 +64,7 @@ class Spec:
 
 
 class Registry:
-    """Kinds by name.
-
-    Args:
-        what: What they are, for messages, such as `policy`.
-        kinds: Name to kind.
-    """
+    """Kinds by name; `what` they are, such as `policy`, is for messages."""
 
     def __init__(self, what: str, kinds: Mapping[str, Kind]):
         self._what, self.kinds = what, kinds
@@ -136,14 +131,8 @@ def bind_options(
     """Return all options that a factory is called with, defaults included.
 
     Text stays text where the factory declares it. Elsewhere it is read as JSON (`3`, `0.5`,
-    `true`, `null`) if it is that. Anything wrong is an `InvalidOptionError`.
-
-    Args:
-        what: What is made, for messages, such as `policy 'replay:full'`.
-        factory: What makes it.
-        given: Arguments that are no options.
-        options: Options as they are typed, `NAME=VALUE`.
-        also: Options that something else takes from the same list, for messages.
+    `true`, `null`) if it is that. Anything wrong is an `InvalidOptionError`. For messages are
+    `what` is made, such as `policy 'replay:full'`, and which options something else takes `also`.
     """
     signature, declared = signature_of(factory), _declared_types(factory)
     values: dict[str, Any] = {}

@@ -56,10 +56,7 @@ class Worker:
 class ProcessWorker(Worker):
     """A worker in a process of its own, which ends together with all that it starts.
 
-    Args:
-        number: Its number.
-        home: Its folder, empty.
-        parent: A file descriptor that closes when the parent ends, or -1.
+    `home` is its folder, empty; `parent` a file descriptor that closes when the parent ends, or -1.
     """
 
     def __init__(self, number: int, home: Path, parent: int = -1):

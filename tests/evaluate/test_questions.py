@@ -48,7 +48,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.models import openai as endpoint
 from robomme_interference_data.evaluate.models.model import Reply
-from robomme_interference_data.evaluate.questions.responders import Guesser, Prompted
+from robomme_interference_data.evaluate.questions.responders import Prompted, guess
 from robomme_interference_data.evaluate.run import evaluation
 from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.runtime.executor import Serial
@@ -125,8 +125,7 @@ def test_guesses_are_right_by_chance() -> None:
             asked = Prompted(
                 question, split.query(episode), seed, None, lambda: np.empty(0, np.uint8)
             )
-            answer = Guesser().answer(asked)
-            hits += answer.letter == question.letters[question.right]
+            hits += guess(asked) == question.letters[question.right]
             expected += question.chance
             variance += question.chance * (1 - question.chance)
     assert abs(hits - expected) < 3.5 * variance**0.5
