@@ -34,10 +34,10 @@ def test_each_is_a_builtin_too_and_travels_between_processes(
 
 
 def test_an_error_about_something_keeps_the_rest() -> None:
-    error = InvalidOptionError.expected("workers", 0, "1 or more", "a hint", "a command")
+    error = InvalidOptionError.expected("workers", 0, "1 or more", "a hint")
     about = error.about("episode 7")
     assert about.message == "episode 7: workers 0; expected 1 or more"
-    assert (about.hint, about.command, about.option) == ("a hint", "a command", "workers")
+    assert (about.hint, about.option) == ("a hint", "workers")
 
 
 @pytest.mark.parametrize(

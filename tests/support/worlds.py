@@ -29,14 +29,22 @@ STEPS = 40
 
 
 @cache
+def split_at(path: str) -> Split:
+    return load_split(path, threads=1)
+
+
 def split_here() -> Split:
-    return load_split(os.environ[SPLIT], threads=1)
+    return split_at(str(Path(os.environ[SPLIT]).resolve()))
+
+
+def query_of(episode: str) -> tuple[Query, NDArray[np.float32], Observation]:
+    """A query of the split, the states of its lesson, and its first live observation."""
+    return query_at(str(Path(os.environ[SPLIT]).resolve()), episode)
 
 
 @cache
-def query_of(episode: str) -> tuple[Query, NDArray[np.float32], Observation]:
-    """A query of the split, the states of its lesson, and its first live observation."""
-    query = split_here().query(episode)
+def query_at(path: str, episode: str) -> tuple[Query, NDArray[np.float32], Observation]:
+    query = split_at(path).query(episode)
     dataset, index = query.dataset, query.record.episode_index
     states = dataset.read_vectors(index, STATE, 0, query.lesson_frames)
     views = {camera: query.frame(camera) for camera in dataset.cameras}

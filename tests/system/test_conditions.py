@@ -1,7 +1,7 @@
 """Conditions beyond the paper go the whole way: the lesson last, in parts, or nowhere."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -29,21 +29,14 @@ PARTS = (slice(0, 24), slice(48, 80), slice(24, 48))  # of k1: 48 frames of less
 
 
 @pytest.fixture
-def split(own_split: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def split(own_split: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A split with buffers of kinds of conditions beyond the paper's."""
     names = ("no-history", "k0", "k1", "before-k1", "before-k3", "held-k1", "same-k1", "parts-k1")
     names += ("absent-k1",)
     code, _, err = run("build", "manifests", own_split, "--conditions", ",".join(names))
     assert code == 0, err
     monkeypatch.setenv(worlds.SPLIT, str(own_split))
-    _forget_the_split()
-    yield own_split
-    _forget_the_split()
-
-
-def _forget_the_split() -> None:
-    worlds.split_here.cache_clear()
-    worlds.query_of.cache_clear()
+    return own_split
 
 
 def test_buffers_of_other_kinds(split: Path, run: Run, tmp_path: Path) -> None:
