@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
-from common import Times, add_split, demo_split, machine, positive, table
+from common import Times, add_buffer_set, demo_buffers, machine, positive, table
 from nothing import Nothing
 
 from evaluate import seconds_a_rollout
@@ -56,7 +56,7 @@ def items(count: int) -> list[WorkItem]:
 
 def drive(rollouts: int, workers: int) -> list[str]:
     """Write the rows of rollouts that do nothing; return a row of the table."""
-    config = RunConfig(policy="hold", split=Path(), out=Path())
+    config = RunConfig(policy="hold", buffer_set=Path(), out=Path())
     this, todo = psutil.Process(), items(rollouts)
     with (
         TemporaryDirectory() as folder,
@@ -105,13 +105,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rollouts", type=positive, default=100_000)
     parser.add_argument("--workers", type=positive, default=2)
-    add_split(parser)
+    add_buffer_set(parser)
     parser.add_argument("--replayed", type=positive, default=48, help="rollouts of replay")
     parser.add_argument("--reset", type=float, nargs=2, default=(5.0, 27.0), help="s, least, most")
     parser.add_argument("--steps-s", type=float, nargs=2, default=(9.0, 13.0), help="the same")
     parser.add_argument("--rounds", type=positive, default=3)
     given: Any = parser.parse_args()
-    given.split = given.split or demo_split()
+    given.buffer_set = given.buffer_set or demo_buffers()
     print(machine("ray"))
 
     columns = ["<rollouts", ">rows/s", ">ms of the driver", ">of a core at 17 rows/s", ">MB grown"]
@@ -122,7 +122,7 @@ def main() -> None:
     taken: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(given.rounds):
         for name, executor in list(ways.items())[:: 1 if number % 2 else -1]:
-            seconds = seconds_a_rollout(given.split, given.replayed, given.workers, executor)
+            seconds = seconds_a_rollout(given.buffer_set, given.replayed, given.workers, executor)
             taken[name].append(seconds)
     times = Times(taken)
     rows = [

@@ -1,4 +1,4 @@
-"""What the benchmarks share: interleaved timing, peak memory, the machine, a table, a split.
+"""What the benchmarks share: interleaved timing, peak memory, the machine, a table, a buffer set.
 
 Imported first, it also finds the tests' helpers (`support`).
 """
@@ -22,8 +22,8 @@ from pathlib import Path
 
 __all__ = [
     "Times",
-    "add_split",
-    "demo_split",
+    "add_buffer_set",
+    "demo_buffers",
     "in_fresh_process",
     "interleave",
     "machine",
@@ -37,19 +37,19 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 
-def add_split(parser: argparse.ArgumentParser) -> None:
-    """Let the command line name a split."""
-    text = "folder of a split; by default that of make demo, made if need be"
-    parser.add_argument("--split", type=Path, help=text)
+def add_buffer_set(parser: argparse.ArgumentParser) -> None:
+    """Let the command line name a buffer set."""
+    text = "folder of a buffer set; by default that of make demo, made if need be"
+    parser.add_argument("--buffer-set", type=Path, help=text)
 
 
-def demo_split() -> Path:
-    """Return the split of `make demo`, made now if it is not there."""
-    split = ROOT / "demo" / "split"
-    if not (split / "manifests" / "manifest.json").is_file():
+def demo_buffers() -> Path:
+    """Return the buffer set of `make demo`, made now if it is not there."""
+    buffer_set = ROOT / "demo" / "buffers"
+    if not (buffer_set / "manifests" / "manifest.json").is_file():
         demo = [sys.executable, str(ROOT / "scripts" / "demo.py")]
         subprocess.run(demo, check=True, stdout=sys.stderr)
-    return split
+    return buffer_set
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Measure what the harness adds to a simulator loop, and what a second worker brings.
 
-    python benchmarks/evaluate.py                    # on the demo's split: some minutes
-    python benchmarks/evaluate.py --split my-split --episodes MoveCube/test/0 --rounds 3
+    python benchmarks/evaluate.py                    # on the demo's buffer set: some minutes
+    python benchmarks/evaluate.py --buffer-set my-buffers --episodes MoveCube/test/0 --rounds 3
 
 The bare loop takes the same actions in the same simulator and draws the same pictures, and does
 nothing else: no history, no policy, no rows.
@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_split, demo_split, interleave, machine, positive, table
+from common import add_buffer_set, demo_buffers, interleave, machine, positive, table
 from numpy.typing import NDArray
 
-from robomme_interference_data import DecodedCache, Split, load_split
+from robomme_interference_data import BufferSet, DecodedCache, load_buffer_set
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.rollout.rollout import run_rollout
@@ -77,15 +77,15 @@ class Clock:
 def main() -> None:
     """Measure and print."""
     options = parse_options()
-    folder = options.split or demo_split()
-    split = load_split(folder, threads=1)
+    folder = options.buffer_set or demo_buffers()
+    buffer_set = load_buffer_set(folder, threads=1)
     print(machine("mani-skill", "av"), end="\n\n", flush=True)
     rows = []
     with tempfile.TemporaryDirectory() as kept, TabletopSimulator(cameras=CAMERAS) as simulator:
-        cached = load_split(folder, cache=DecodedCache(Path(kept)), threads=1)
+        cached = load_buffer_set(folder, cache=DecodedCache(Path(kept)), threads=1)
         for name in options.episodes:
             episode = EpisodeId.parse(name)
-            rows.append(overhead(episode, simulator, split, cached, options.rounds))
+            rows.append(overhead(episode, simulator, buffer_set, cached, options.rounds))
     print(
         table(
             "A rollout of the oracle's actions, front and wrist drawn at every step, one process; "
@@ -110,7 +110,7 @@ def main() -> None:
 def parse_options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    add_split(parser)
+    add_buffer_set(parser)
     parser.add_argument(
         "--episodes", nargs="+", default=["MoveCube/test/0", "PatternLock/test/0"], metavar="ID"
     )
@@ -120,13 +120,17 @@ def parse_options() -> argparse.Namespace:
 
 
 def overhead(
-    episode: EpisodeId, simulator: TabletopSimulator, split: Split, cached: Split, rounds: int
+    episode: EpisodeId,
+    simulator: TabletopSimulator,
+    buffer_set: BufferSet,
+    cached: BufferSet,
+    rounds: int,
 ) -> list[str]:
     """Time an episode's rollout bare and in the harness; return the cells of its line."""
     actions = oracle_actions(episode, simulator)
     policy = Recorded(actions)
-    config = RunConfig("python:recorded", Path(split.location), Path("nowhere"))
-    run = Run(config, "recorded", split.name, split.revision)
+    config = RunConfig("python:recorded", Path(buffer_set.location), Path("nowhere"))
+    run = Run(config, "recorded", buffer_set.name, buffer_set.revision)
 
     def bare() -> None:
         simulator.reset(str(episode), demonstration=False)
@@ -134,15 +138,15 @@ def overhead(
             _, status = simulator.step(action)
         assert status is Status.SUCCESS
 
-    def harness(condition: str, data: Split) -> None:
+    def harness(condition: str, data: BufferSet) -> None:
         item = WorkItem(condition, episode)
-        row = run_rollout(run, item, simulator=simulator, policy=policy, split=data)
+        row = run_rollout(run, item, simulator=simulator, policy=policy, buffer_set=data)
         assert row.success and row.steps == len(actions)
 
     ways = {
         BARE: bare,
-        WITHOUT: lambda: harness(WITHOUT, split),
-        K0: lambda: harness(K0, split),
+        WITHOUT: lambda: harness(WITHOUT, buffer_set),
+        K0: lambda: harness(K0, buffer_set),
         CACHED: lambda: harness(K0, cached),
     }
     times = interleave(ways, rounds)
@@ -153,7 +157,7 @@ def overhead(
         f"{times.ratio(WITHOUT, BARE):.3f}",
         f"{times.ratio(K0, BARE):.3f}",
         f"{times.ratio(CACHED, BARE):.3f}",
-        str(len(split.load(episode, K0))),
+        str(len(buffer_set.load(episode, K0))),
     ]
 
 
@@ -168,17 +172,17 @@ def oracle_actions(episode: EpisodeId, simulator: TabletopSimulator) -> NDArray[
 
 
 def seconds_a_rollout(
-    split: Path, rollouts: int, workers: int, executor: Executor | None = None
+    buffer_set: Path, rollouts: int, workers: int, executor: Executor | None = None
 ) -> float:
     """Return what a rollout of `replay` takes, from the row by which all workers have started."""
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     conditions = tuple(name for name in opened.conditions if name != NO_HISTORY)
     families = opened.families[: max(1, rollouts // len(conditions))]
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder:
         config = RunConfig(
             "replay",
-            split,
+            buffer_set,
             Path(folder),
             conditions=conditions,
             families=families,
@@ -190,9 +194,9 @@ def seconds_a_rollout(
     return (counted[-1] - counted[0]) / (len(counted) - 1)
 
 
-def workers(split: Path, rollouts: int) -> list[list[str]]:
+def workers(buffer_set: Path, rollouts: int) -> list[list[str]]:
     """Time a run with one worker and with two; return the lines."""
-    one, two = (seconds_a_rollout(split, rollouts, count) for count in (1, 2))
+    one, two = (seconds_a_rollout(buffer_set, rollouts, count) for count in (1, 2))
     return [["1", f"{one:.2f}", "1.00"], ["2", f"{two:.2f}", f"{one / two:.2f}"]]
 
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import av
 import av.logging
-from common import add_split, demo_split, interleave, machine, megabytes, positive, table
+from common import add_buffer_set, demo_buffers, interleave, machine, megabytes, positive, table
 from load import Span, choose_buffer, open_lerobot, spans_of
 
-from robomme_interference_data import Buffer, Split, load_split
+from robomme_interference_data import Buffer, BufferSet, load_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.constants import (
     ACTION,
@@ -33,31 +33,33 @@ from robomme_interference_data.errors import InterferenceError
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    add_split(parser)
+    add_buffer_set(parser)
     parser.add_argument("--items", type=positive, default=100, help="items read in a round")
     parser.add_argument("--rounds", type=positive, default=5, help="timed repetitions")
     options = parser.parse_args()
     try:
         require_lerobot()
-        folder = options.split or demo_split()
-        split = load_split(folder)
+        folder = options.buffer_set or demo_buffers()
+        buffer_set = load_buffer_set(folder)
         print(machine("av", "lerobot"), end="\n\n", flush=True)
-        print(measure_bytes(split, choose_buffer(split, None, None)), end="\n\n", flush=True)
+        print(
+            measure_bytes(buffer_set, choose_buffer(buffer_set, None, None)), end="\n\n", flush=True
+        )
         print(time_lerobot(folder, options))
     except InterferenceError as error:
         sys.exit(str(error))
 
 
-def measure_bytes(split: Split, buffer: Buffer) -> str:
+def measure_bytes(buffer_set: BufferSet, buffer: Buffer) -> str:
     """Compare the files that a buffer needs with what lies in its spans; return the table."""
     videos = [
         span
         for camera in buffer.cameras
-        for span in spans_of(buffer, split, CAMERA_PREFIX + camera)
+        for span in spans_of(buffer, buffer_set, CAMERA_PREFIX + camera)
     ]
     inside, data = sum(map(packet_bytes, videos)), set()
     for session in buffer.sessions:
-        entry, dataset = session.entry, split.datasets[session.entry.dataset]
+        entry, dataset = session.entry, buffer_set.datasets[session.entry.dataset]
         data.add(dataset.lerobot.rows(entry.episode_index).path)
         for feature in {STATE, ACTION} & dataset.features.keys():
             inside += dataset.read_vectors(

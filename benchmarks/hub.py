@@ -1,8 +1,8 @@
-"""What it costs to load a buffer from the Hub, to fetch a whole split, and to publish one.
+"""What it costs to load a buffer from the Hub, to fetch a whole buffer set, and to publish one.
 
 The Hub is a server on the loopback interface (tests/support/hub_server.py), every answer of which
 takes longer by a latency; its client is the real one, in fresh processes, whose imports are left
-out, with empty caches. The split of which a buffer is loaded has real videos; the whole one that is
+out, with empty caches. The buffer set of which a buffer is loaded has real videos; the whole one that is
 fetched and published is made up: the number of its files counts, not their size.
 """
 
@@ -12,16 +12,20 @@ import sys
 from pathlib import Path
 from statistics import median
 
-from common import add_split, demo_split, machine, megabytes, positive, table
+from common import add_buffer_set, demo_buffers, machine, megabytes, positive, table
 from files import packet_bytes
 from load import choose_buffer, spans_of
 from loopback_hub import Hub, Run, running
-from made_split import write_split
+from made_buffer_set import write_buffer_set
 
-from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data import Buffer, load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.cards.publication import PublishConfig
-from robomme_interference_data.cards.publish import SplitContent, plan_split, publish_split
+from robomme_interference_data.cards.publish import (
+    BufferSetContent,
+    plan_buffer_set,
+    publish_buffer_set,
+)
 from robomme_interference_data.cards.publisher import Publisher
 from robomme_interference_data.constants import ACTION, RECORDS_PATH, STATE
 from robomme_interference_data.data.fetch import FetchConfig, fetch, plan_fetch
@@ -36,19 +40,19 @@ SPAN_FILES = re.compile(r"/(data|videos)/")
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    add_split(parser)
-    parser.add_argument("--queries", type=positive, default=450, help="of the made-up split")
-    parser.add_argument("--units", type=positive, default=450, help="of the made-up split")
+    add_buffer_set(parser)
+    parser.add_argument("--queries", type=positive, default=450, help="of the made-up buffer set")
+    parser.add_argument("--units", type=positive, default=450, help="of the made-up buffer set")
     parser.add_argument("--latency", type=positive, default=50, help="of every answer, ms")
     parser.add_argument("--rounds", type=positive, default=1, help="repetitions")
     options = parser.parse_args()
     try:
         require_lerobot()
-        real = options.split or demo_split()
+        real = options.buffer_set or demo_buffers()
         with running(options.latency / 1000) as (hub, folder):
             print(machine("huggingface-hub"), end="\n\n", flush=True)
-            made = folder / "split"
-            write_split(made, options.queries, options.units, CONDITIONS)
+            made = folder / "buffer_set"
+            write_buffer_set(made, options.queries, options.units, CONDITIONS)
             published = time_publishing(hub, made, options)
             hub.run(publish, real, REAL)
             print(time_loading(hub, real, made, options), end="\n\n", flush=True)
@@ -63,11 +67,11 @@ def main() -> None:
 
 
 def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) -> str:
-    """Load one buffer of each split into an empty cache, and again; return the table."""
+    """Load one buffer of each buffer set into an empty cache, and again; return the table."""
     rows = []
     for name, repo, root in (("real videos", REAL, real), ("made up", WHOLE, made)):
-        split = load_split(root)
-        buffer = choose_buffer(split, None, None)
+        buffer_set = load_buffer_set(root)
+        buffer = choose_buffer(buffer_set, None, None)
         wanted = (repo, str(buffer.episode_id), buffer.condition)
         runs = []
         for _ in range(options.rounds):
@@ -80,7 +84,7 @@ def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) 
         ratio = f"{bytes_of_files / span_bytes(buffer, root):.2f}" if repo == REAL else ""
         rows.append(
             [
-                f"{name}, {len(split):,} buffers",
+                f"{name}, {len(buffer_set):,} buffers",
                 f"{len(last) - len(files)}",
                 f"{(runs[-1].received - bytes_of_files) / 1e3:,.0f}",
                 f"{len(files)}",
@@ -104,16 +108,16 @@ def time_loading(hub: Hub, real: Path, made: Path, options: argparse.Namespace) 
 
 def first_frame(repo: str, episode: str, condition: str) -> None:
     """Load a buffer and decode its first frame."""
-    buffer = load_buffer(episode, condition, split=repo, revision=VERSION, cameras=["front"])
+    buffer = load_buffer(episode, condition, buffer_set=repo, revision=VERSION, cameras=["front"])
     next(iter(buffer.stream(1, cameras=("front",))))
 
 
 def span_bytes(buffer: Buffer, root: Path) -> int:
     """Return the bytes of the front video packets and the numbers of a buffer's spans."""
-    split = load_split(root)
-    inside = sum(packet_bytes(span) for span in spans_of(buffer, split))
+    buffer_set = load_buffer_set(root)
+    inside = sum(packet_bytes(span) for span in spans_of(buffer, buffer_set))
     for session in buffer.sessions:
-        entry, dataset = session.entry, split.datasets[session.entry.dataset]
+        entry, dataset = session.entry, buffer_set.datasets[session.entry.dataset]
         for feature in {STATE, ACTION} & dataset.features.keys():
             numbers = dataset.read_vectors(entry.episode_index, feature, entry.start, entry.stop)
             inside += numbers.nbytes
@@ -121,7 +125,7 @@ def span_bytes(buffer: Buffer, root: Path) -> int:
 
 
 def metadata_table(made: Path, options: argparse.Namespace) -> str:
-    """Tell what the metadata of the made-up split consists of; return the table."""
+    """Tell what the metadata of the made-up buffer set consists of; return the table."""
     rows = []
     for path in sorted(made.glob("manifests/*")):
         rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
@@ -129,17 +133,17 @@ def metadata_table(made: Path, options: argparse.Namespace) -> str:
         for path in (folder / RECORDS_PATH, *sorted(folder.glob("meta/in*.json"))):
             rows.append([path.relative_to(made).as_posix(), _kilobytes(path.stat().st_size)])
     title = (
-        f"Metadata that a buffer needs of the made-up split, {options.queries:,} demonstrations "
+        f"Metadata that a buffer needs of the made-up buffer set, {options.queries:,} demonstrations "
         f"and {options.units:,} units."
     )
     return table(title, ("<file", ">kB"), rows)
 
 
-# --- a whole split -------------------------------------------------------------------------------
+# --- a whole buffer set -------------------------------------------------------------------------------
 
 
 def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
-    """Fetch the made-up split by both ways in turn; return the table."""
+    """Fetch the made-up buffer set by both ways in turn; return the table."""
     ways = {"robomme-interference fetch": fetch_whole, "snapshot_download": snapshot}
     runs: dict[str, list[Run]] = {name: [] for name in ways}
     for number in range(options.rounds):
@@ -161,7 +165,7 @@ def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
         for name, run in runs.items()
     ]
     title = (
-        f"The made-up split of {options.queries:,} queries × {len(CONDITIONS)} conditions, fetched "
+        f"The made-up buffer set of {options.queries:,} queries × {len(CONDITIONS)} conditions, fetched "
         f"whole into an empty cache; {_rounds(options)}."
     )
     columns = ("<way", ">files of episodes", ">requests", ">MB", ">s", ">ratio", ">aim")
@@ -169,12 +173,12 @@ def time_fetching(hub: Hub, options: argparse.Namespace) -> str:
 
 
 def fetch_whole(repo: str) -> None:
-    """Fetch a split as the command does."""
-    fetch(plan_fetch(load_split(repo, revision=VERSION), FetchConfig()))
+    """Fetch a buffer set as the command does."""
+    fetch(plan_fetch(load_buffer_set(repo, revision=VERSION), FetchConfig()))
 
 
 def snapshot(repo: str) -> None:
-    """Download the repositories of a split with the Hub's client alone."""
+    """Download the repositories of a buffer set with the Hub's client alone."""
     from huggingface_hub import snapshot_download
 
     for name in (f"{repo}-demonstrations", repo):
@@ -185,7 +189,7 @@ def snapshot(repo: str) -> None:
 
 
 def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
-    """Publish the made-up split twice, and upload its files plainly; return the table."""
+    """Publish the made-up buffer set twice, and upload its files plainly; return the table."""
     hub.fresh_cache()
     first, again = (hub.run(publish, made, WHOLE) for _ in range(2))
     plain = hub.run(upload_plainly, made, PLAIN)
@@ -208,7 +212,7 @@ def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
     ]
     files = 3 * (options.queries + options.units)
     title = (
-        f"The made-up split published, {files:,} files of episodes, without the checks before; "
+        f"The made-up buffer set published, {files:,} files of episodes, without the checks before; "
         "each once."
     )
     columns = ("<way", ">large files", ">commits", ">requests", ">bytes sent", ">s", ">ratio")
@@ -216,14 +220,14 @@ def time_publishing(hub: Hub, made: Path, options: argparse.Namespace) -> str:
 
 
 def publish(root: Path, repo: str) -> None:
-    """Publish a split as the command does, without its checks."""
+    """Publish a buffer set as the command does, without its checks."""
     config = PublishConfig(repo)
-    content, publisher = SplitContent(load_split(root), config), Publisher(config)
-    publish_split(content, publisher, plan_split(content, publisher))
+    content, publisher = BufferSetContent(load_buffer_set(root), config), Publisher(config)
+    publish_buffer_set(content, publisher, plan_buffer_set(content, publisher))
 
 
 def upload_plainly(root: Path, repo: str) -> None:
-    """Upload the datasets and manifests of a split with the Hub's client alone."""
+    """Upload the datasets and manifests of a buffer set with the Hub's client alone."""
     from huggingface_hub import HfApi
 
     api, kind = HfApi(), {"repo_type": "dataset"}

@@ -20,8 +20,8 @@ from typing import Any
 import av
 import numpy as np
 from common import (
-    add_split,
-    demo_split,
+    add_buffer_set,
+    demo_buffers,
     in_fresh_process,
     interleave,
     machine,
@@ -32,7 +32,7 @@ from common import (
 )
 from numpy.typing import NDArray
 
-from robomme_interference_data import Buffer, DecodedCache, Split, load_split
+from robomme_interference_data import Buffer, BufferSet, DecodedCache, load_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
 from robomme_interference_data.constants import FRONT
 from robomme_interference_data.errors import InterferenceError
@@ -57,11 +57,13 @@ def main() -> None:
     options = parse_options()
     try:
         require_lerobot()
-        split = options.split or demo_split()
-        buffer = choose_buffer(load_split(split, threads=1), options.episode, options.condition)
+        buffer_set = options.buffer_set or demo_buffers()
+        buffer = choose_buffer(
+            load_buffer_set(buffer_set, threads=1), options.episode, options.condition
+        )
         print(machine("av", "lerobot"), end="\n\n", flush=True)
-        print(time_loading(split, buffer, options), end="\n\n", flush=True)
-        print(measure_streaming(split, buffer, options.chunk))
+        print(time_loading(buffer_set, buffer, options), end="\n\n", flush=True)
+        print(measure_streaming(buffer_set, buffer, options.chunk))
     except InterferenceError as error:
         sys.exit(str(error))
 
@@ -69,7 +71,7 @@ def main() -> None:
 def parse_options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    add_split(parser)
+    add_buffer_set(parser)
     parser.add_argument(
         "--episode", help="query episode; by default the one with the median lesson length"
     )
@@ -88,20 +90,20 @@ def parse_options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def choose_buffer(split: Split, episode: str | None, condition: str | None) -> Buffer:
+def choose_buffer(buffer_set: BufferSet, episode: str | None, condition: str | None) -> Buffer:
     """Return the buffer to measure."""
-    name = condition or max(split.conditions, key=lambda name: parse_condition(name).k)
+    name = condition or max(buffer_set.conditions, key=lambda name: parse_condition(name).k)
     if episode is None:
-        lengths = {m.history_frames: m.episode_id for m in split.manifests(condition=name)}
+        lengths = {m.history_frames: m.episode_id for m in buffer_set.manifests(condition=name)}
         episode = str(lengths[statistics.median_low(lengths)])
-    return split.load(episode, name)
+    return buffer_set.load(episode, name)
 
 
 def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> str:
     """Time all ways of loading the front frames; return the table."""
-    split = load_split(folder, threads=1)
+    buffer_set = load_buffer_set(folder, threads=1)
     key, threads = (buffer.episode_id, buffer.condition), options.threads
-    spans = spans_of(buffer, split)
+    spans = spans_of(buffer, buffer_set)
     wanted = buffer.frames("front")
 
     def bare() -> None:
@@ -114,15 +116,15 @@ def time_loading(folder: Path, buffer: Buffer, options: argparse.Namespace) -> s
             kept[position] = image
         return kept
 
-    read_item, items = lerobot_reader(split, buffer)
+    read_item, items = lerobot_reader(buffer_set, buffer)
     # An odd distance: a frame is as likely to be right after a key frame as just before one.
     distance = max(1, len(items) // options.lerobot_frames) | 1
     chosen = range(0, len(items), distance)
     scale = len(items) / len(chosen)
     with tempfile.TemporaryDirectory(prefix="interference-cache-") as cache_folder:
         cache = DecodedCache(Path(cache_folder))
-        parallel = load_split(folder, threads=threads).load(*key)
-        cached = load_split(folder, cache=cache, threads=1).load(*key)
+        parallel = load_buffer_set(folder, threads=threads).load(*key)
+        cached = load_buffer_set(folder, cache=cache, threads=1).load(*key)
         found = [bare_kept(), parallel.frames("front"), cached.frames("front")]
         found += [np.stack([read_item(position) for position in chosen])]
         check_equal(found, [wanted] * 3 + [wanted[chosen]])
@@ -173,11 +175,11 @@ def check_equal(found: list[NDArray[np.uint8]], wanted: list[NDArray[np.uint8]])
         sys.exit("The ways of loading give different pixels: their times mean nothing.")
 
 
-def spans_of(buffer: Buffer, split: Split, camera: str = FRONT) -> list[Span]:
+def spans_of(buffer: Buffer, buffer_set: BufferSet, camera: str = FRONT) -> list[Span]:
     """Return where the frames of a camera lie."""
     spans = []
     for session in buffer.sessions:
-        entry, lerobot = session.entry, split.datasets[session.entry.dataset].lerobot
+        entry, lerobot = session.entry, buffer_set.datasets[session.entry.dataset].lerobot
         path, first = lerobot.place(entry.episode_index).videos[camera]
         start, stop = first + entry.start, first + entry.stop
         spans.append(Span(lerobot.files.path(path), start, stop, lerobot.fps))
@@ -209,13 +211,15 @@ def open_lerobot(name: str, root: Path) -> Any:
 
 
 def lerobot_reader(
-    split: Split, buffer: Buffer
+    buffer_set: BufferSet, buffer: Buffer
 ) -> tuple[Callable[[int], NDArray[np.uint8]], list[tuple[str, int]]]:
     """Return a function that reads a frame of the buffer through LeRobotDataset, and all frames.
 
     LeRobotDataset decodes every camera of an item; here it is left with the front camera only.
     """
-    opened = {name: open_lerobot(name, Path(split.location) / name) for name in split.datasets}
+    opened = {
+        name: open_lerobot(name, Path(buffer_set.location) / name) for name in buffer_set.datasets
+    }
     for dataset in opened.values():
         for camera in [key for key in dataset.meta.video_keys if key != FRONT]:
             del dataset.meta.info.features[camera]
@@ -235,8 +239,12 @@ def lerobot_reader(
 
 def measure_streaming(folder: Path, buffer: Buffer, chunk: int) -> str:
     """Measure the peak memory of streaming buffers of all lengths; return the table."""
-    split = load_split(folder)
-    names = [name for name in split.conditions if split.manifest(buffer.episode_id, name).sessions]
+    buffer_set = load_buffer_set(folder)
+    names = [
+        name
+        for name in buffer_set.conditions
+        if buffer_set.manifest(buffer.episode_id, name).sessions
+    ]
     cases = [(name, 1) for name in names] + [(names[-1], TIMES_LONGER)]
     peaks, rows = [], []
     for name, times in cases:
@@ -257,14 +265,14 @@ def stream_peak(
     folder: str, episode: str, condition: str, times: int, chunk: int
 ) -> tuple[int, int, int]:
     """Stream a buffer, its sessions so many times over; return frames, their bytes, the peak."""
-    split = load_split(folder)
-    manifest = split.manifest(episode, condition)
+    buffer_set = load_buffer_set(folder)
+    manifest = buffer_set.manifest(episode, condition)
     longer = dataclasses.replace(
         manifest,
         sessions=manifest.sessions * times,
         history_frames=manifest.history_frames * times,
     )
-    buffer = Buffer(longer, split.query(episode), split.datasets)
+    buffer = Buffer(longer, buffer_set.query(episode), buffer_set.datasets)
     before = peak_memory()
     decoded = sum(part.frames["front"].nbytes for part in buffer.stream(chunk, ("front",)))
     return len(buffer), decoded, peak_memory() - before

@@ -15,12 +15,21 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-from common import Times, add_split, demo_split, interleave, machine, megabytes, positive, table
+from common import (
+    Times,
+    add_buffer_set,
+    demo_buffers,
+    interleave,
+    machine,
+    megabytes,
+    positive,
+    table,
+)
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import UNIT_FRAMES
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
@@ -46,8 +55,8 @@ def main() -> None:
     # One frame more: the first live observation.
     images = draw.integers(0, 256, (frames + 1, 256, 256, 3), dtype=np.uint8)
     states = draw.normal(size=(frames + 1, 8)).astype(np.float32)
-    split = load_split(options.split or demo_split(), threads=1)
-    buffer = split.load(options.episode, split.conditions[-1])
+    buffer_set = load_buffer_set(options.buffer_set or demo_buffers(), threads=1)
+    buffer = buffer_set.load(options.episode, buffer_set.conditions[-1])
     with servers() as ports:
         times, size = measure(ports, images, states, options.rounds)
         decoding = measure_decoding(ports[1], buffer, options.rounds)
@@ -92,7 +101,7 @@ def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lesson", type=positive, default=246, help="frames of the lesson")
     parser.add_argument("--rounds", type=positive, default=7)
-    add_split(parser)
+    add_buffer_set(parser)
     parser.add_argument("--episode", default="MoveCube/test/0", metavar="ID")
     return parser.parse_args()
 

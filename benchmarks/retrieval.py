@@ -3,7 +3,7 @@
     python benchmarks/retrieval.py                  # SigLIP base with random weights; minutes
     python benchmarks/retrieval.py --model so400m   # the paper's architecture: wants a GPU
 
-Frames are those of a split's distractor units. Weights are random, which costs the same time as
+Frames are those of a buffer set's distractor units. Weights are random, which costs the same time as
 trained ones. Histories that are graded are made-up embeddings: no video is needed.
 """
 
@@ -21,10 +21,10 @@ from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
-from common import Times, add_split, demo_split, interleave, machine, positive, table
+from common import Times, add_buffer_set, demo_buffers, interleave, machine, positive, table
 from manifests import write_dataset
 
-from robomme_interference_data import Dataset, load_split
+from robomme_interference_data import Dataset, load_buffer_set
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
@@ -86,7 +86,7 @@ class MadeUp:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    add_split(parser)
+    add_buffer_set(parser)
     parser.add_argument("--model", choices=TOWERS, default="base", help="SigLIP architecture")
     parser.add_argument("--device", help="where it computes; by default a GPU if there is one")
     parser.add_argument("--rounds", type=positive, default=3, help="timed repetitions")
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--size", type=positive, default=1152, help="values in an embedding")
     options = parser.parse_args()
     try:
-        split = options.split or demo_split()
+        buffer_set = options.buffer_set or demo_buffers()
         with tempfile.TemporaryDirectory(prefix="interference-retrieval-") as name:
             folder = Path(name)
             encoders = [
@@ -103,9 +103,9 @@ def main() -> None:
                 make_encoder(f"siglip:{save_model(options.model, folder)}", device=options.device),
             ]
             print(machine("torch", "transformers", "numpy"), end="\n\n", flush=True)
-            print(index_table(split, encoders, folder, options), end="\n\n", flush=True)
-            made = made_up_split(folder / "made-up", options)
-            print(lookup_table(made, split, encoders, options))
+            print(index_table(buffer_set, encoders, folder, options), end="\n\n", flush=True)
+            made = made_up_buffer_set(folder / "made-up", options)
+            print(lookup_table(made, buffer_set, encoders, options))
     except InterferenceError as error:
         sys.exit(str(error))
 
@@ -126,11 +126,11 @@ def save_model(name: str, folder: Path) -> Path:
 
 
 def index_table(
-    split: Path, encoders: list[Encoder], folder: Path, options: argparse.Namespace
+    buffer_set: Path, encoders: list[Encoder], folder: Path, options: argparse.Namespace
 ) -> str:
     """Time the index of some units against decoding, and against the forward pass."""
     root = folder / DISTRACTORS
-    shutil.copytree(split / DISTRACTORS, root, ignore=shutil.ignore_patterns("index"))
+    shutil.copytree(buffer_set / DISTRACTORS, root, ignore=shutil.ignore_patterns("index"))
     path = root / RECORDS_PATH
     few = pq.read_table(path).slice(0, options.units)
     pq.write_table(few, path)
@@ -177,8 +177,8 @@ def label_of(encoder: Encoder, options: argparse.Namespace) -> str:
     return "thumbnail" if encoder.name == "thumbnail" else f"siglip {options.model}"
 
 
-def made_up_split(root: Path, options: argparse.Namespace) -> Path:
-    """Write a split of tables and embeddings alone: queries and 900 units."""
+def made_up_buffer_set(root: Path, options: argparse.Namespace) -> Path:
+    """Write a buffer set of tables and embeddings alone: queries and 900 units."""
     write_dataset(root / DEMONSTRATIONS, DEMONSTRATIONS, options.queries)
     write_dataset(root / DISTRACTORS, DISTRACTORS, 900)
     for _ in write_manifests(
@@ -192,13 +192,13 @@ def made_up_split(root: Path, options: argparse.Namespace) -> Path:
 
 
 def lookup_table(
-    made: Path, split: Path, encoders: list[Encoder], options: argparse.Namespace
+    made: Path, buffer_set: Path, encoders: list[Encoder], options: argparse.Namespace
 ) -> str:
     """Time one retrieval against one live frame's embedding, and grading against reading."""
-    buffers = list(load_split(made).buffers())
+    buffers = list(load_buffer_set(made).buffers())
     longest = sorted((one for one in buffers if one.condition == CONDITIONS[-1]), key=len)
     middle = longest[len(longest) // 2]
-    live = next(load_split(split).buffers()).query.frame()
+    live = next(load_buffer_set(buffer_set).buffers()).query.frame()
     rows = []
     for encoder in encoders:
         ways: dict[str, Callable[[], object]] = {

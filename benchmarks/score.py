@@ -116,11 +116,11 @@ def write_rows(path: Path) -> Path:
     texts = {
         "system": ([*(f"memory-{n}" for n in range(SYSTEMS)), "pi05_baseline"], system),
         "simulator": (["tabletop"], same),
-        "split": (["made-up"], same),
+        "buffer_set": (["made-up"], same),
         "revision": (["ab" * 32], same),
         "family": (list(FAMILIES), family),
         "condition": (list(CONDITIONS), condition),
-        "episode_split": (["test"], same),
+        "split": (["test"], same),
         "shift": (["none"], same),
         "difficulty": (["easy", "medium", "hard"], episode % 3),
         "goal": (["do it"], same),
@@ -222,18 +222,18 @@ def with_pandas(rows: Path, out: Path, draws: int, *, scipy: bool) -> None:
     frame = pd.read_parquet(
         rows,
         columns=[
-            *("system", "simulator", "revision", "family", "condition", "episode_split"),
+            *("system", "simulator", "revision", "family", "condition", "split"),
             *("episode", "model_seed", "seed", "difficulty", "status", "success", "steps"),
         ],
     )
-    key = ["simulator", "system", "condition", "family", "episode_split", "episode", "model_seed"]
+    key = ["simulator", "system", "condition", "family", "split", "episode", "model_seed"]
     assert not frame.duplicated(key).any()
     assert frame["family"].isin(FAMILIES).all() and frame["condition"].isin(CONDITIONS).all()
     assert frame["status"].isin(["success", "fail", "timeout", "error"]).all()
     assert (frame["success"] == (frame["status"] == "success")).all()
     assert frame.groupby("simulator")["revision"].nunique().max() == 1
     assert frame["steps"].between(0, 1300).all()
-    scenes = frame.groupby(["simulator", "family", "episode_split", "episode"])
+    scenes = frame.groupby(["simulator", "family", "split", "episode"])
     assert scenes[["seed", "difficulty"]].nunique().max().max() == 1
 
     episode = ["system", "condition", "family", "difficulty", "episode"]

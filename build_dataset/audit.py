@@ -1,4 +1,4 @@
-"""Audit the distractors of a split: how units are used, and whether anything leaks."""
+"""Audit the distractors of a buffer set: how units are used, and whether anything leaks."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     MANIFEST_PATH,
 )
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import KINDS, Kind, parse_condition
@@ -95,17 +95,17 @@ def _usage(counts: Any) -> tuple[Any, ...]:
     return len(found), min(found), mean(found), max(found), found.count(0)
 
 
-def audit_split(split: Split) -> Audit:
+def audit_buffer_set(buffer_set: BufferSet) -> Audit:
     """Count the use of units and look for leaks."""
-    units = list(split.datasets[DISTRACTORS].records())
-    queries = list(split.datasets[DEMONSTRATIONS].records())
+    units = list(buffer_set.datasets[DISTRACTORS].records())
+    queries = list(buffer_set.datasets[DEMONSTRATIONS].records())
     pool = sorted(unit.episode_id for unit in units)
-    audit = Audit({name: dict.fromkeys(pool, 0) for name in split.conditions})
+    audit = Audit({name: dict.fromkeys(pool, 0) for name in buffer_set.conditions})
     audit.leaks += _pool_leaks(units, queries)
-    for manifest in split.manifests():
+    for manifest in buffer_set.manifests():
         uses = audit.uses.get(manifest.condition)
         if uses is None:
-            path = split.files.path(MANIFEST_PATH)
+            path = buffer_set.files.path(MANIFEST_PATH)
             raise FormatError.damaged(path, f"{manifest.condition} is not among its conditions")
         places = audit.places.setdefault(manifest.condition, {})
         drawn: Counter[EpisodeId] = Counter()

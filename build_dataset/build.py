@@ -70,7 +70,7 @@ class BuildResult:
 def build_dataset(
     plan: BuildPlan, out: Path, executor: Executor, progress: WorkProgress
 ) -> BuildResult:
-    """Build one of a split's datasets as a LeRobot v3 dataset, or let one grow.
+    """Build one of a buffer set's datasets as a LeRobot v3 dataset, or let one grow.
 
     Args:
         plan: What to build.

@@ -1,4 +1,4 @@
-"""Commands that make splits and check them: `build …`, `verify`, `audit`."""
+"""Commands that make buffer sets and check them: `build …`, `verify`, `audit`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robomme_interference_data.cli.console import Group, echo, print_json, say, stoppable
-from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
+from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DEMONSTRATIONS,
@@ -38,22 +38,20 @@ app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Build a split's datasets, demonstrations and distractor units first, and manifests.",
+    help="Build a buffer set's datasets, demonstrations and distractor units first, and manifests.",
     epilog="""Flow: record or download episodes, build the datasets and the manifests, verify.
 
 ```
-robomme-interference build all --source robomme-h5:recordings/ --out my-split
-robomme-interference verify my-split
-robomme-interference show MoveCube/train/0 k3 --split my-split --out strip.png
+robomme-interference build all my-buffers --source robomme-h5:recordings/
+robomme-interference verify my-buffers
+robomme-interference show my-buffers MoveCube/train/0 k3 --out strip.png
 ```
 
-`build all` is these three, with S=my-split:
+`build all` is these three, with S=my-buffers:
 
 ```
-robomme-interference build demonstrations --source robomme-h5:recordings/ \\
-    --out $S/demonstrations
-robomme-interference build distractors --source robomme-h5:recordings/ \\
-    --out $S/distractors
+robomme-interference build demonstrations $S --source robomme-h5:recordings/
+robomme-interference build distractors $S --source robomme-h5:recordings/
 robomme-interference build manifests $S --conditions no-history,k0,k1,k3,k7
 ```
 """,
@@ -72,10 +70,9 @@ _DATASETS = {
 
     Examples:
     ```
-    robomme-interference build demonstrations --source robomme-h5:recordings/ --split test \
-        --out S/demonstrations
-    robomme-interference build demonstrations --source tabletop --split test --episodes 0-4 \
-        --cameras front --out S/demonstrations
+    robomme-interference build demonstrations S --source robomme-h5:recordings/ --split test
+    robomme-interference build demonstrations S --source tabletop --split test --episodes 0-4 \
+        --cameras front
     ```
     """,
     DISTRACTORS: r"""Build distractor units: 32 frames of each episode, raw indices 0, 8, …, 248.
@@ -84,9 +81,9 @@ _DATASETS = {
 
     Examples:
     ```
-    robomme-interference build distractors --source lerobot:NAMESPACE/NAME --out S/distractors
-    robomme-interference build distractors --source robomme-h5:recordings/ --source frames:mine/ \
-        --cameras front --out S/distractors
+    robomme-interference build distractors S --source lerobot:NAMESPACE/NAME
+    robomme-interference build distractors S --source robomme-h5:recordings/ --source frames:mine/ \
+        --cameras front
     ```
     """,
     RAW_DISTRACTORS: """Build distractor units at full rate, for raw-k<n>: 256 raw frames each.
@@ -95,7 +92,7 @@ _DATASETS = {
 
     Example:
     ```
-    robomme-interference build distractors-raw --source tabletop --out S/distractors-raw
+    robomme-interference build distractors-raw S --source tabletop
     ```
     """,
     CONTRADICTIONS: r"""Build contradicting lessons: the same scene, another answer.
@@ -105,19 +102,17 @@ _DATASETS = {
 
     Example:
     ```
-    robomme-interference build contradictions --source tabletop --split test --episodes 0-4 \
-        --out S/contradictions
+    robomme-interference build contradictions S --source tabletop --split test --episodes 0-4
     ```
     """,
     SHIFTED: r"""Build what query episodes look like under each shift, for retrieval-score.
 
     Nine frames of each episode: the first live view under light, camera and clutter, each at
-    strengths 1, 2 and 3. Take the query episodes; build manifests and index the split afterwards.
+    strengths 1, 2 and 3. Take the query episodes; build manifests and index the buffer set afterwards.
 
     Example:
     ```
-    robomme-interference build shifted --source tabletop --split test --episodes 0-4 \
-        --out S/shifted
+    robomme-interference build shifted S --source tabletop --split test --episodes 0-4
     ```
     """,
 }
@@ -128,7 +123,7 @@ def _add_command(kind: str, text: str) -> None:
     @with_settings
     def build(config: BuildConfig, as_json: AsJson = False) -> None:
         with stoppable(_KEPT):
-            _build(plan_build(kind, config), config.out, config, as_json=as_json)
+            _build(plan_build(kind, config), config.buffer_set / kind, config, as_json=as_json)
 
     app.command(name=kind, help=text)(build)
 
@@ -140,7 +135,7 @@ for _kind, _text in _DATASETS.items():
 @app.command()
 @with_settings
 def manifests(
-    split: Annotated[Path, typer.Argument(help="Folder with the datasets.")],
+    buffer_set: Annotated[Path, typer.Argument(help="Folder with the datasets.")],
     config: PlanConfig,
     as_json: AsJson = False,
 ) -> None:
@@ -148,45 +143,46 @@ def manifests(
 
     Example:
     ```
-    robomme-interference build manifests my-split --conditions no-history,k0,k1,k3,k7 --seed 0
+    robomme-interference build manifests my-buffers --conditions no-history,k0,k1,k3,k7 --seed 0
     ```
     """
     with stoppable("The datasets are kept"):
-        _plan(split, config, as_json=as_json)
+        _plan(buffer_set, config, as_json=as_json)
 
 
 @app.command()
 def questions(
-    split: Annotated[Path, typer.Argument(help="Folder of the split.")], as_json: AsJson = False
+    buffer_set: Annotated[Path, typer.Argument(help="Folder of the buffer set.")],
+    as_json: AsJson = False,
 ) -> None:
     """Make the questions about the past that `ask` asks: one a query, with a marked picture.
 
     Only for demonstrations of tabletop, of which the possible answers are known. Rows and pictures
-    are in questions.parquet; the same split gives the same bytes.
+    are in questions.parquet; the same buffer set gives the same bytes.
 
     Example:
     ```
-    robomme-interference build questions my-split
+    robomme-interference build questions my-buffers
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
     from .questions import make_questions, write_questions
 
-    if not split.is_dir():
+    if not buffer_set.is_dir():
         raise MissingFileError(
-            f"there is no folder {split}",
-            "A split on the Hub is fetched first: robomme-interference fetch NAME --to FOLDER",
+            f"there is no folder {buffer_set}",
+            "A buffer set on the Hub is fetched first: robomme-interference fetch NAME --to FOLDER",
         )
-    with stoppable("The split is as it was"), WorkProgress(unit="questions") as progress:
-        opened = load_split(split)
+    with stoppable("The buffer set is as it was"), WorkProgress(unit="questions") as progress:
+        opened = load_buffer_set(buffer_set)
         progress.start("Making questions", len(opened.episode_ids))
         made = []
         for one in make_questions(opened):
             made.append(one)
             progress.advance(1)
-        out = write_questions(made, split)
+        out = write_questions(made, buffer_set)
     if as_json:
         print_json({"out": str(out), "questions": len(made)})
     else:
@@ -205,8 +201,8 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
 
     Examples:
     ```
-    robomme-interference build all --source robomme-h5:recordings/ --out my-split
-    robomme-interference build all --source tabletop --split test --out my-split \
+    robomme-interference build all my-buffers --source robomme-h5:recordings/
+    robomme-interference build all my-buffers --source tabletop --split test \
         --conditions no-history,k0,k7,before-k7,held-k7,stale-k0
     ```
     """
@@ -215,32 +211,32 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
         taken = " and ".join(f"{kind} of {len(step.tasks):,}" for kind, step in steps.items())
         say(f"Recorded episodes to take: {taken}")
         for kind, step in steps.items():
-            _build(step, config.out / kind, config, as_json=False)
-        _plan(config.out, plan, as_json=as_json)
-    say(f"Next: robomme-interference verify {config.out}")
+            _build(step, config.buffer_set / kind, config, as_json=False)
+        _plan(config.buffer_set, plan, as_json=as_json)
+    say(f"Next: robomme-interference verify {config.buffer_set}")
 
 
 @with_settings
-def new_split(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
-    r"""Build a split of your own for demonstrations that are published: units and manifests.
+def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False) -> None:
+    r"""Build a buffer set of your own for demonstrations that are published: units and manifests.
 
     The units are of the sources' train episodes, whatever robot or simulator they are of; their
     cameras and sizes must be those of the demonstrations. Ends with an audit; fails on a leak.
 
     Examples:
     ```
-    robomme-interference new-split --demonstrations namespace/name@data-1.0.0 \
-        --source lerobot:NAMESPACE/NAME --out my-split
-    robomme-interference publish my-split --repo-id my-name/my-split
+    robomme-interference new-buffer-set my-buffers --demonstrations namespace/name@data-1.0.0 \
+        --source lerobot:NAMESPACE/NAME
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers
     ```
     """
     with stoppable(_KEPT):
         base, units = plan_new(config, plan)
         say(f"Demonstrations: {base.files.describe()}; episodes to take: {len(units.tasks):,}")
-        _build(units, config.out / DISTRACTORS, config, as_json=False)
-        _plan(config.out, plan, as_json=as_json, base=base.files)
-        audit(config.out)
-    say(f"Next: robomme-interference publish {config.out} --repo-id NAMESPACE/NAME")
+        _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
+        _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
+        audit(config.buffer_set)
+    say(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
 
 
 def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool) -> None:
@@ -260,48 +256,52 @@ def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool)
         print_json({**vars(result), "out": str(result.out)})
 
 
-def _plan(split: Path, config: PlanConfig, *, as_json: bool, base: "Files | None" = None) -> None:
-    from robomme_interference_data.data.loading import load_split
+def _plan(
+    buffer_set: Path, config: PlanConfig, *, as_json: bool, base: "Files | None" = None
+) -> None:
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
     from .manifests import in_folder, plan_manifests, write_manifests
 
     limit = position_limit(config)
-    places = in_folder(split) | ({} if base is None else {DEMONSTRATIONS: base})
+    places = in_folder(buffer_set) | ({} if base is None else {DEMONSTRATIONS: base})
     plan = plan_manifests(places, config.conditions, config.seed, limit)
     with WorkProgress(unit="buffers") as progress:
         total = len(plan.demonstrations) * len(plan.conditions)
         progress.start("Planning buffers", total)
-        for done in write_manifests(plan, split):
+        for done in write_manifests(plan, buffer_set):
             progress.advance(done)
-    counts = load_split(split).header.counts
+    counts = load_buffer_set(buffer_set).header.counts
     if as_json:
-        print_json({"out": str(split / MANIFESTS), **counts})
+        print_json({"out": str(buffer_set / MANIFESTS), **counts})
     else:
-        say(f"{split / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries")
+        say(
+            f"{buffer_set / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries"
+        )
 
 
 def verify(
-    split: SplitFolder,
+    buffer_set: BufferSetFolder,
     decode: Annotated[
         bool, typer.Option(help="Decode all frames; without, files, tables and rules are checked.")
     ] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Recompute every hash and rule of a split and name each violation; fails if there is one.
+    """Recompute every hash and rule of a buffer set and name each violation; fails if there is one.
 
     Example:
     ```
-    robomme-interference verify my-split
+    robomme-interference verify my-buffers
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from .verify import verify_split
+    from .verify import verify_buffer_set
 
     progress = WorkProgress()
-    checks = verify_split(load_split(split), decode=decode, progress=progress)
+    checks = verify_buffer_set(load_buffer_set(buffer_set), decode=decode, progress=progress)
     with progress:
         violations = list(checks)
     if as_json:
@@ -313,28 +313,28 @@ def verify(
         say(
             f"{len(violations)} violation{'s' * (len(violations) > 1)}"
             if violations
-            else f"All {what} of {split} hold."
+            else f"All {what} of {buffer_set} hold."
         )
     if violations:
         raise typer.Exit(1)
 
 
 def audit(
-    split: SplitFolder,
+    buffer_set: BufferSetFolder,
     as_json: AsJson = False,
 ) -> None:
     """Print how often units are used and where families stand; fails on any leak.
 
     Example:
     ```
-    robomme-interference audit my-split
+    robomme-interference audit my-buffers
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
 
-    from .audit import audit_split
+    from .audit import audit_buffer_set
 
-    report = audit_split(load_split(split))
+    report = audit_buffer_set(load_buffer_set(buffer_set))
     if as_json:
         print_json(report.as_dict())
     else:

@@ -44,7 +44,9 @@ class BuildConfig(WorkersConfig):
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[@REVISION], frames:FOLDER, "
         "tabletop, robomme (demonstrations only) or sample[:FAMILY,…]; repeated for several.",
     )
-    out: Path = setting(help="Folder to make, or dataset to let grow.")
+    buffer_set: Path = setting(
+        name="-", metavar="BUFFER_SET", help="Folder of the buffer set to create or extend."
+    )
     families: tuple[str, ...] = setting((), help="Families to take; all by default.")
     split: str | None = setting(None, help="Only train, val or test.", shown="units: train")
     episodes: str | None = setting(None, help="Numbers to take, such as 0-49 or 0,3,10-12.")
@@ -73,7 +75,7 @@ class BuildConfig(WorkersConfig):
 
 @dataclass(frozen=True)
 class AllConfig(BuildConfig):
-    """What to build a whole split of."""
+    """What to build a whole buffer set of."""
 
     unit_episodes: str | None = setting(
         None, help="Numbers of the train episodes that give units, such as 0-3; default: all."
@@ -85,7 +87,7 @@ class AllConfig(BuildConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class NewConfig(BuildConfig):
-    """What to build a split of for demonstrations that are published."""
+    """What to build a buffer set of for demonstrations that are published."""
 
     demonstrations: str = setting(
         metavar="NAME", help="Repository of the demonstrations, namespace/name[@REVISION]."
@@ -112,7 +114,7 @@ class BuildPlan:
     """A `BuildConfig` whose sources are open; or made without one.
 
     Attributes:
-        kind: Name of the dataset in a split, such as `demonstrations`.
+        kind: Name of the dataset in a buffer set, such as `demonstrations`.
         sources: Where to read.
         tasks: The episodes to store: number of the source, and episode.
         cameras: Cameras to store; None for all.
@@ -131,12 +133,12 @@ class BuildPlan:
 
 
 def plan_all(config: AllConfig, plan: PlanConfig) -> dict[str, BuildPlan]:
-    """Plan the datasets of a split, and check all that can be known before anything is read."""
+    """Plan the datasets of a buffer set, and check all that can be known before anything is read."""
     every = dataclasses.replace(config, families=(), episodes=config.unit_episodes, split="train")
     names = [*datasets_of(in_order(plan.conditions)), *[SHIFTED] * config.shifted]
     plans = {name: plan_build(name, every if name in UNITS else config) for name in names}
     queries = (episode.id for _, episode in plans[DEMONSTRATIONS].tasks)
-    _check_plans(queries, plans, config.out, plan)
+    _check_plans(queries, plans, config.buffer_set, plan)
     return plans
 
 
@@ -156,14 +158,14 @@ def plan_new(config: NewConfig, plan: PlanConfig) -> "tuple[Dataset, BuildPlan]"
             "demonstrations",
             config.demonstrations,
             "demonstrations that are published",
-            "A published split's card names the repository of its demonstrations. For "
+            "A published buffer set's card names the repository of its demonstrations. For "
             "demonstrations in a folder, build distractors and manifests beside it.",
         )
-    check_needs(in_order(plan.conditions), in_folder(config.out))
+    check_needs(in_order(plan.conditions), in_folder(config.buffer_set))
     cameras = config.cameras or base.cameras
     units = plan_build(DISTRACTORS, dataclasses.replace(config, cameras=cameras))
     queries = (record.episode_id for record in base.records())
-    _check_plans(queries, {DISTRACTORS: units}, config.out, plan)
+    _check_plans(queries, {DISTRACTORS: units}, config.buffer_set, plan)
     return base, units
 
 
@@ -242,7 +244,7 @@ def plan_build(kind: str, config: BuildConfig) -> BuildPlan:
                 f"{text} plays demonstrations only, and distractor units need whole episodes",
                 "Build the two datasets apart, the distractors from RoboMME's own training "
                 "recordings.",
-                "build distractors --source robomme-h5:FOLDER --out SPLIT/distractors",
+                "build distractors BUFFER_SET --source robomme-h5:FOLDER",
             )
     split = config.split or ("train" if kind in UNITS else None)
     tasks = list_episodes(sources, families=config.families, split=split, numbers=numbers)

@@ -53,7 +53,7 @@ _LEROBOTS = ("episode_index", "length")
 def listed_files(root: Path) -> list[str]:
     """Return the files of a dataset whose SHA-256 is recorded: all but the list and what it names.
 
-    An index has a list of its own; so have the manifests, which a published split has beside its
+    An index has a list of its own; so have the manifests, which a published buffer set has beside its
     units, and the questions, which are made anew to be checked. What people put beside a dataset
     has none: README, LICENSE, cards with `parts.json`, and hidden files.
     """
@@ -128,7 +128,7 @@ class BuildReport:
     """`meta/build_report.json`."""
 
     format_version: Annotated[int, "Of the files."]
-    kind: Annotated[str, "Name of the dataset in a split."]
+    kind: Annotated[str, "Name of the dataset in a buffer set."]
     counts: Annotated[dict[str, Any], "What the identity counts, and `skipped` episodes."]
     skipped: Annotated[tuple[SkippedEpisode, ...], "Episodes that yielded nothing, by id."]
 

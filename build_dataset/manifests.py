@@ -1,4 +1,4 @@
-"""Plan the buffers of a split: for every query episode and every condition, what it holds.
+"""Plan the buffers of a buffer set: for every query episode and every condition, what it holds.
 
 Rules 5 and 8 of the protocol; what a condition holds is `schema/conditions.py`, what sessions there
 are `data/query_sessions.py`.
@@ -58,7 +58,7 @@ class ManifestPlan:
     """All that decides the manifests.
 
     Attributes:
-        source: The datasets of the split, and the seed of the draw.
+        source: The datasets of the buffer set, and the seed of the draw.
         conditions: For which buffers are planned, in order.
         position_limit: Longest history plus rollout that the systems hold; None for no limit.
     """
@@ -69,7 +69,7 @@ class ManifestPlan:
 
     @property
     def datasets(self) -> Mapping[str, Dataset]:
-        """The datasets of the split by name."""
+        """The datasets of the buffer set by name."""
         return self.source.datasets
 
     @property
@@ -79,7 +79,7 @@ class ManifestPlan:
 
 
 def in_folder(root: Path) -> dict[str, Files]:
-    """Return where the datasets of a split lie that is built in a folder."""
+    """Return where the datasets of a buffer set lie that is built in a folder."""
     further = (name for name in OPTIONAL_DATASETS if (root / name / IDENTITY_PATH).is_file())
     return {name: LocalFiles(root / name) for name in (DEMONSTRATIONS, DISTRACTORS, *further)}
 
@@ -90,10 +90,10 @@ def plan_manifests(
     seed: int = 0,
     position_limit: int | None = POSITION_LIMIT,
 ) -> ManifestPlan:
-    """Check that the datasets of a split and the options fit each other.
+    """Check that the datasets of a buffer set and the options fit each other.
 
     Args:
-        places: Where the datasets of the split lie, by name; see `in_folder`.
+        places: Where the datasets of the buffer set lie, by name; see `in_folder`.
         conditions: For which buffers are planned.
         seed: Seed of the draw.
         position_limit: See `ManifestPlan`.
@@ -124,7 +124,7 @@ def plan_manifests(
 
 
 def check_needs(conditions: Iterable[Condition], there: Collection[str]) -> None:
-    """Check that a split has the datasets that conditions need.
+    """Check that a buffer set has the datasets that conditions need.
 
     Args:
         conditions: The conditions.
@@ -134,9 +134,9 @@ def check_needs(conditions: Iterable[Condition], there: Collection[str]) -> None
         for name in condition.kind.needs:
             if name not in there:
                 raise SourceError(
-                    f"{condition} needs the dataset {name}, which the split lacks",
+                    f"{condition} needs the dataset {name}, which the buffer set lacks",
                     f"Build it first, or leave {condition} out.",
-                    f"build {name} --source KIND:PATH --out SPLIT/{name}",
+                    f"build {name} --source KIND:PATH --out BUFFER_SET/{name}",
                 )
 
 
@@ -193,7 +193,7 @@ def _check_length(manifest: BufferManifest, limit: int | None) -> None:
 
 
 def check_place(root: Path) -> None:
-    """Check that nothing else lies where the manifests of a split are to be."""
+    """Check that nothing else lies where the manifests of a buffer set are to be."""
     out = root.resolve() / MANIFESTS
     strangers = {path.name for path in out.glob("[!.]*")} - {MANIFEST_ROWS, MANIFEST_HEADER}
     if (strangers and not (out / MANIFEST_HEADER).is_file()) or out.is_file():
@@ -203,14 +203,14 @@ def check_place(root: Path) -> None:
 
 
 def write_manifests(plan: ManifestPlan, root: Path) -> Iterator[int]:
-    """Write the manifests of a split; yields the number of buffers done after each batch.
+    """Write the manifests of a buffer set; yields the number of buffers done after each batch.
 
-    Whenever it is interrupted, the split has either the earlier manifests or the new ones: until
+    Whenever it is interrupted, the buffer set has either the earlier manifests or the new ones: until
     `manifest.json` is replaced, the new rows lie beside the old ones under a name that it tells.
 
     Args:
         plan: What to write.
-        root: The split; manifests of an earlier run are replaced.
+        root: The buffer set; manifests of an earlier run are replaced.
     """
     out = root.resolve() / MANIFESTS
     rows, header = out / MANIFEST_ROWS, out / MANIFEST_HEADER

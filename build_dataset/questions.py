@@ -1,4 +1,4 @@
-"""Make the questions about the past of a split: what is asked, and what stands for an answer."""
+"""Make the questions about the past of a buffer set: what is asked, and what stands for an answer."""
 
 import dataclasses
 import hashlib
@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS_PATH
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import BuildError
@@ -27,13 +27,13 @@ Marks = Sequence[Sequence[Pixel]]
 """Of each option the points, (y, x) in pixels of the first live view; none where words tell it."""
 
 
-def make_questions(split: Split) -> Iterator[Question]:
-    """Make the questions of a split, in canonical order; the same split gives the same bytes."""
+def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
+    """Make the questions of a buffer set, in canonical order; the same buffer set gives the same bytes."""
     module = "robomme_interference_data.build_dataset.question_pictures"
     picture = load_extra(module, "picture", "build questions", "retrieval")
-    for question, marks in planned_questions(split):
-        view = split.query(question.episode_id).frame()
-        side = recorded_scene(split.query(question.episode_id)).side
+    for question, marks in planned_questions(buffer_set):
+        view = buffer_set.query(question.episode_id).frame()
+        side = recorded_scene(buffer_set.query(question.episode_id)).side
         if view.shape != (side, side, 3):
             raise BuildError(
                 f"the first live view of {question.episode_id} has {view.shape[1]}×{view.shape[0]} "
@@ -43,15 +43,15 @@ def make_questions(split: Split) -> Iterator[Question]:
         yield dataclasses.replace(question, picture=png(picture(view, marks)))
 
 
-def planned_questions(split: Split) -> Iterator[tuple[Question, Marks]]:
-    """Yield the questions of a split without their pictures, and what is marked on these."""
-    revision = split.datasets[DEMONSTRATIONS].identity.revision
-    for episode in sorted(split.episode_ids):
-        yield _planned(split.query(episode), revision)
+def planned_questions(buffer_set: BufferSet) -> Iterator[tuple[Question, Marks]]:
+    """Yield the questions of a buffer set without their pictures, and what is marked on these."""
+    revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
+    for episode in sorted(buffer_set.episode_ids):
+        yield _planned(buffer_set.query(episode), revision)
 
 
 def write_questions(questions: Sequence[Question], folder: Path) -> Path:
-    """Write questions into a split's folder, whole or not at all; return the file."""
+    """Write questions into a buffer set's folder, whole or not at all; return the file."""
     out = folder / QUESTIONS_PATH
     schema = arrow_schema(Question)
     with (

@@ -1,4 +1,4 @@
-"""Recompute every hash and every rule of a split, and name each violation."""
+"""Recompute every hash and every rule of a buffer set, and name each violation."""
 
 import json
 from collections import defaultdict
@@ -34,7 +34,7 @@ from robomme_interference_data.constants import (
     UNIT_MIN_RAW_FRAMES,
     UNITS,
 )
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import IndexHeader, index_folder
 from robomme_interference_data.data.questions import Question, read_questions
@@ -73,7 +73,7 @@ _TOO_MANY = "is too many: it is in no list"
 
 @dataclass(frozen=True)
 class Violation:
-    """Something in a split that is not as recorded or as the rules say.
+    """Something in a buffer set that is not as recorded or as the rules say.
 
     Attributes:
         where: File, episode or buffer.
@@ -84,10 +84,10 @@ class Violation:
     what: str
 
 
-def verify_split(
-    split: Split, *, decode: bool = True, progress: WorkProgress | None = None
+def verify_buffer_set(
+    buffer_set: BufferSet, *, decode: bool = True, progress: WorkProgress | None = None
 ) -> Iterator[Violation]:
-    """Check a split, yielding violations as they are found.
+    """Check a buffer set, yielding violations as they are found.
 
     Checked are: the SHA-256 of every file, and that none is missing or too many; with `decode`,
     every frame and vector of every episode against its recorded hashes; what LeRobot's columns
@@ -96,15 +96,15 @@ def verify_split(
     and compared field by field; and so every question, if there are any, but for its picture.
 
     Args:
-        split: The split; all of one on the Hub is downloaded.
+        buffer_set: The buffer set; all of one on the Hub is downloaded.
         decode: Whether to decode all data: by far the longest part.
         progress: Where to show how many frames are decoded.
     """
-    return _split(split, decode, progress or WorkProgress(quiet=True))
+    return _buffer_set(buffer_set, decode, progress or WorkProgress(quiet=True))
 
 
-def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Violation]:
-    header, own = split.header, split.files.snapshot("*")
+def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> Iterator[Violation]:
+    header, own = buffer_set.header, buffer_set.files.snapshot("*")
     yield from _json(own / MANIFEST_PATH, MANIFEST_PATH)
     for path in all_files(own / MANIFESTS):
         if path not in (MANIFEST_HEADER, MANIFEST_ROWS):
@@ -120,7 +120,7 @@ def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Viola
     datasets: dict[str, Dataset] = {}
     for name in header.datasets:
         try:
-            datasets[name] = Dataset(LocalFiles(split.place(name).snapshot("*")))
+            datasets[name] = Dataset(LocalFiles(buffer_set.place(name).snapshot("*")))
         except InterferenceError as error:
             yield Violation(name, error.message)
     frames = sum(dataset.identity.counts.frames for dataset in datasets.values())
@@ -129,10 +129,10 @@ def _split(split: Split, decode: bool, progress: WorkProgress) -> Iterator[Viola
         yield from _told(name, _dataset(name, dataset, header, progress if decode else None))
         yield from _indexes(name, dataset, datasets.get(DISTRACTORS))
     if len(datasets) == len(header.datasets):
-        yield from _told(MANIFESTS, _buffers(split, datasets))
+        yield from _told(MANIFESTS, _buffers(buffer_set, datasets))
     if (own / QUESTIONS_PATH).is_file():
         yield from _told(QUESTIONS_PATH, _table(own, QUESTIONS_PATH, Question))
-        yield from _told(QUESTIONS_PATH, _questions(split))
+        yield from _told(QUESTIONS_PATH, _questions(buffer_set))
 
 
 def _told(where: str, violations: Iterable[Violation]) -> Iterator[Violation]:
@@ -189,7 +189,7 @@ def _files(name: str, dataset: Dataset, header: ManifestHeader) -> Iterator[Viol
     if sha256_file(files.path(IDENTITY_PATH)) != header.datasets[name].identity:
         what = f"does not have the SHA-256 of {MANIFESTS}/{MANIFEST_HEADER}"
         yield Violation(f"{name}/{IDENTITY_PATH}", what)
-    # Of a split that was fetched, one dataset is at its root, and the other in a folder there.
+    # Of a buffer set that was fetched, one dataset is at its root, and the other in a folder there.
     others = tuple(f"{other}/" for other in header.datasets if other != name)
     for path in (IDENTITY_PATH, REPORT_PATH, INFO_PATH, STATS_PATH):
         text = _LEROBOT_TEXT.get(path, indented_json)
@@ -315,16 +315,16 @@ def _index(name: str, dataset: Dataset, folder: str, units: Dataset | None) -> I
             yield Violation(where, f"was made with another encoder than that of the {DISTRACTORS}")
 
 
-def _buffers(split: Split, datasets: Mapping[str, Dataset]) -> Iterator[Violation]:
+def _buffers(buffer_set: BufferSet, datasets: Mapping[str, Dataset]) -> Iterator[Violation]:
     """Plan all buffers anew, and compare them with the rows."""
-    header, places = split.header, {name: one.files for name, one in datasets.items()}
+    header, places = buffer_set.header, {name: one.files for name, one in datasets.items()}
     where = f"{MANIFESTS}/{MANIFEST_HEADER}"
     if header.rule_version != RULE_VERSION:
         what = f"rule version {header.rule_version}; this package can check {RULE_VERSION}"
         yield Violation(where, what)
         return
     plan = plan_manifests(places, header.conditions, header.seed, header.position_limit)
-    given = {str(manifest): to_dict(manifest) for manifest in split.manifests()}
+    given = {str(manifest): to_dict(manifest) for manifest in buffer_set.manifests()}
     order = list(given)
     counts = {"queries": len(plan.demonstrations), "buffers": 0, "sessions": 0}
     for number, manifest in enumerate(planned_buffers(plan)):
@@ -348,10 +348,10 @@ def _buffers(split: Split, datasets: Mapping[str, Dataset]) -> Iterator[Violatio
         yield Violation(where, f"datasets are {sorted(header.datasets)}")
 
 
-def _questions(split: Split) -> Iterator[Violation]:
+def _questions(buffer_set: BufferSet) -> Iterator[Violation]:
     """Plan all questions anew, and compare them with those that are there."""
-    given = read_questions(split)
-    for question, _ in planned_questions(split):
+    given = read_questions(buffer_set)
+    for question, _ in planned_questions(buffer_set):
         where = f"{QUESTIONS_PATH} {question.episode_id}"
         there = given.pop(question.episode_id, None)
         if there is None:

@@ -1,1 +1,1 @@
-"""Cards: what a published dataset, split or run says of itself, and how it is published."""
+"""Cards: what a published dataset, buffer set or run says of itself, and how it is published."""

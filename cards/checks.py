@@ -1,40 +1,40 @@
-"""What has to hold before a split is published: every hash and rule, no leak, LeRobot opens it."""
+"""What has to hold before a buffer set is published: every hash and rule, no leak, LeRobot opens it."""
 
 import logging
 from collections.abc import Sized
 from pathlib import Path
 
-from robomme_interference_data.build_dataset.audit import audit_split
+from robomme_interference_data.build_dataset.audit import audit_buffer_set
 from robomme_interference_data.build_dataset.lerobot_writer import require_lerobot
-from robomme_interference_data.build_dataset.verify import verify_split
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import PublishError
 from robomme_interference_data.runtime.progress import WorkProgress
 from robomme_interference_data.storage.files import LocalFiles, with_filename
 
 
-def check_split(split: Split, progress: WorkProgress | None = None) -> None:
-    """Check that a split is fit to be published; raise a `PublishError` if it is not."""
+def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None) -> None:
+    """Check that a buffer set is fit to be published; raise a `PublishError` if it is not."""
     require_lerobot()
-    violations = list(verify_split(split, progress=progress))
+    violations = list(verify_buffer_set(buffer_set, progress=progress))
     if violations:
         first = violations[0]
         raise PublishError(
-            f"{split.location} is not as recorded: {_number(violations, 'violation')}, such as "
+            f"{buffer_set.location} is not as recorded: {_number(violations, 'violation')}, such as "
             f"{first.where}: {first.what}",
             "List all of them.",
-            f"verify {split.location}",
+            f"verify {buffer_set.location}",
         )
-    leaks = audit_split(split).leaks
+    leaks = audit_buffer_set(buffer_set).leaks
     if leaks:
         raise PublishError(
-            f"{split.location} leaks: {_number(leaks, 'leak')}, such as {leaks[0].kind}: "
+            f"{buffer_set.location} leaks: {_number(leaks, 'leak')}, such as {leaks[0].kind}: "
             f"{leaks[0].where}",
             "List all of them.",
-            f"audit {split.location}",
+            f"audit {buffer_set.location}",
         )
-    for name in split.header.datasets:
-        place = split.place(name)
+    for name in buffer_set.header.datasets:
+        place = buffer_set.place(name)
         if isinstance(place, LocalFiles):  # one on the Hub was checked when it was published
             open_with_lerobot(name, place.root)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robomme_interference_data.cli.console import check_output, echo, print_json, say, stoppable
-from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
+from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
 from robomme_interference_data.evaluate.score.config import Grid
 
@@ -34,7 +34,8 @@ def card(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="DIR", help="Folder of a split, of demonstrations or of a run; or a Hub id."
+            metavar="DIR",
+            help="Folder of a buffer set, of demonstrations or of a run; or a Hub id.",
         ),
     ],
     repo_id: Annotated[
@@ -45,12 +46,12 @@ def card(
         str, typer.Option(help="Its license, such as cc-by-4.0; other: the recordings'.")
     ] = "other",
 ) -> None:
-    """Print the card of a split, of demonstrations or of a run: README.md, all of it from data.
+    """Print the card of a buffer set, of demonstrations or of a run: README.md, all of it from data.
 
     Examples:
     ```
-    robomme-interference card my-split --repo-id my-name/my-split
-    robomme-interference card my-split/demonstrations --license cc-by-4.0
+    robomme-interference card my-buffers --repo-id my-name/my-buffers
+    robomme-interference card my-buffers/demonstrations --license cc-by-4.0
     robomme-interference card my-run --repo-id my-name/my-results
     ```
     """
@@ -70,25 +71,25 @@ def facts_of(source: str) -> "Facts":
         RUN_TABLES,
     )
     from robomme_interference_data.data.dataset import Dataset
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.storage.hub import locate
 
-    from .facts import demonstrations_facts, split_facts
+    from .facts import buffer_set_facts, demonstrations_facts
     from .results import results_facts
 
     if Path(source).is_file():
         return results_facts(Path(source))
     files = locate(source)
     if _has(files, MANIFEST_PATH):
-        return split_facts(load_split(files.location))
+        return buffer_set_facts(load_buffer_set(files.location))
     if _has(files, IDENTITY_PATH):
         return demonstrations_facts(Dataset(files))
     if _has(files, RUN_HEADER):
         return results_facts(files.snapshot(RUN_HEADER, RUN_RECORD, *RUN_TABLES))
     raise MissingFileError(
-        f"{files.describe()} holds no split, no demonstrations and no run: {MANIFEST_PATH}, "
+        f"{files.describe()} holds no buffer set, no demonstrations and no run: {MANIFEST_PATH}, "
         f"{IDENTITY_PATH} and {RUN_HEADER} are missing",
-        "Give the folder of a split or of a run.",
+        "Give the folder of a buffer set or of a run.",
     )
 
 
@@ -101,7 +102,7 @@ def _has(files: "Files", path: str) -> bool:
 
 @with_settings
 def publish(
-    split: SplitFolder,
+    buffer_set: BufferSetFolder,
     config: PublishConfig,
     private: Private = False,
     to: To = None,
@@ -109,7 +110,7 @@ def publish(
     yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
-    """Publish a split on the Hub: its demonstrations, then its units and manifests, with cards.
+    """Publish a buffer set on the Hub: its demonstrations, then its units and manifests, with cards.
 
     All hashes and rules are checked first. A version never changes: its tag, such as data-1.0.0,
     comes last, and is never moved. Re-run the same command after an interruption to send what is
@@ -117,51 +118,51 @@ def publish(
 
     Examples:
     ```
-    robomme-interference publish my-split --repo-id my-name/my-split --dry-run
-    robomme-interference publish my-split --repo-id my-name/my-split --license cc-by-4.0
-    robomme-interference publish my-split --repo-id my-name/my-split --version 1.1.0 --yes
-    robomme-interference publish my-split --repo-id my-name/my-split --to export/
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers --dry-run
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers --license cc-by-4.0
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers --version 1.1.0 --yes
+    robomme-interference publish my-buffers --repo-id my-name/my-buffers --to export/
     ```
     """
     from robomme_interference_data.constants import DEMONSTRATIONS, INDEX_DIR
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
 
-    from .checks import check_split
-    from .publish import SplitContent, plan_split, publish_split
+    from .checks import check_buffer_set
+    from .publish import BufferSetContent, plan_buffer_set, publish_buffer_set
     from .publisher import Publisher
     from .repo import HubRepository
 
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     unpublished = opened.header.datasets[DEMONSTRATIONS].place is None
     if unpublished and not opened.place(DEMONSTRATIONS).list(INDEX_DIR):
         say(
             "The demonstrations are published without embeddings. To add some first: "
-            f"robomme-interference index {split}"
+            f"robomme-interference index {buffer_set}"
         )
     if to is not None:
         check_output(to.resolve().parent)
     elif not dry_run:
         HubRepository(config.repo_id).check_rights(exists=False)  # checks may take hours
     with WorkProgress(quiet=as_json) as progress:
-        check_split(opened, progress)
-    content = SplitContent(opened, config)
+        check_buffer_set(opened, progress)
+    content = BufferSetContent(opened, config)
     if to is not None:
         _export(content.folder(), to, dry_run=dry_run, as_json=as_json)
         return
     publisher = Publisher(config, private=private)
-    plans = plan_split(content, publisher)
+    plans = plan_buffer_set(content, publisher)
     done = _carry_out(
         publisher,
         plans,
-        lambda: publish_split(content, publisher, plans),
+        lambda: publish_buffer_set(content, publisher, plans),
         dry_run=dry_run,
         yes=yes,
         as_json=as_json,
     )
     if done and not as_json:
         last = done[-1]
-        say(f'load_split("{last.repository.repo_id}", revision="{last.version.tag}")')
+        say(f'load_buffer_set("{last.repository.repo_id}", revision="{last.version.tag}")')
 
 
 @with_settings
@@ -179,7 +180,7 @@ def publish_results(
 ) -> None:
     """Publish the results of a run on the Hub: rows, scores, report and a card.
 
-    Versions are kept as those of a split are. Videos of rollouts are not published.
+    Versions are kept as those of a buffer set are. Videos of rollouts are not published.
 
     Examples:
     ```

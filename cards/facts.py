@@ -14,7 +14,7 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
     SUMS_PATH,
 )
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.questions import Question
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
@@ -23,7 +23,7 @@ from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import read_json, sha256_file
 
-from .film import film_of_lesson, film_of_split
+from .film import film_of_buffer_set, film_of_lesson
 from .markdown import code
 from .publication import Publication
 from .sources import (
@@ -110,7 +110,7 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
     if dataset.kind != DEMONSTRATIONS:
         raise InvalidOptionError(
             f"{dataset.files.describe()} is a dataset of {dataset.kind}, not of {DEMONSTRATIONS}",
-            "Units are published with the manifests that name them: give the split.",
+            "Units are published with the manifests that name them: give the buffer set.",
         )
     records = records_of(dataset)
     film = film_of_lesson(dataset, records)
@@ -153,24 +153,27 @@ def demonstrations_facts(dataset: Dataset) -> Facts:
     )
 
 
-def split_facts(split: Split) -> Facts:
-    """Return what there is to say of a split."""
-    header, datasets = split.header, {name: split.datasets[name] for name in split.datasets}
+def buffer_set_facts(buffer_set: BufferSet) -> Facts:
+    """Return what there is to say of a buffer set."""
+    header, datasets = (
+        buffer_set.header,
+        {name: buffer_set.datasets[name] for name in buffer_set.datasets},
+    )
     records = {name: records_of(dataset) for name, dataset in datasets.items()}
     lessons, units = records[DEMONSTRATIONS], {**records}
     del units[DEMONSTRATIONS]
     every_unit = [record for found in units.values() for record in found]
-    ids = {*split.episode_ids}
+    ids = {*buffer_set.episode_ids}
     queries = tuple(one for one in lessons if one.episode_id in ids)
-    manifests = tuple(split.manifests())
-    film = film_of_split(split, queries, manifests)
+    manifests = tuple(buffer_set.manifests())
+    film = film_of_buffer_set(buffer_set, queries, manifests)
     same_family = count_same_family(manifests)
     simulators = sorted({name for one in datasets.values() for name in one.identity.simulators})
     more = (
         f"{same_family:,} buffers hold distractors of the query's own family, which the "
         "paper's protocol rules out: results stand beside none of the benchmark."
     )
-    split_name, questions = one_split(queries), _questions(split)
+    split_name, questions = one_split(queries), _questions(buffer_set)
     tables = [CardTable("buffers", BufferManifest, _BUFFERS, header.rows, split_name)]
     for name in [*units][:1]:
         own = _episodes(datasets[name], units[name])
@@ -181,17 +184,17 @@ def split_facts(split: Split) -> Facts:
     def provenance(about: Publication) -> Rows:
         rows = [
             ("demonstrations", code(about.base) if about.base else "not published"),
-            ("revision of the split", code(split.revision)),
+            ("revision of the buffer set", code(buffer_set.revision)),
             (f"SHA-256 of `{_BUFFERS}`", code(header.rows)),
         ]
         rows += [row for name, one in datasets.items() for row in dataset_rows(one, name)]
         return [*rows, ("version of the draw", code(header.rule_version))]
 
     return Facts(
-        kind="split",
+        kind="buffer_set",
         title="RoboMME-Interference buffers",
         description=f"History buffers of RoboMME-Interference: {len(manifests):,} buffers of "
-        f"{len(queries):,} query episodes under {', '.join(split.conditions)}, and the distractor "
+        f"{len(queries):,} query episodes under {', '.join(buffer_set.conditions)}, and the distractor "
         "units that they hold.",
         origin="The sessions of every buffer were drawn by SHA-256, rule version "
         f"{header.rule_version}, seed {header.seed}.",
@@ -204,19 +207,19 @@ def split_facts(split: Split) -> Facts:
         pictures=film.pictures,
         values={
             "film": film,
-            "cameras": split.cameras,
+            "cameras": buffer_set.cameras,
             "buffers": len(manifests),
             "queries": len(queries),
             "units": len(every_unit),
             "units_split": one_split(every_unit),
-            "conditions": split.conditions,
-            "condition_table": condition_table(split.conditions, manifests),
+            "conditions": buffer_set.conditions,
+            "condition_table": condition_table(buffer_set.conditions, manifests),
             "counts": unit_table(queries, every_unit),
             "goals": goal_table(lessons),
             "questions": questions is not None,
             "first": queries[0].episode_id,
             "header": header,
-            "other_conditions": _beyond_paper(split.conditions),
+            "other_conditions": _beyond_paper(buffer_set.conditions),
             "same_family": same_family,
             "skipped": sum(_skipped(datasets[name]) for name in units),
             "inexact": sum(not one.exact for one in manifests),
@@ -263,10 +266,10 @@ def _episodes(dataset: Dataset, records: Iterable[EpisodeRecord]) -> CardTable:
     return CardTable("episodes", EpisodeRecord, RECORDS_PATH, digest, one_split(records))
 
 
-def _questions(split: Split) -> str | None:
-    """Return the SHA-256 of the questions of a split, or None if it has none."""
+def _questions(buffer_set: BufferSet) -> str | None:
+    """Return the SHA-256 of the questions of a buffer set, or None if it has none."""
     with suppress(MissingFileError):
-        return sha256_file(split.files.path(QUESTIONS_PATH))
+        return sha256_file(buffer_set.files.path(QUESTIONS_PATH))
     return None
 
 

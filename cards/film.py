@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import FormatError
@@ -48,17 +48,17 @@ class Film:
         return f"{buffer.episode_id} under {buffer.condition}: {sessions}. Goal: {buffer.goal}"
 
 
-def film_of_split(
-    split: Split, queries: Sequence[EpisodeRecord], manifests: Sequence[BufferManifest]
+def film_of_buffer_set(
+    buffer_set: BufferSet, queries: Sequence[EpisodeRecord], manifests: Sequence[BufferManifest]
 ) -> Film:
     """Return the film strip of the first query, under `k3` or what holds most sessions."""
     if not (manifests and queries):
-        raise FormatError.damaged(split.location, "no buffers")
+        raise FormatError.damaged(buffer_set.location, "no buffers")
     first = queries[0].episode_id
     own = [one for one in manifests if one.episode_id == first]
     chosen = max(own, key=lambda one: (one.condition == _FIRST_CHOICE, len(one.sessions)))
-    # Of a split on the Hub no video is fetched before it is drawn.
-    return Film(split.load(first, chosen.condition, cameras=()))
+    # Of a buffer set on the Hub no video is fetched before it is drawn.
+    return Film(buffer_set.load(first, chosen.condition, cameras=()))
 
 
 def film_of_lesson(dataset: Dataset, records: Sequence[EpisodeRecord]) -> Film:

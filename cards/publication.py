@@ -88,8 +88,8 @@ class Publication:
         version: Such as `1.2.0`: buffers changed, added, or only card and index did.
         license: Identifier of its license, as the Hub knows them; `other` for that of the
             recordings.
-        base: What it was made for, `namespace/name@<40-digit commit>`: of a split its
-            demonstrations, of results their split; None if that is not published.
+        base: What it was made for, `namespace/name@<40-digit commit>`: of a buffer set its
+            demonstrations, of results their buffer set; None if that is not published.
         command: The command that made it, or None.
     """
 

@@ -1,4 +1,4 @@
-"""Publish a split: its demonstrations, then its units with the manifests that name them."""
+"""Publish a buffer set: its demonstrations, then its units with the manifests that name them."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -19,7 +19,7 @@ from robomme_interference_data.constants import (
     QUESTIONS_PATH,
     SUMS_PATH,
 )
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import MissingFileError, PublishError
@@ -28,7 +28,7 @@ from robomme_interference_data.schema.manifest import BufferManifest, ManifestHe
 from robomme_interference_data.storage.files import LocalFiles, indented_json
 from robomme_interference_data.storage.hub import HubFiles
 
-from .facts import Facts, demonstrations_facts, split_facts
+from .facts import Facts, buffer_set_facts, demonstrations_facts
 from .publication import Publication, PublishConfig, Version
 from .publisher import Publisher, RepoContent, RepoPlan, digest
 from .render import card_files
@@ -38,76 +38,76 @@ _UNKNOWN = "0" * 40
 """Stands for the commit of demonstrations that are not published yet."""
 
 
-class SplitContent:
-    """What the repositories of a split hold.
+class BufferSetContent:
+    """What the repositories of a buffer set hold.
 
     Args:
-        split: The split, whose checks have passed.
+        buffer_set: The buffer set, whose checks have passed.
         config: As what it is published.
     """
 
-    def __init__(self, split: Split, config: PublishConfig):
-        self.split = split
+    def __init__(self, buffer_set: BufferSet, config: PublishConfig):
+        self.buffer_set = buffer_set
         self.config = config
 
     @cached_property
     def base(self) -> str | None:
-        """The published demonstrations that the split is for, `namespace/name@commit`, or None."""
-        recorded = self.split.header.datasets[DEMONSTRATIONS]
+        """The published demonstrations that the buffer set is for, `namespace/name@commit`, or None."""
+        recorded = self.buffer_set.header.datasets[DEMONSTRATIONS]
         repo_id, _, commit = (recorded.place or "").partition("@")
         if not commit or self.config.demonstrations_id not in (None, repo_id):
             return None
         if Dataset(HubFiles(repo_id, commit)).revision != recorded.revision:
             raise PublishError(
                 f"{recorded.place} holds other demonstrations than those that "
-                f"{self.split.location} is for",
-                self.split.mend,
+                f"{self.buffer_set.location} is for",
+                self.buffer_set.mend,
             )
         return recorded.place
 
     @cached_property
     def demonstrations(self) -> RepoContent:
         """What the repository of the demonstrations holds."""
-        dataset = self.split.datasets[DEMONSTRATIONS]
+        dataset = self.buffer_set.datasets[DEMONSTRATIONS]
         facts, files = demonstrations_facts(dataset), dataset_files(dataset)
         parts = parts_of_dataset(dataset)
         return self._content(self.config.demonstrations, dataset, facts, files, parts)
 
     @cached_property
     def _facts(self) -> Facts:
-        return split_facts(self.split)
+        return buffer_set_facts(self.buffer_set)
 
     def units(self, base: str | None) -> RepoContent:
-        """Return what the split's own repository holds: units at its root, and the manifests.
+        """Return what the buffer set's own repository holds: units at its root, and the manifests.
 
         Args:
             base: Where the demonstrations are, `namespace/name@commit`; None for a folder beside.
         """
-        split, datasets = self.split, self.split.header.datasets
+        buffer_set, datasets = self.buffer_set, self.buffer_set.header.datasets
         names = [DISTRACTORS, *(name for name in OPTIONAL_DATASETS if name in datasets)]
         files: RepoFiles = {}
-        parts = parts_of_buffers(split.manifests()) | parts_of_questions(split)
+        parts = parts_of_buffers(buffer_set.manifests()) | parts_of_questions(buffer_set)
         for name in names:
             folder = "" if name == DISTRACTORS else f"{name}/"
-            dataset = split.datasets[name]
+            dataset = buffer_set.datasets[name]
             files |= {folder + path: file for path, file in dataset_files(dataset).items()}
             parts |= parts_of_dataset(dataset)
-        header = indented_json(to_dict(with_locations(split.header, base))).encode()
+        header = indented_json(to_dict(with_locations(buffer_set.header, base))).encode()
         files[MANIFEST_PATH] = LocalFile(header)
-        for path in (f"{MANIFESTS}/{MANIFEST_ROWS}", *[QUESTIONS_PATH] * has_questions(split)):
-            files[path] = LocalFile(split.files.path(path))
-        units, repo_id = split.datasets[DISTRACTORS], self.config.repo_id
+        for path in (f"{MANIFESTS}/{MANIFEST_ROWS}", *[QUESTIONS_PATH] * has_questions(buffer_set)):
+            files[path] = LocalFile(buffer_set.files.path(path))
+        units, repo_id = buffer_set.datasets[DISTRACTORS], self.config.repo_id
         return self._content(repo_id, units, self._facts, files, parts, base)
 
     def folder(self) -> RepoFiles:
-        """Return the files of the split's repository, with the other one in `demonstrations/`.
+        """Return the files of the buffer set's repository, with the other one in `demonstrations/`.
 
         Demonstrations that are only on the Hub stay there.
         """
-        base = self.split.header.datasets[DEMONSTRATIONS].place
+        base = self.buffer_set.header.datasets[DEMONSTRATIONS].place
         own = self.units(base if base and "@" in base else None)
         files = own.files(self.config.wanted or own.first)
-        if isinstance(self.split.place(DEMONSTRATIONS), LocalFiles):
+        if isinstance(self.buffer_set.place(DEMONSTRATIONS), LocalFiles):
             other = self.demonstrations
             lessons = other.files(self.config.wanted or other.first)
             files |= {f"{DEMONSTRATIONS}/{path}": file for path, file in lessons.items()}
@@ -123,7 +123,7 @@ class SplitContent:
         base: str | None = None,
     ) -> RepoContent:
         # No paths of this machine: the same data gives the same card.
-        command = f"robomme-interference publish SPLIT --repo-id {self.config.repo_id}"
+        command = f"robomme-interference publish BUFFER_SET --repo-id {self.config.repo_id}"
 
         def card(version: Version) -> dict[str, bytes]:
             license = self.config.license
@@ -134,16 +134,16 @@ class SplitContent:
         return RepoContent(repo_id, first, files, parts, card, IDENTITY_PATH, lerobot)
 
 
-def plan_split(content: SplitContent, publisher: Publisher) -> list[RepoPlan]:
-    """Return what is to be done: the demonstrations, unless they are published, then the split."""
+def plan_buffer_set(content: BufferSetContent, publisher: Publisher) -> list[RepoPlan]:
+    """Return what is to be done: the demonstrations, unless they are published, then the buffer set."""
     if content.base is not None:
         return [publisher.plan(content.units(content.base))]
     first = publisher.plan(content.demonstrations, follows=True)
     return [first, publisher.plan(content.units(_location(first)))]
 
 
-def publish_split(
-    content: SplitContent, publisher: Publisher, plans: Sequence[RepoPlan]
+def publish_buffer_set(
+    content: BufferSetContent, publisher: Publisher, plans: Sequence[RepoPlan]
 ) -> list[RepoPlan]:
     """Do what was planned; return the plans with their commits."""
     *first, last = plans
@@ -154,12 +154,12 @@ def publish_split(
 
 
 def _location(plan: RepoPlan) -> str:
-    """Return what a split names of its demonstrations: it stays when only their card changes."""
+    """Return what a buffer set names of its demonstrations: it stays when only their card changes."""
     return f"{plan.repository.repo_id}@{plan.same or plan.published or _UNKNOWN}"
 
 
 def with_locations(header: ManifestHeader, base: str | None) -> ManifestHeader:
-    """Return a header that says where the datasets of a published split lie."""
+    """Return a header that says where the datasets of a published buffer set lie."""
     places = {DEMONSTRATIONS: base, DISTRACTORS: "."}
     datasets = {
         name: replace(one, place=places.get(name, one.place))
@@ -204,20 +204,20 @@ def parts_of_buffers(manifests: Iterable[BufferManifest]) -> dict[str, str]:
     return parts
 
 
-def has_questions(split: Split) -> bool:
-    """Tell whether a split has questions about the past."""
+def has_questions(buffer_set: BufferSet) -> bool:
+    """Tell whether a buffer set has questions about the past."""
     with suppress(MissingFileError):
-        return split.files.path(QUESTIONS_PATH).is_file()
+        return buffer_set.files.path(QUESTIONS_PATH).is_file()
     return False
 
 
-def parts_of_questions(split: Split) -> dict[str, str]:
-    """Return a digest of each question with its picture; of a split without questions, none."""
-    if not has_questions(split):
+def parts_of_questions(buffer_set: BufferSet) -> dict[str, str]:
+    """Return a digest of each question with its picture; of a buffer set without questions, none."""
+    if not has_questions(buffer_set):
         return {}
     return {
         f"question {one.episode_id}": digest(
             to_dict(one) | {"picture": sha256(one.picture).hexdigest()}
         )
-        for one in read_questions(split).values()
+        for one in read_questions(buffer_set).values()
     }

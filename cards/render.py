@@ -51,7 +51,7 @@ def card_files(facts: Facts, about: Publication) -> dict[str, bytes]:
     """Return a card: its files by their path in the repository.
 
     Args:
-        facts: What there is to say, such as `split_facts(split)`.
+        facts: What there is to say, such as `buffer_set_facts(buffer set)`.
         about: As what it is published; where `base` is not given, the data names it.
     """
     about = about.made_for(facts.base)

@@ -63,7 +63,7 @@ def results_facts(results: Score | Path) -> Facts:
     [(source, run)] = found.rows.sources.items()
     exported = source.parent / RUN_TABLES[0]
     file = exported if run is not None and exported.is_file() else source
-    splits = {*found.rows.names("episode_split")}
+    splits = {*found.rows.names("split")}
     rows = CardTable(
         name="rollouts",
         record=Rollout,
@@ -109,7 +109,7 @@ def results_facts(results: Score | Path) -> Facts:
             "statuses": ", ".join(f"{statuses[one]:,} {one}" for one in FINAL),
             "refused": found.rows.refused,
         },
-        base=starts[-1].settings.get("split") if starts else None,
+        base=starts[-1].settings.get("buffer_set") if starts else None,
         details=_details(run),
         tags=("evaluation-results",),
     )
@@ -152,14 +152,14 @@ def _pictures(found: Score, figures: dict[str, str]) -> dict[str, bytes]:
 
 
 def _provenance(found: Score, run: RunHeader | None, table: CardTable, about: Publication) -> Rows:
-    """Return where the results come from: split, revision, rows and policy."""
-    rows: Rows = [("split", code(run.split))] if run is not None else []
+    """Return where the results come from: buffer set, revision, rows and policy."""
+    rows: Rows = [("buffer_set", code(run.buffer_set))] if run is not None else []
     if about.base:
-        rows.append(("published split", code(about.base)))
+        rows.append(("published buffer set", code(about.base)))
     for simulator, revision in sorted(found.rows.revisions.items()):
-        rows.append((f"revision of the split, {escape(simulator)}", code(revision)))
+        rows.append((f"revision of the buffer set, {escape(simulator)}", code(revision)))
     if found.rows.unpinned:
-        rows.append(("revision of the split", "the rows name none"))
+        rows.append(("revision of the buffer set", "the rows name none"))
     rows.append((f"SHA-256 of `{table.path}`", code(table.sha256)))
     if run is not None:
         policy = run.identity.get("policy")

@@ -82,7 +82,7 @@ def source_details(datasets: Mapping[str, Dataset]) -> dict[str, Any]:
 
 
 def dataset_rows(dataset: Dataset, name: str = "") -> Rows:
-    """Return provenance of a dataset; `name` tells it from the others of a split."""
+    """Return provenance of a dataset; `name` tells it from the others of a buffer set."""
     identity, of = dataset.identity, f" of the {escape(name)}" if name else ""
     digest = sha256_file(dataset.files.path(IDENTITY_PATH))
     return [

@@ -6,7 +6,7 @@ from pathlib import Path
 from . import RunConfig, run_evaluation
 
 if __name__ == "__main__":  # worker processes import the script
-    config = RunConfig(policy="replay", split=Path("demo/split"), out=Path("runs/replay"))
+    config = RunConfig(policy="replay", buffer_set=Path("demo/buffers"), out=Path("runs/replay"))
     print(run_evaluation(config).counts)
 ```
 """

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
@@ -62,8 +62,8 @@ class Ceiling:
     success: float | None
 
 
-def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
-    """Return the ceiling of a memory on a split, by family and condition, and of all families."""
+def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
+    """Return the ceiling of a memory on a buffer set, by family and condition, and of all families."""
     check_memory(config.memory, "ceiling")
     non_default_retrieval(config)
     if config.shift != NO_SHIFT and config.retrieval is None:
@@ -76,19 +76,19 @@ def ceiling(split: Split, config: CeilingConfig) -> list[Ceiling]:
             f"a retrieval step has nothing to retrieve from under {NO_HISTORY}",
             f"Leave {NO_HISTORY} out: the ceiling there is that of the memory without retrieval.",
         )
-    if all(split.query(one).record.evidence is None for one in split.episode_ids):
+    if all(buffer_set.query(one).record.evidence is None for one in buffer_set.episode_ids):
         raise InvalidOptionError(
-            f"it is unknown which frames of {split.location} show the answer",
+            f"it is unknown which frames of {buffer_set.location} show the answer",
             "Build it from a source with evidence: see docs/sources.md.",
         )
-    names = [one.name for one in in_order(config.conditions or split.conditions)]
+    names = [one.name for one in in_order(config.conditions or buffer_set.conditions)]
     found = [
         what_is_left(buffer, config.memory, frames)
         for name in names
-        for buffer in split.buffers(condition=name)
-        if (frames := _given(split, buffer, config)) is not None
+        for buffer in buffer_set.buffers(condition=name)
+        if (frames := _given(buffer_set, buffer, config)) is not None
     ]
-    return [*_cells(found, split.families), *_cells(found, (ALL,))]
+    return [*_cells(found, buffer_set.families), *_cells(found, (ALL,))]
 
 
 def what_is_left(buffer: Buffer, memory: str, frames: Sequence[int]) -> Left:
@@ -119,7 +119,7 @@ def chance(query: Query, known: dict[int, str]) -> float | None:
     return (right in left) / len(left)
 
 
-def _given(split: Split, buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
+def _given(buffer_set: BufferSet, buffer: Buffer, config: CeilingConfig) -> Sequence[int] | None:
     """Return the frames that the memory is given; None where there is nothing to retrieve from."""
     if config.retrieval is None:
         return range(len(buffer))
@@ -128,7 +128,7 @@ def _given(split: Split, buffer: Buffer, config: CeilingConfig) -> Sequence[int]
     name = encoder_name(config.retrieval)
     rule = Rule.parse(config.retrieval_rule, published_threshold(name))
     under, camera = parse_shift(config.shift), config.retrieval_camera
-    seen = live_embedding(split, buffer, under, name, camera)
+    seen = live_embedding(buffer_set, buffer, under, name, camera)
     return choose(measure(buffer, name, camera, seen), rule).frames.tolist()
 
 

@@ -13,14 +13,14 @@ from robomme_interference_data.cli.console import (
     say,
     stoppable,
 )
-from robomme_interference_data.cli.options import AsJson, SplitFolder, with_settings
+from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
 from .run.config import AskConfig, CeilingConfig, RunConfig
 
 
 @with_settings
-def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
+def ceiling(buffer_set: BufferSetFolder, config: CeilingConfig, as_json: AsJson = False) -> None:
     """Tell what a memory keeps of the answers, before anybody has rolled out anything.
 
     The share of the evidence that is kept, and, on tabletop, how often the ideal observer
@@ -28,17 +28,17 @@ def ceiling(split: SplitFolder, config: CeilingConfig, as_json: AsJson = False) 
 
     Examples:
     ```
-    robomme-interference ceiling my-split --memory window
-    robomme-interference ceiling my-split --retrieval thumbnail --conditions k0,k7
-    robomme-interference ceiling my-split --retrieval thumbnail --shift light:2
+    robomme-interference ceiling my-buffers --memory window
+    robomme-interference ceiling my-buffers --retrieval thumbnail --conditions k0,k7
+    robomme-interference ceiling my-buffers --retrieval thumbnail --shift light:2
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.schema.codec import to_dict
 
     from . import ceiling as module
 
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     cells = module.ceiling(opened, config)
     if as_json:
         print_json([to_dict(cell) for cell in cells])
@@ -61,30 +61,30 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
 
     Examples:
     ```
-    robomme-interference evaluate --policy replay:window \
-      --split S --out runs/window
+    robomme-interference evaluate S --policy replay:window \
+      --out runs/window
 
-    robomme-interference evaluate --policy websocket://localhost:8000 \
-      --system perceptual-framesamp-modul --split S --out runs/mine \
+    robomme-interference evaluate S --policy websocket://localhost:8000 \
+      --system perceptual-framesamp-modul --out runs/mine \
       --policy-option checkpoint=mme_vla_suite/perceptual-framesamp-modul/79999 \
       --conditions k0,k7 --families MoveCube,RouteStick
 
-    robomme-interference evaluate --policy websocket --workers 2 \
-      --serve 'python serve.py --port {port}' --system mine --split S --out runs/served
+    robomme-interference evaluate S --policy websocket --workers 2 \
+      --serve 'python serve.py --port {port}' --system mine --out runs/served
 
-    robomme-interference evaluate --policy lerobot:me/act@v1 \
-      --system act-v1 --policy-option device=cpu --split S --out runs/act
+    robomme-interference evaluate S --policy lerobot:me/act@v1 \
+      --system act-v1 --policy-option device=cpu --out runs/act
 
-    robomme-interference evaluate --policy guess --conditions no-history \
-      --workers 2 --split S --out runs/guess
+    robomme-interference evaluate S --policy guess --conditions no-history \
+      --workers 2 --out runs/guess
 
-    robomme-interference evaluate --policy replay --shift light:2 --split S --out runs/light
+    robomme-interference evaluate S --policy replay --shift light:2 --out runs/light
 
-    robomme-interference evaluate --policy oracle --episodes 0-4 --videos \
-      --split S --out runs/oracle
+    robomme-interference evaluate S --policy oracle --episodes 0-4 --videos \
+      --out runs/oracle
 
-    robomme-interference evaluate --policy replay --shard 2/8 \
-      --split S --out runs/shard-2
+    robomme-interference evaluate S --policy replay --shard 2/8 \
+      --out runs/shard-2
     ```
     """
     _run(config, "Finished rollouts", "rollouts", as_json=as_json)
@@ -97,17 +97,17 @@ def ask(config: AskConfig, as_json: AsJson = False) -> None:
     Of each query episode: the goal, the first live view with the possible answers marked, and the
     frames of the buffer that are kept. Right or wrong measures whether the past can be read out of
     memory. Rows are those of rollouts, and are scored alike; what was asked and answered is in
-    RUN/answers. Make the questions first: robomme-interference build questions SPLIT.
+    RUN/answers. Make the questions first: robomme-interference build questions BUFFER_SET.
 
     Examples:
     ```
-    robomme-interference ask --model recall --split S --out runs/recall --conditions k0,k7
+    robomme-interference ask S --model recall --out runs/recall --conditions k0,k7
 
-    robomme-interference ask --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct \
-      --system qwen3-vl-4b --split S --out runs/qwen --frames 32 --sampling framesamp
+    robomme-interference ask S --model openai:http://localhost:8000/v1#Qwen/Qwen3-VL-4B-Instruct \
+      --system qwen3-vl-4b --out runs/qwen --frames 32 --sampling framesamp
 
-    robomme-interference ask --model transformers:my/model --control blank \
-      --system mine-blank --split S --out runs/blank
+    robomme-interference ask S --model transformers:my/model --control blank \
+      --system mine-blank --out runs/blank
     ```
     """
     _run(config, "Answers", "questions", as_json=as_json)

@@ -3,7 +3,7 @@
 The released rule: midway between the 99th percentile of the cosines across true cuts and the 1st
 percentile of the lowest cosine inside each session. Buffers share their sessions; each stored span
 counts once, and each cut between the same two (ours). The rule looks at true sessions, so a
-threshold that is fitted on a split must not be graded on the same split without saying so;
+threshold that is fitted on a buffer set must not be graded on the same buffer set without saying so;
 `held_out` grades each family with a threshold to which no frame of it contributed.
 """
 
@@ -44,7 +44,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the released rule finds in a split.
+    """What the released rule finds in a buffer set.
 
     Attributes:
         rule: The rule that the encoder goes by itself.
@@ -83,7 +83,7 @@ class Calibration:
             f"percentile of the lowest cosine inside {len(self.lowest)} sessions: "
             f"{self.lowest_percentile:.3f}; {gap}\n"
             "Each stored span counts once, and each cut between the same two. Fitted and tried on "
-            "the same split; only the families left out below are unseen."
+            "the same buffer set; only the families left out below are unseen."
         )
         parts = [title, said]
         if self.held_out:
@@ -113,7 +113,7 @@ def calibrate(
     """Fit a threshold, refit it without each family, and try others.
 
     Args:
-        measured: All buffers of a split that hold frames of the lesson; one or more.
+        measured: All buffers of a buffer set that hold frames of the lesson; one or more.
         rule: The rule that the encoder goes by itself.
         thresholds: What to try, ascending.
     """
@@ -165,7 +165,7 @@ def _fit(
         missing = "cut between sessions" if not cuts else "session of two frames or more"
         raise InvalidOptionError(
             f"{len(kept)} buffers without any {missing}: nothing to fit a threshold to",
-            "Take a split with conditions such as k3, and four families or more to leave one out.",
+            "Take a buffer set with conditions such as k3, and four families or more to leave one out.",
         )
     high, low = float(np.percentile(cuts, 99)), float(np.percentile(lowest, 1))
     return round((high + low) / 2, _DIGITS), round(high, _DIGITS), round(low, _DIGITS)

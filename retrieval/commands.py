@@ -10,13 +10,12 @@ import typer
 from robomme_interference_data.cli.console import check_output, echo, print_json, say, stoppable
 from robomme_interference_data.cli.options import (
     AsJson,
+    BufferSetFolder,
     ConditionName,
     Conditions,
     Families,
     Picture,
     QueryName,
-    SplitFolder,
-    SplitOption,
     with_settings,
 )
 from robomme_interference_data.constants import IDENTITY_PATH, MANIFEST_PATH
@@ -39,7 +38,9 @@ Camera = Annotated[str, typer.Option(help="Camera whose frames are compared.")]
 
 @with_settings
 def index(
-    split: Annotated[Path, typer.Argument(help="Folder of a split, or of one of its datasets.")],
+    buffer_set: Annotated[
+        Path, typer.Argument(help="Folder of a buffer set, or of one of its datasets.")
+    ],
     encoder: EncoderName = "thumbnail",
     camera: Camera = "front",
     device: Annotated[
@@ -60,30 +61,30 @@ def index(
     """Embed every stored frame once, and keep the embeddings beside the data.
 
     Goes on where an interrupted run stopped. An index that is there and right is kept, even if
-    another device computed it. Where datasets of the split lie on the Hub, it looks whether they
+    another device computed it. Where datasets of the buffer set lie on the Hub, it looks whether they
     have embeddings there.
 
     Examples:
     ```
-    robomme-interference index my-split
-    robomme-interference index my-split --encoder siglip --device cuda
+    robomme-interference index my-buffers
+    robomme-interference index my-buffers --encoder siglip --device cuda
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.runtime.progress import WorkProgress
     from robomme_interference_data.schema.codec import to_dict
 
     from .encoders import make_encoder
     from .index import build_index, look_on_hub
 
-    places = [split / IDENTITY_PATH, *sorted(split.glob(f"*/{IDENTITY_PATH}"))]
+    places = [buffer_set / IDENTITY_PATH, *sorted(buffer_set.glob(f"*/{IDENTITY_PATH}"))]
     roots = [path.parent.parent for path in places if path.is_file()]
     if not roots:
         raise MissingFileError(
-            f"{split} is neither a split nor a dataset of this package",
-            f"Make one: robomme-interference build all --source KIND:PATH --out {split}",
+            f"{buffer_set} is neither a buffer set nor a dataset of this package",
+            f"Make one: robomme-interference build all {buffer_set} --source KIND:PATH",
         )
-    planned = load_split(split) if (split / MANIFEST_PATH).is_file() else None
+    planned = load_buffer_set(buffer_set) if (buffer_set / MANIFEST_PATH).is_file() else None
     made = make_encoder(encoder, device=device, batch=batch)
     with stoppable("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(
@@ -112,9 +113,9 @@ def index(
 
 
 def retrieve(
+    buffer_set: BufferSetFolder,
     episode: QueryName,
     condition: ConditionName,
-    split: SplitOption = Path(),
     encoder: EncoderName = "thumbnail",
     rule: Annotated[str, typer.Option(help="RULE, as for retrieval-score.")] = "max",
     camera: Camera = "front",
@@ -128,12 +129,12 @@ def retrieve(
 
     Examples:
     ```
-    robomme-interference retrieve MoveCube/test/0 k7 --split my-split --out why.png
-    robomme-interference retrieve MoveCube/test/0 k7 --split my-split --rule mean/0.9
-    robomme-interference retrieve MoveCube/test/0 k7 --split my-split --rule joined --shift light:2
+    robomme-interference retrieve my-buffers MoveCube/test/0 k7 --out why.png
+    robomme-interference retrieve my-buffers MoveCube/test/0 k7 --rule mean/0.9
+    robomme-interference retrieve my-buffers MoveCube/test/0 k7 --rule joined --shift light:2
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.data.views import live_embedding, live_frame
     from robomme_interference_data.schema.codec import to_dict
 
@@ -142,7 +143,7 @@ def retrieve(
     check_output(out)
     name = encoders.encoder_name(encoder)
     parsed = select.Rule.parse(rule, encoders.published_threshold(name))
-    under, opened = parse_shift(shift), load_split(split)
+    under, opened = parse_shift(shift), load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
     query = live_embedding(opened, buffer, under, name, camera)
     measured = select.measure(buffer, name, camera, query)
@@ -159,7 +160,7 @@ def retrieve(
 
 
 def retrieval_score(
-    split: SplitFolder,
+    buffer_set: BufferSetFolder,
     encoder: EncoderName = "thumbnail",
     rules: Annotated[
         list[str],
@@ -180,13 +181,13 @@ def retrieval_score(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Grade retrieval on every buffer of a split that holds a lesson, without a simulator.
+    """Grade retrieval on every buffer of a buffer set that holds a lesson, without a simulator.
 
     Examples:
     ```
-    robomme-interference retrieval-score my-split
-    robomme-interference retrieval-score my-split --rules all --out my-score
-    robomme-interference retrieval-score my-split --shift light:2 --conditions k7
+    robomme-interference retrieval-score my-buffers
+    robomme-interference retrieval-score my-buffers --rules all --out my-score
+    robomme-interference retrieval-score my-buffers --shift light:2 --conditions k7
     ```
     """
     from robomme_interference_data.schema.codec import to_dict
@@ -198,10 +199,10 @@ def retrieval_score(
     check_output(out)
     name = encoders.encoder_name(encoder)
     wanted = select.parse_rules(rules, encoders.published_threshold(name))
-    about, measured = _measured(split, name, camera, shift, families, conditions, as_json)
+    about, measured = _measured(buffer_set, name, camera, shift, families, conditions, as_json)
     grades = [grade.grade(one, rule) for rule in wanted for one in measured]
     cells = list(grade.cells(grades))
-    title = f"Retrieval on {about['split']}, encoder {name}, camera {camera}"
+    title = f"Retrieval on {about['buffer_set']}, encoder {name}, camera {camera}"
     title += "" if shift == NO_SHIFT else f", shift {shift}"
     if len(wanted) == 1:
         title += f", rule {wanted[0]}"
@@ -218,7 +219,7 @@ def retrieval_score(
 
 
 def calibrate(
-    split: SplitFolder,
+    buffer_set: BufferSetFolder,
     encoder: EncoderName = "thumbnail",
     sweep: Annotated[
         tuple[float, float],
@@ -237,8 +238,8 @@ def calibrate(
 
     Examples:
     ```
-    robomme-interference calibrate my-split
-    robomme-interference calibrate my-split --sweep 0.30 0.99 --out thresholds.png
+    robomme-interference calibrate my-buffers
+    robomme-interference calibrate my-buffers --sweep 0.30 0.99 --out thresholds.png
     ```
     """
     from robomme_interference_data.schema.codec import to_dict
@@ -249,10 +250,10 @@ def calibrate(
     check_output(out)
     name = encoders.encoder_name(encoder)
     thresholds = fitting.sweep_steps(*sweep)
-    about, measured = _measured(split, name, camera, NO_SHIFT, families, conditions, as_json)
+    about, measured = _measured(buffer_set, name, camera, NO_SHIFT, families, conditions, as_json)
     rule = select.Rule.parse("max", encoders.published_threshold(name))
     found = fitting.calibrate(measured, rule, thresholds)
-    title = f"Threshold of {name}, camera {camera}, on {about['split']}"
+    title = f"Threshold of {name}, camera {camera}, on {about['buffer_set']}"
     if out is not None:
         charts.draw_calibration(found, title, out)
         say(f"{out} written")
@@ -263,7 +264,7 @@ def calibrate(
 
 
 def _measured(
-    split: Path,
+    buffer_set: Path,
     encoder: str,
     camera: str,
     shift: str,
@@ -272,13 +273,13 @@ def _measured(
     quiet: bool,
 ) -> tuple[dict[str, Any], list["Similarities"]]:
     """Measure all wanted buffers that hold frames of the lesson; tell what they are of."""
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.data.views import live_embedding
     from robomme_interference_data.runtime.progress import WorkProgress
 
     from .select import measure
 
-    under, opened = parse_shift(shift), load_split(split)
+    under, opened = parse_shift(shift), load_buffer_set(buffer_set)
     wanted: dict[str, Any] = {"family": families, "condition": conditions}
     total = sum(1 for _ in opened.manifests(**wanted))
     measured = []
@@ -292,11 +293,11 @@ def _measured(
     left_out = total - len(measured)
     if not measured:
         raise InvalidOptionError(
-            f"none of the {left_out} buffers of {split} holds a lesson: there is nothing to grade",
+            f"none of the {left_out} buffers of {buffer_set} holds a lesson: there is nothing to grade",
             command=opened.planning("k0", "k3"),
         )
     if left_out and not quiet:
         say(f"{left_out} of {total} buffers hold no lesson and are left out")
-    about = {"split": opened.name, "revision": opened.revision, "encoder": encoder}
+    about = {"buffer_set": opened.name, "revision": opened.revision, "encoder": encoder}
     about |= {"camera": camera, "shift": shift}
     return about | {"buffers": len(measured), "left_out": left_out}, measured

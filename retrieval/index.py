@@ -23,7 +23,7 @@ from robomme_interference_data.constants import (
     FORMAT_VERSION,
     INDEX_HEADER,
 )
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import (
@@ -124,16 +124,16 @@ def build_index(
         return reports
 
 
-def look_on_hub(split: Split, encoder: Encoder, camera: str = "front") -> Iterator[str]:
-    """Say of each dataset of a split that lies on the Hub whether retrieval finds embeddings there.
+def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str = "front") -> Iterator[str]:
+    """Say of each dataset of a buffer set that lies on the Hub whether retrieval finds embeddings there.
 
     Args:
-        split: The split.
+        buffer_set: The buffer set.
         encoder: What embedded its other datasets.
         camera: Camera, with or without `observation.images.`.
     """
-    for name, recorded in split.header.datasets.items():
-        files = split.place(name)
+    for name, recorded in buffer_set.header.datasets.items():
+        files = buffer_set.place(name)
         if not isinstance(files, HubFiles):
             continue
         try:
@@ -147,7 +147,7 @@ def look_on_hub(split: Split, encoder: Encoder, camera: str = "front") -> Iterat
                 f"retrieval will not find the {name}: {error.message}\n"
                 "Ask their publisher for embeddings, or fetch them and embed their frames too:\n"
                 f"  hf download {files.repo_id} --repo-type dataset --revision {files.commit} "
-                f"--local-dir {split.location}/{name}"
+                f"--local-dir {buffer_set.location}/{name}"
             )
         else:
             yield f"{files.describe()} has embeddings by the same encoder: retrieval finds them"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.data.buffer import Buffer
-from robomme_interference_data.data.buffer_set_index import SplitIndex
+from robomme_interference_data.data.buffer_set_index import BufferSetIndex
 from robomme_interference_data.data.embeddings import index_folder
 from robomme_interference_data.errors import InvalidOptionError
 
@@ -53,10 +53,10 @@ class Selector:
     def identity(self, buffer: Buffer) -> dict[str, Any]:
         """Return what its choices depend on besides the buffers, as plain values.
 
-        Two selectors of one identity choose alike from the same split.
+        Two selectors of one identity choose alike from the same buffer set.
 
         Args:
-            buffer: Any buffer of the split whose index it looks up.
+            buffer: Any buffer of the buffer set whose index it looks up.
 
         Returns:
             `encoder`, its name; `fingerprint`, the SHA-256 over all that determines the features;
@@ -90,8 +90,8 @@ class Selector:
         query = index.embed(features)[0]
         return choose(measure(buffer, self._encoder.name, self.camera, query), self.rule).frames
 
-    def _index(self, buffer: Buffer) -> SplitIndex:
-        """Return the index of the split, made with this very encoder."""
+    def _index(self, buffer: Buffer) -> BufferSetIndex:
+        """Return the index of the buffer set, made with this very encoder."""
         index = buffer.index(self._encoder.name, self.camera)
         check_encoder(index.encoder, self._encoder, index.remedy)
         return index

@@ -3,7 +3,7 @@
 ```python
 from robomme_interference_data import load_buffer
 
-buffer = load_buffer("VideoRepick/test/7", "k3", split="my-split")
+buffer = load_buffer("VideoRepick/test/7", "k3", buffer_set="my-buffers")
 buffer.frames("front")  # (T, H, W, 3) uint8
 ```
 """
@@ -14,9 +14,9 @@ from .lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .data.buffer import Buffer, Chunk
-    from .data.buffer_set import Split
+    from .data.buffer_set import BufferSet
     from .data.dataset import Dataset
-    from .data.loading import load_buffer, load_split
+    from .data.loading import load_buffer, load_buffer_set
     from .data.query import Query
     from .errors import InterferenceError
     from .ids import EpisodeId
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 __all__ = [
     # load
     "load_buffer",
-    "load_split",
-    "Split",
+    "load_buffer_set",
+    "BufferSet",
     "Buffer",
     "Chunk",
     "Session",
@@ -51,8 +51,8 @@ __all__ = [
 __getattr__ = lazy_exports(
     __name__,
     {
-        ".data.loading": "load_buffer load_split",
-        ".data.buffer_set": "Split",
+        ".data.loading": "load_buffer load_buffer_set",
+        ".data.buffer_set": "BufferSet",
         ".data.buffer": "Buffer Chunk",
         ".data.query": "Query",
         ".data.dataset": "Dataset",

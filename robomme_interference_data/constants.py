@@ -1,4 +1,4 @@
-"""Numbers and names fixed by the protocol, and every path inside a dataset or split."""
+"""Numbers and names fixed by the protocol, and every path inside a dataset or buffer set."""
 
 from typing import NamedTuple
 
@@ -84,7 +84,7 @@ INDEX_HEADER = "index.json"
 PAPER_ENCODER = "google/siglip-so400m-patch14-384"
 """Model that embeds frames in the paper; its index is `index/siglip`."""
 
-# --- paths inside a split ----------------------------------------------------------------------
+# --- paths inside a buffer set ----------------------------------------------------------------------
 
 DEMONSTRATIONS = "demonstrations"
 DISTRACTORS = "distractors"
@@ -119,12 +119,12 @@ UNITS = {
 """Of what the units of a dataset are."""
 
 OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED)
-"""Datasets that a split may lack; on the Hub they are folders of its repository."""
+"""Datasets that a buffer set may lack; on the Hub they are folders of its repository."""
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)
-"""Names of a split's datasets, which are their kinds."""
+"""Names of a buffer set's datasets, which are their kinds."""
 QUESTIONS_PATH = "questions.parquet"
-"""Questions about the past, which a split may have."""
+"""Questions about the past, which a buffer set may have."""
 PARTS_PATH = "parts.json"
 """Digests of what a published version holds, by which the next one is numbered."""
 

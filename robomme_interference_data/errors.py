@@ -29,7 +29,7 @@ class InterferenceError(Exception):
         message: What was given and what was expected.
         hint: What to do next, or None.
         command: Command of this package that helps, without the program's name, such as
-            `verify my-split`; only the command line shows it.
+            `verify my-buffers`; only the command line shows it.
     """
 
     def __init__(self, message: str, hint: str | None = None, command: str | None = None):
@@ -112,7 +112,7 @@ class MissingExtraError(InterferenceError, ImportError):
 
 
 class MissingFileError(InterferenceError, FileNotFoundError):
-    """A file that a dataset or split must have is not there."""
+    """A file that a dataset or buffer set must have is not there."""
 
 
 class HubError(InterferenceError, OSError):

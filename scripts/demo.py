@@ -14,25 +14,25 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = Path(sys.executable).parent / "robomme-interference"
 
-ROLLOUTS = "--split demo/split --conditions k0,k7"
+ROLLOUTS = "--conditions k0,k7"
 STEPS = {
     "Play three test episodes and nine others, and plan buffers of them": (
-        "build all --source tabletop --split test --episodes 0 "
+        "build all demo/buffers --source tabletop --split test --episodes 0 "
         "--families MoveCube,PatternLock,RouteStick --unit-episodes 2 --cameras front "
-        "--conditions no-history,k0,k3,k7 --out demo/split"
+        "--conditions no-history,k0,k3,k7"
     ),
     "Draw a buffer: the lesson, and seven sessions of other tasks behind it": (
-        "show RouteStick/test/0 k7 --split demo/split --out demo/buffer.png"
+        "show demo/buffers RouteStick/test/0 k7 --out demo/buffer.png"
     ),
-    "Embed every frame, for retrieval": "index demo/split",
+    "Embed every frame, for retrieval": "index demo/buffers",
     "Explain which part of that buffer is retrieved": (
-        "retrieve RouteStick/test/0 k7 --split demo/split --out demo/retrieval.png"
+        "retrieve demo/buffers RouteStick/test/0 k7 --out demo/retrieval.png"
     ),
     "Roll out a policy that remembers frames sampled evenly from the whole buffer": (
-        f"evaluate --policy replay:framesamp {ROLLOUTS} --out demo/runs/framesamp"
+        f"evaluate demo/buffers --policy replay:framesamp {ROLLOUTS} --out demo/runs/framesamp"
     ),
     "The same policy behind a retrieval step": (
-        f"evaluate --policy replay:framesamp --retrieval thumbnail {ROLLOUTS} "
+        f"evaluate demo/buffers --policy replay:framesamp --retrieval thumbnail {ROLLOUTS} "
         "--out demo/runs/retrieval"
     ),
     "Compare the two": (
@@ -45,13 +45,13 @@ RESULTS = {
     "demo/buffer.png": "what a policy is given before the episode: the lesson, then seven others",
     "demo/retrieval.png": "which of these frames the retrieval step passes on, and why",
     "demo/runs/retrieval/rollouts.jsonl": "one row for each rollout",
-    "demo/split": "the datasets (LeRobot v3) and the buffers planned from them",
+    "demo/buffers": "the datasets (LeRobot v3) and the buffers planned from them",
 }
 
 NEXT = (
-    "robomme-interference verify demo/split",
-    "robomme-interference evaluate --policy guess --split demo/split --out demo/runs/guess",
-    "robomme-interference list demo/split",
+    "robomme-interference verify demo/buffers",
+    "robomme-interference evaluate demo/buffers --policy guess --out demo/runs/guess",
+    "robomme-interference list demo/buffers",
 )
 
 

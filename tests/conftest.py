@@ -189,19 +189,19 @@ def robomme_python(bare_python: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_split() -> Path:
-    """The golden split: not to be written to. See `support/splits.py`."""
-    from support.splits import GOLDEN
+def tiny_buffers() -> Path:
+    """The golden buffer set: not to be written to. See `support/splits.py`."""
+    from support.buffer_sets import GOLDEN
 
     return GOLDEN
 
 
 @pytest.fixture
-def own_split(tmp_path: Path) -> Path:
-    """A copy of the golden split, to be damaged."""
-    from support.splits import copy_split
+def own_buffers(tmp_path: Path) -> Path:
+    """A copy of the golden buffer set, to be damaged."""
+    from support.buffer_sets import copy_buffer_set
 
-    return copy_split(tmp_path / "split")
+    return copy_buffer_set(tmp_path / "buffer_set")
 
 
 @pytest.fixture

@@ -225,7 +225,7 @@ class Recall(Privileged):
         if info.evidence is None:
             raise PolicyError(
                 "recall needs to know which frames show the answer, and this is unknown",
-                "Build the split from a source with evidence: see docs/sources.md.",
+                "Build the buffer set from a source with evidence: see docs/sources.md.",
             )
         self._known = known_parts(info.evidence, MEMORIES[self.memory](info.history_frames))
 

@@ -245,6 +245,6 @@ def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
     if wrong:
         raise PolicyError(
             f"the policy {path} does not fit: it {'; it '.join(wrong)}",
-            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a split's demonstrations; "
+            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's demonstrations; "
             "docs/systems.md says how.",
         )

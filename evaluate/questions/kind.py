@@ -40,7 +40,7 @@ class Questions(RunKind[AskConfig]):
         """Check the settings, and ask what answers."""
         config = self.config
         _check_settings(config)
-        self._questions = read_questions(self.split)
+        self._questions = read_questions(self.buffer_set)
         self.metadata, self._images = {"model": config.model}, None
         if config.model not in OWN:
             self.config = config = dataclasses.replace(config, model=pin_model(config.model))
@@ -63,7 +63,7 @@ class Questions(RunKind[AskConfig]):
         config = self.config
         if config.model == "recall":
             for episode in {item.episode for item in items}:
-                if recorded_scene(self.split.query(episode)) is None:
+                if recorded_scene(self.buffer_set.query(episode)) is None:
                     raise InvalidOptionError(
                         f"recall does not know what may have been the answer in {episode}",
                         "Ask a model, or guess.",
@@ -72,7 +72,7 @@ class Questions(RunKind[AskConfig]):
         if self._images is None or (config.retrieval is not None and config.sampling == "full"):
             return
         for item in items:
-            history = self.split.manifest(item.episode, item.condition).history_frames
+            history = self.buffer_set.manifest(item.episode, item.condition).history_frames
             kept = len(MEMORIES[config.sampling](history, config.frames))
             if kept + 1 > self._images:
                 raise InvalidOptionError(

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robomme_interference_data.constants import FRONT
-from robomme_interference_data.data.buffer_set import Split
-from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
 from robomme_interference_data.evaluate.rollout.rollout import retrieval_columns
 from robomme_interference_data.evaluate.run.config import AskConfig
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 
 
 class AskTask:
-    """Asks questions, as an executor's task; split, questions and model are made at the first.
+    """Asks questions, as an executor's task; buffer set, questions and model are made at the first.
 
     What breaks is raised, and the model is made anew for the next question.
     """
 
     def __init__(self, run: Run[AskConfig]):
         self._run = run
-        self._split: Split | None = None
+        self._buffer_set: BufferSet | None = None
         self._questions: dict[EpisodeId, Question] = {}
         self._selector: Selector | None = None
         self._responder: ModelResponder | None = None
@@ -55,10 +55,13 @@ class AskTask:
             raise
 
     def describe(self) -> dict[str, str]:
-        """Return the split's revision, its questions' digest and versions, where it would run."""
-        split = load_split(self._run.config.split)
-        questions = digest_questions(read_questions(split).values())
-        told = {"the split's revision": split.revision, "the questions' digest": questions}
+        """Return the buffer set's revision, its questions' digest and versions, where it would run."""
+        buffer_set = load_buffer_set(self._run.config.buffer_set)
+        questions = digest_questions(read_questions(buffer_set).values())
+        told = {
+            "the buffer set's revision": buffer_set.revision,
+            "the questions' digest": questions,
+        }
         return package_versions(self._run.config) | told
 
     def close(self) -> None:
@@ -69,14 +72,14 @@ class AskTask:
 
     def _ask(self, item: WorkItem, worker: Worker) -> Rollout:
         config, began = self._run.config, time.perf_counter()
-        if self._split is None:
-            self._split = load_split(config.split, cache=config.cache, threads=1)
-            self._questions = read_questions(self._split)
+        if self._buffer_set is None:
+            self._buffer_set = load_buffer_set(config.buffer_set, cache=config.cache, threads=1)
+            self._questions = read_questions(self._buffer_set)
             self._selector = make_selector(config)
         if self._responder is None and config.model not in OWN:
             self._responder = ModelResponder(config)
         buffer, question = (
-            self._split.load(item.episode, item.condition),
+            self._buffer_set.load(item.episode, item.condition),
             self._questions[item.episode],
         )
         given: Sequence[int] = range(len(buffer))

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from robomme_interference_data.constants import DEMONSTRATIONS
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
@@ -71,8 +71,8 @@ def default_system(config: RunConfig) -> str:
     return "-".join(("retrieval", name, *non_default_retrieval(config).values())).replace("/", "-")
 
 
-def check_settings(config: RunConfig, system: str, split: Split, policy: Policy) -> None:
-    """Check the settings against each other, the split and the policy."""
+def check_settings(config: RunConfig, system: str, buffer_set: BufferSet, policy: Policy) -> None:
+    """Check the settings against each other, the buffer set and the policy."""
     find_simulator(config.simulator)
     check_shift(config.simulator, config.shift)
     check_shared(config)
@@ -84,7 +84,7 @@ def check_settings(config: RunConfig, system: str, split: Split, policy: Policy)
         )
     step = [] if config.retrieval is None else [config.retrieval_camera]
     for camera in (*policy.history_cameras, *step):
-        split.datasets[DEMONSTRATIONS].shape(camera)  # refuses one that is not there
+        buffer_set.datasets[DEMONSTRATIONS].shape(camera)  # refuses one that is not there
     _check_name(config, name_system(system))
     _check_subgoals(config, name_system(system))
     if config.videos:
@@ -145,13 +145,13 @@ def _check_subgoals(config: RunConfig, system: System) -> None:
 
 
 def check_plan(
-    config: RunConfig, system: System, split: Split, plan: Plan, items: Sequence[WorkItem]
+    config: RunConfig, system: System, buffer_set: BufferSet, plan: Plan, items: Sequence[WorkItem]
 ) -> None:
     """Check every rollout of a plan."""
     recalls = parse_policy(config.policy).kind == "recall"
     own = ":" in config.simulator  # a simulator of one's own may serve any episodes
     for episode in dict.fromkeys(item.episode for item in items):
-        record = split.query(episode).record
+        record = buffer_set.query(episode).record
         if recalls and record.evidence is None:
             raise InvalidOptionError(
                 f"{config.policy} needs to know which frames show the answer, and of {episode} "
@@ -162,14 +162,14 @@ def check_plan(
         if not own and recorded not in (None, config.simulator):
             raise InvalidOptionError(
                 f"{episode} was recorded on {recorded!r}, the run is on {config.simulator!r}",
-                f'Set simulator="{recorded}", or give a split of {config.simulator}.'
+                f'Set simulator="{recorded}", or give a buffer set of {config.simulator}.'
                 if recorded in SIMULATORS
-                else "No simulator plays the episodes of this split: give one whose demonstrations "
+                else "No simulator plays the episodes of this buffer set: give one whose demonstrations "
                 f"are of {' or '.join(SIMULATORS)}, or a simulator of your own that plays them.",
             )
     if system.position_limit is not None and config.retrieval is None:
         planned, longest = set(items), dict.fromkeys(plan.conditions, 0)
-        for manifest in split.manifests():
+        for manifest in buffer_set.manifests():
             name = manifest.condition
             if WorkItem(name, manifest.episode_id) in planned:
                 longest[name] = max(manifest.history_frames, longest[name])

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import (
     InterferenceError,
     PolicyServerError,
@@ -39,13 +39,13 @@ from .worker import Opening, RolloutTask
 class Rollouts(RunKind[RunConfig]):
     """Rollouts of a policy in a simulator."""
 
-    def __init__(self, config: RunConfig, split: Split):
+    def __init__(self, config: RunConfig, buffer_set: BufferSet):
         policy = served_policy(config.policy, config.serve)
         config = dataclasses.replace(config, policy=policy)
         self.system = config.system or default_system(config)
         # One commit for all workers.
         policy, subgoals = pin_policy(policy), pin_subgoals(config.subgoals)
-        super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), split)
+        super().__init__(dataclasses.replace(config, policy=policy, subgoals=subgoals), buffer_set)
 
     def claim(self, folder: Path) -> AbstractContextManager[None]:
         """Keep other runs from the policy's servers."""
@@ -57,7 +57,7 @@ class Rollouts(RunKind[RunConfig]):
         self._policy, self._of_policy = describe_policy(
             config.policy, config.policy_options, workers=config.workers
         )
-        check_settings(config, self.system, self.split, self._policy)
+        check_settings(config, self.system, self.buffer_set, self._policy)
         self._system = name_system(self.system)
         self.config, self._of_subgoals = describe_subgoals(config, self._system)
         self.metadata = self._of_policy | self._of_subgoals
@@ -71,7 +71,7 @@ class Rollouts(RunKind[RunConfig]):
 
     def check(self, plan: Plan, items: Sequence[WorkItem]) -> None:
         """Check every rollout."""
-        check_plan(self.config, self._system, self.split, plan, items)
+        check_plan(self.config, self._system, self.buffer_set, plan, items)
 
     def task(self, run: Run[RunConfig]) -> RolloutTask:
         """Return what rolls out."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
 from robomme_interference_data.data.buffer import Buffer, Chunk
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RolloutError
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
 from robomme_interference_data.evaluate.run.config import RunConfig
@@ -68,7 +68,7 @@ def run_rollout(
     *,
     simulator: Simulator,
     policy: Policy,
-    split: Split,
+    buffer_set: BufferSet,
     selector: "Selector | None" = None,
     writer: SubgoalWriter | None = None,
     clip: Clip | None = None,
@@ -82,7 +82,7 @@ def run_rollout(
     config, clock, began = run.config, _Clock(), time.perf_counter()
     worker = worker or Worker(0)  # no time limit
     cameras = policy.history_cameras if selector is None else ()  # until it is known which part
-    buffer = split.load(item.episode, item.condition, cameras=cameras)
+    buffer = buffer_set.load(item.episode, item.condition, cameras=cameras)
     given: Sequence[int] = range(len(buffer))
     with ExitStack() as stack:
         history = None

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from robomme_interference_data.constants import CAMERA_PREFIX
-from robomme_interference_data.data.buffer_set import Split
-from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     PolicyServerError,
     ServerKeepaliveError,
@@ -53,7 +53,7 @@ class Opening:
 
 
 class RolloutTask:
-    """Runs rollouts, as an executor's task; simulator, policy and split are made at the first one.
+    """Runs rollouts, as an executor's task; simulator, policy and buffer set are made at the first one.
 
     What breaks is raised, and simulator and policy are made anew for the next rollout: nothing
     that broke is used again. Clips, subgoals and the log of a server that it started are sent.
@@ -65,7 +65,7 @@ class RolloutTask:
         self._policy: Policy | None = None
         self._checked = False  # whether the policy is what the run began with
         self._writer: SubgoalWriter | None = None
-        self._split: Split | None = None
+        self._buffer_set: BufferSet | None = None
         self._logs: dict[str, bytes] = {}
         self._selector: Selector | None = None
 
@@ -129,8 +129,8 @@ class RolloutTask:
 
     def _roll(self, job: Job, worker: Worker, clip: Clip | None) -> Rollout:
         config = self._run.config
-        if self._split is None:
-            self._split = load_split(config.split, cache=config.cache, threads=1)
+        if self._buffer_set is None:
+            self._buffer_set = load_buffer_set(config.buffer_set, cache=config.cache, threads=1)
             self._selector = make_selector(config)
         policy = self._open_policy(worker)
         if not self._checked:
@@ -144,7 +144,7 @@ class RolloutTask:
             job.item,
             simulator=self._open_simulator(policy, worker),
             policy=policy,
-            split=self._split,
+            buffer_set=self._buffer_set,
             selector=self._selector,
             writer=self._writer,
             clip=clip,
@@ -152,11 +152,11 @@ class RolloutTask:
         )
 
     def describe(self) -> dict[str, str]:
-        """Return the split's revision and all versions, where it would run."""
+        """Return the buffer set's revision and all versions, where it would run."""
         config = self._run.config
         versions = simulator_versions(config.simulator, config.robomme_python)
-        revision = load_split(config.split).revision
-        return package_versions(config) | versions | {"the split's revision": revision}
+        revision = load_buffer_set(config.buffer_set).revision
+        return package_versions(config) | versions | {"the buffer set's revision": revision}
 
     def close(self) -> None:
         """Release simulator, policy and what writes subgoals."""

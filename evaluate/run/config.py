@@ -32,7 +32,7 @@ class WorkConfig(WorkersConfig, RetrievalConfig):
     )
     families: tuple[str, ...] = setting((), help="Families; by default all.")
     episodes: str | None = setting(None, help="Numbers, such as 0-49 or 0,3,10-12; default: all.")
-    episode_split: str = setting("test", help="train, val or test.")
+    split: str = setting("test", help="train, val or test.")
     shard: str = setting("1/1", help="Part of the plan to run, such as 2/8; see merge.")
     system: str | None = setting(None, help="Name for the rows; see docs/systems.md.")
     model_seed: int = setting(0, help="Seed for what is drawn at random.")
@@ -53,7 +53,9 @@ class RunConfig(WorkConfig):
         "websocket://HOST:PORT (several with commas), websocket with --serve, "
         "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
     )
-    split: str = setting(help="Folder of the split of buffers.")
+    buffer_set: str = setting(
+        name="-", metavar="BUFFER_SET", help="Folder of the buffer set, or its NAMESPACE/NAME."
+    )
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
     simulator: str = setting("tabletop", help="tabletop, robomme or module:function of your own.")
     shift: str = setting(NO_SHIFT, help=SHIFT_HELP)
@@ -107,7 +109,9 @@ class AskConfig(WorkConfig):
         help="openai:URL#MODEL, transformers:ID or transformers:FOLDER; recall, the ideal "
         "observer, or guess."
     )
-    split: str = setting(help="Folder of the split, with its questions.")
+    buffer_set: str = setting(
+        name="-", metavar="BUFFER_SET", help="Folder of the buffer set, with its questions."
+    )
     out: Path = setting(help="Folder of the run; an earlier run is gone on with.")
     frames: int = setting(
         SAMPLE_FRAMES, help="Frames that are kept, that of now among them.", metavar="N"
@@ -151,8 +155,8 @@ def check_shared(config: WorkConfig) -> None:
             raise InvalidOptionError.expected(
                 name, value, "more than 0", "Leave it out for the default."
             )
-    if config.episode_split not in SPLITS:
-        raise InvalidOptionError.one_of("episode_split", config.episode_split, SPLITS)
+    if config.split not in SPLITS:
+        raise InvalidOptionError.one_of("split", config.split, SPLITS)
     Rule.parse(config.retrieval_rule)
     non_default_retrieval(config)
 

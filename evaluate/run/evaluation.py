@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from robomme_interference_data.data.buffer_set import Split
-from robomme_interference_data.data.loading import load_split
+from robomme_interference_data.data.buffer_set import BufferSet
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import (
     InterferenceError,
     ServerDiedError,
@@ -89,7 +89,7 @@ def run_evaluation(
     Raises:
         UnknownNameError, InvalidOptionError, InvalidIdError: A setting is not what it may be.
         HistoryTooLongError: A buffer exceeds the system's position limit.
-        MissingFileError: The split is not there, or has no questions.
+        MissingFileError: The buffer set is not there, or has no questions.
         RunFolderError: `out` holds another run, or something else.
         PolicyError: The policy cannot be made.
         PolicyServerError: A policy server cannot be reached, or no longer any of them; another run
@@ -101,50 +101,50 @@ def run_evaluation(
         MissingExtraError: A library is not installed.
     """
     end_if_starting()
-    split, folder = load_split(config.split), Path(config.out)
-    kind = _kind(dataclasses.replace(config, split=split.location), split)
+    buffer_set, folder = load_buffer_set(config.buffer_set), Path(config.out)
+    kind = _kind(dataclasses.replace(config, buffer_set=buffer_set.location), buffer_set)
     with kind.claim(folder), ExitStack() as stack:
         kind.prepare()
         config = kind.config
         plan = plan_work(
-            split.episode_ids,
+            buffer_set.episode_ids,
             conditions=config.conditions
-            or tuple(one for one in split.conditions if kind.refusal(one) is None),
+            or tuple(one for one in buffer_set.conditions if kind.refusal(one) is None),
             families=config.families,
             episodes=config.episodes,
-            episode_split=config.episode_split,
+            split=config.split,
             shard=config.shard,
         )
         items = plan.items()
         for condition in plan.conditions:
             if (refusal := kind.refusal(condition)) is not None:
                 raise refusal
-            split.manifest(split.episode_ids[0], condition)  # raises with what there is
+            buffer_set.manifest(buffer_set.episode_ids[0], condition)  # raises with what there is
         kind.check(plan, items)
         existing = read_record(folder)
         todo = [item for item in items if item not in existing or not is_done(existing[item])]
         executor = executor or make_executor(config)
-        run: Run[Any] = Run(config, kind.system, split.name, split.revision)
+        run: Run[Any] = Run(config, kind.system, buffer_set.name, buffer_set.revision)
         session: Session | None = None
         if kind.needs_session(todo):
             session = stack.enter_context(executor.session(kind.task(run)))
             kind.open(session, todo)
         identity = run_identity(kind, plan)
-        with open_log(folder, identity, split.name, resume=not config.no_resume) as log:
+        with open_log(folder, identity, buffer_set.name, resume=not config.no_resume) as log:
             log.begin(invocation(kind, plan, command))
-            # The same split may be in another folder by now: rows keep one label for it.
-            run = dataclasses.replace(run, split=log.header.split)
+            # The same buffer set may be in another folder by now: rows keep one label for it.
+            run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
             return _run_items(run, kind, session, items, log, progress)
 
 
-def _kind(config: RunConfig | AskConfig, split: Split) -> RunKind[Any]:
+def _kind(config: RunConfig | AskConfig, buffer_set: BufferSet) -> RunKind[Any]:
     if isinstance(config, AskConfig):
         from robomme_interference_data.evaluate.questions.kind import Questions
 
-        return Questions(config, split)
+        return Questions(config, buffer_set)
     from robomme_interference_data.evaluate.rollout.kind import Rollouts
 
-    return Rollouts(config, split)
+    return Rollouts(config, buffer_set)
 
 
 def _run_items(
@@ -172,7 +172,7 @@ def _run_items(
             stack.callback(outcomes.close)
         try:
             for outcome in outcomes:
-                row, trace = _row(run, outcome, kind.split, log)
+                row, trace = _row(run, outcome, kind.buffer_set, log)
                 log.append(row, trace)
                 if progress is not None:
                     progress.row(row, outcome.node)
@@ -198,7 +198,9 @@ def _run_items(
     return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
 
 
-def _row(run: Run[Any], outcome: Outcome, split: Split, log: RunLog) -> tuple[Rollout, str | None]:
+def _row(
+    run: Run[Any], outcome: Outcome, buffer_set: BufferSet, log: RunLog
+) -> tuple[Rollout, str | None]:
     """Write the files of an outcome; return its row, and what broke, with its traceback, or None.
 
     A row that could not be read again, such as with a number of 100 bits from somebody's
@@ -208,13 +210,13 @@ def _row(run: Run[Any], outcome: Outcome, split: Split, log: RunLog) -> tuple[Ro
     error, trace = outcome.error, outcome.trace
     if error is None:
         row, trace = outcome.value
-        row = dataclasses.replace(row, split=run.split)
+        row = dataclasses.replace(row, buffer_set=run.buffer_set)
         try:
             row_of(row_line(row))
         except ValueError as refused:
             error = RuntimeError(f"its row cannot be stored: {first_line(refused)}")
     if error is not None:
-        query = split.query(item.episode)
+        query = buffer_set.query(item.episode)
         row = run.row(
             item,
             seed=query.seed,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.evaluate.policies.identity import plain
 from robomme_interference_data.simulators.registry import simulator_class
 
@@ -29,11 +29,11 @@ def run_identity(kind: RunKind[Any], plan: Plan) -> dict[str, Any]:
     return {
         "system": kind.system,
         "simulator": config.simulator,
-        "revision": kind.split.revision,
-        "episode_split": config.episode_split,
+        "revision": kind.buffer_set.revision,
+        "split": config.split,
         "shift": config.shift,
         "model_seed": config.model_seed,
-        "retrieval_index": _retrieval_index(config, kind.split, plan),
+        "retrieval_index": _retrieval_index(config, kind.buffer_set, plan),
         "protocol_version": PROTOCOL_VERSION,
         **kind.identity(plan),
     }
@@ -48,7 +48,7 @@ def make_selector(config: RetrievalConfig) -> "Selector | None":
     return Selector(config.retrieval, rule=config.retrieval_rule, camera=config.retrieval_camera)
 
 
-def _retrieval_index(config: RetrievalConfig, split: Split, plan: Plan) -> Any:
+def _retrieval_index(config: RetrievalConfig, buffer_set: BufferSet, plan: Plan) -> Any:
     """Return what the retrieval step's choices depend on; None without one.
 
     Looks for the index of every dataset that a planned condition needs.
@@ -58,7 +58,7 @@ def _retrieval_index(config: RetrievalConfig, split: Split, plan: Plan) -> Any:
         return None
     found = None  # the same for all: the buffers of a condition need the same datasets
     for name in plan.conditions:
-        found = selector.identity(next(split.buffers(condition=name)))
+        found = selector.identity(next(buffer_set.buffers(condition=name)))
     return plain(found)
 
 

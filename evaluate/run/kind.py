@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.constants import PROTOCOL_VERSION
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.runtime.executor import Session, Task
 from robomme_interference_data.schema.rollouts import Rollout
@@ -37,13 +37,13 @@ class Run[C: RunConfig | AskConfig]:
     Attributes:
         config: Its settings; the system is named, and a model on the Hub has its commit.
         system: The label under which its results are reported.
-        split: Label of the split in its rows.
-        revision: `Split.revision`.
+        buffer_set: Label of the buffer set in its rows.
+        revision: `BufferSet.revision`.
     """
 
     config: C
     system: str
-    split: str
+    buffer_set: str
     revision: str
 
     def row(self, item: WorkItem, **values: Any) -> Rollout:
@@ -51,11 +51,11 @@ class Run[C: RunConfig | AskConfig]:
         return Rollout(
             system=self.system,
             simulator=self.config.simulator,
-            split=self.split,
+            buffer_set=self.buffer_set,
             revision=self.revision,
             family=item.episode.family,
             condition=item.condition,
-            episode_split=item.episode.split,
+            split=item.episode.split,
             episode=item.episode.index,
             shift=self.config.shift,
             model_seed=self.config.model_seed,
@@ -74,7 +74,7 @@ class RunKind[C: RunConfig | AskConfig](ABC):
 
     Attributes:
         config: The settings; `prepare` names the commits of models in them.
-        split: The split.
+        buffer_set: The buffer set.
         system: The label under which the rows are reported; set by `prepare`.
         metadata: What the policy, or the model, reports of itself; set by `prepare`.
         versions: Versions of the simulator; set by `prepare`.
@@ -84,8 +84,8 @@ class RunKind[C: RunConfig | AskConfig](ABC):
     metadata: dict[str, Any]
     versions: Mapping[str, str]
 
-    def __init__(self, config: C, split: Split):
-        self.config, self.split = config, split
+    def __init__(self, config: C, buffer_set: BufferSet):
+        self.config, self.buffer_set = config, buffer_set
         self.metadata, self.versions = {}, {}
 
     def claim(self, folder: Path) -> AbstractContextManager[None]:

@@ -92,7 +92,7 @@ class RunHeader:
 
     Attributes:
         identity: What can change a result: it makes the run the one that it is.
-        split: Label of the split in all rows.
+        buffer_set: Label of the buffer set in all rows.
         plans: What was asked for, each plan once.
         status: `running`; or `complete` or, if something is missing or broke, `incomplete`.
         planned: Rollouts that were asked for by all plans together.
@@ -102,7 +102,7 @@ class RunHeader:
 
     format_version: int
     identity: dict[str, Any]
-    split: str
+    buffer_set: str
     plans: tuple[Plan, ...] = ()
     status: str = "running"
     planned: int = 0
@@ -187,7 +187,7 @@ class RunLog:
 
 @contextmanager
 def open_log(
-    folder: Path, identity: Mapping[str, Any], split: str, *, resume: bool = True
+    folder: Path, identity: Mapping[str, Any], buffer_set: str, *, resume: bool = True
 ) -> Iterator[RunLog]:
     """Open or make the folder of a run, and hold it; a run that is there keeps its label."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -205,7 +205,7 @@ def open_log(
     with file_lock(folder / ".lock", busy):
         if not there:
             (folder / RUN_RECORD).touch()
-            header = RunHeader(FORMAT_VERSION, dict(identity), split)
+            header = RunHeader(FORMAT_VERSION, dict(identity), buffer_set)
             write_json(folder / RUN_HEADER, to_dict(header))
         elif not resume:
             raise RunFolderError(

@@ -48,8 +48,8 @@ class Merged:
 def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     """Join runs of the same settings into one, which scores, and goes on, like any other.
 
-    A finished row stands before an error. Videos and `errors.log` come along. The split's label
-    in rows is the first run's; by its revision it is the same split in all.
+    A finished row stands before an error. Videos and `errors.log` come along. The buffer set's label
+    in rows is the first run's; by its revision it is the same buffer set in all.
 
     Raises:
         RunFolderError: A folder holds no run, or another one than the first; `out` is taken.
@@ -66,7 +66,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     duplicates: dict[WorkItem, bool] = {}
     for folder, (_, rows) in zip(folders, runs, strict=True):
         for item, own in rows.items():
-            row = replace(own, split=first.split)
+            row = replace(own, buffer_set=first.buffer_set)
             before = found.get(item)
             if before is None or (is_done(row) and not is_done(before[0])):
                 found[item] = row, folder
@@ -86,7 +86,7 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
     # Nothing that a link stands for comes along.
     taken = {name: LocalFiles(at).path(name) for at, name in videos if (at / name).exists()}
     logs = [LocalFiles(at).path(ERRORS_LOG) for at in folders if (at / ERRORS_LOG).exists()]
-    with open_log(target, first.identity, first.split) as log:
+    with open_log(target, first.identity, first.buffer_set) as log:
         log.write_all(row for row, _ in found.values())
         for name, path in taken.items():
             (target / name).parent.mkdir(parents=True, exist_ok=True)

@@ -104,31 +104,30 @@ def plan_work(
     conditions: Iterable[str],
     families: Sequence[str] = (),
     episodes: str | None = None,
-    episode_split: str = "test",
+    split: str = "test",
     shard: str = "1/1",
 ) -> Plan:
-    """Return the plan of a run over the query episodes of a split: `known`; see `RunConfig`."""
+    """Return the plan of a run over the query episodes of a buffer set: `known`; see `RunConfig`."""
     there = sorted(known)
     here: dict[str, list[int]] = {episode.family: [] for episode in there}
     for episode in there:
-        if episode.split == episode_split:
+        if episode.split == split:
             here[episode.family].append(episode.index)
     for family in families:
         if family not in here:
-            raise UnknownNameError.among("family", family, "the split", here)
+            raise UnknownNameError.among("family", family, "the buffer set", here)
     asked = None if episodes is None else parse_numbers(episodes)
     chosen = {}
     for family in [name for name in here if not families or name in families]:
-        numbers, group = here[family], f"{family}/{episode_split}"
+        numbers, group = here[family], f"{family}/{split}"
         missing = sorted(set(asked or ()) - set(numbers))
         if missing or (families and not numbers):
             raise UnknownNameError(
-                f"the split has no query episode {group}/{(missing or [0])[0]}"
+                f"the buffer set has no query episode {group}/{(missing or [0])[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
-                f"It has episodes {format_numbers(numbers)} of {group}; `episode_split` asks for "
-                "others."
+                f"It has episodes {format_numbers(numbers)} of {group}; `split` asks for others."
                 if numbers
-                else f"It has none of {group}: see `episode_split`.",
+                else f"It has none of {group}: see `split`.",
             )
         if numbers:
             chosen[group] = format_numbers(asked or numbers)
@@ -136,8 +135,8 @@ def plan_work(
     if not chosen:
         splits = sorted({one.split for one in there})
         raise InvalidOptionError(
-            f"there is nothing to run: the split has no {episode_split} episode",
-            f"Set `episode_split`; there are {', '.join(splits)}.",
+            f"there is nothing to run: the buffer set has no {split} episode",
+            f"Set `split`; there are {', '.join(splits)}.",
         )
     return Plan(chosen, names, shard)
 

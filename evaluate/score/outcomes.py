@@ -49,7 +49,7 @@ class Outcomes:
             NaN where nothing was asked, `(E,) float64`.
         expected: The episodes of a complete cell, `(E,) bool`.
         due: The cells that are expected or have rows, `(S, C) bool`.
-        unpinned: Whether rows of a system name no revision of a split, `(S,) bool`.
+        unpinned: Whether rows of a system name no revision of a buffer set, `(S,) bool`.
     """
 
     simulator: str
@@ -76,7 +76,7 @@ class Outcomes:
 
     def pairable(self, one: str, other: str) -> bool:
         """Whether two systems had the same histories, as far as their rows tell."""
-        # Of a split that one names and the other does not, nobody knows whether it is one.
+        # Of a buffer set that one names and the other does not, nobody knows whether it is one.
         same = self.unpinned[[self.systems.index(name) for name in (one, other)]]
         return bool(same[0] == same[1])
 
@@ -187,7 +187,7 @@ def _outcomes(
     due = given if grid is Grid.GIVEN else {*DEFAULT_CONDITIONS}
     conditions = tuple(one.name for one in in_order(given | due))
     model_seeds = tuple(sorted({row.model_seed for row in rows}))
-    ids = {(row.family, row.episode_split, row.episode) for row in rows}
+    ids = {(row.family, row.split, row.episode) for row in rows}
     expected = ids
     if grid is Grid.BENCHMARK:
         expected = {
@@ -210,7 +210,7 @@ def _outcomes(
                 (
                     axes[0][row.system],
                     axes[1][row.condition],
-                    axes[2][row.family, row.episode_split, row.episode],
+                    axes[2][row.family, row.split, row.episode],
                     axes[3][row.model_seed],
                 )
                 for row in rows

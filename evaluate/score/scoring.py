@@ -138,7 +138,7 @@ def _unpaired(rows: Rows, outcomes: Outcomes, system: str, other: str) -> str:
     """Return why two systems differ in more than what is asked; nothing if they do not."""
     if not outcomes.pairable(system, other):
         (lone,) = (one for one in (system, other) if (outcomes.simulator, one) in rows.unpinned)
-        return f"the rows of {lone} name no revision of a split, so their histories may differ"
+        return f"the rows of {lone} name no revision of a buffer set, so their histories may differ"
     steps = [rows.retrieval.get((outcomes.simulator, one)) for one in (system, other)]
     if None not in steps and steps[0] != steps[1]:
         return f"they are behind other retrieval steps, {' and '.join(map(str, steps))}"

@@ -1,4 +1,4 @@
-"""Commands that fetch and look at splits, and at this machine."""
+"""Commands that fetch and look at buffer sets, and at this machine."""
 
 from dataclasses import asdict
 from operator import attrgetter
@@ -14,37 +14,36 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_
 from .console import check_output, echo, print_json, say, stoppable
 from .options import (
     AsJson,
+    BufferSetFolder,
     ConditionName,
     Conditions,
     Families,
     Picture,
     QueryName,
-    SplitFolder,
-    SplitOption,
     with_settings,
 )
 
 
 def list_buffers(
-    split: SplitFolder,
+    buffer_set: BufferSetFolder,
     families: Families = [],  # noqa: B006 - typer copies it
     conditions: Conditions = [],  # noqa: B006
     difficulty: Annotated[str | None, typer.Option(help="Only easy, medium or hard.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the buffers of a split.
+    """List the buffers of a buffer set.
 
     Examples:
     ```
-    robomme-interference list my-split --conditions k3,k7
-    robomme-interference list my-split --families MoveCube --json
+    robomme-interference list my-buffers --conditions k3,k7
+    robomme-interference list my-buffers --families MoveCube --json
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import Table
 
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     found = opened.manifests(family=families, condition=conditions, difficulty=difficulty)
     if as_json:
         print_json([to_dict(manifest) for manifest in found])
@@ -68,7 +67,7 @@ def list_conditions(as_json: AsJson = False) -> None:
     Examples:
     ```
     robomme-interference conditions
-    robomme-interference build manifests my-split --conditions no-history,k0,k7,before-k7,held-k7
+    robomme-interference build manifests my-buffers --conditions no-history,k0,k7,before-k7,held-k7
     ```
     """
     from robomme_interference_data.constants import MAX_K
@@ -90,9 +89,9 @@ def list_conditions(as_json: AsJson = False) -> None:
 
 
 def show(
+    buffer_set: BufferSetFolder,
     episode: QueryName,
     condition: ConditionName,
-    split: SplitOption = Path(),
     out: Picture = None,
     camera: Annotated[str, typer.Option(help="Camera to draw.")] = "front",
     shift: Annotated[str, typer.Option(help=f"{SHIFT_HELP} Drawn with --out.")] = NO_SHIFT,
@@ -102,12 +101,12 @@ def show(
 
     Examples:
     ```
-    robomme-interference show VideoRepick/test/7 k3 --split my-split
-    robomme-interference show VideoRepick/test/7 k7 --split my-split --out strip.png
-    robomme-interference show MoveCube/test/0 k1 --split my-split --shift light:2 --out strip.png
+    robomme-interference show my-buffers VideoRepick/test/7 k3
+    robomme-interference show my-buffers VideoRepick/test/7 k7 --out strip.png
+    robomme-interference show my-buffers MoveCube/test/0 k1 --shift light:2 --out strip.png
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.data.views import live_frame
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import Table
@@ -119,7 +118,7 @@ def show(
             f"--shift {shift} says nothing where nothing is drawn",
             "Add --out strip.png, or leave it out.",
         )
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     buffer = opened.load(episode, condition)
     buffer.query.dataset.shape(camera)  # refuses an unknown one
     if out is not None:
@@ -160,8 +159,8 @@ def show(
 
 
 def show_question(
+    buffer_set: BufferSetFolder,
     episode: QueryName,
-    split: SplitOption = Path(),
     out: Annotated[Path | None, typer.Option(help="Picture to write, .png.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -169,17 +168,17 @@ def show_question(
 
     Example:
     ```
-    robomme-interference question VideoUnmask/test/0 --split my-split --out question.png
+    robomme-interference question my-buffers VideoUnmask/test/0 --out question.png
     ```
     """
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
     from robomme_interference_data.data.questions import read_questions
     from robomme_interference_data.storage.files import atomic_path
 
     check_output(out)
     if out is not None and out.suffix.lower() != ".png":
         raise InvalidOptionError.expected("--out", str(out), "a name that ends in .png")
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     query = opened.query(episode)
     question = read_questions(opened)[query.episode_id]
     if out is not None:
@@ -202,7 +201,7 @@ def show_question(
 
 @with_settings
 def fetch(
-    split: Annotated[str, typer.Argument(help="Repository, namespace/name or …@data-1.0.0.")],
+    buffer_set: Annotated[str, typer.Argument(help="Repository, namespace/name or …@data-1.0.0.")],
     config: FetchConfig,
     to: Annotated[
         Path | None, typer.Option(help="Folder to copy the files to; by default only the cache.")
@@ -210,7 +209,7 @@ def fetch(
     dry_run: Annotated[bool, typer.Option(help="Only tell what would be fetched.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Fetch a split from the Hub, or the part of it that some buffers need.
+    """Fetch a buffer set from the Hub, or the part of it that some buffers need.
 
     What is there already is not fetched again; every file is checked against its digest.
 
@@ -218,16 +217,16 @@ def fetch(
     ```
     robomme-interference fetch namespace/name@data-1.0.0
     robomme-interference fetch namespace/name --conditions k3 --families MoveCube --cameras front
-    robomme-interference fetch namespace/name --index thumbnail --to my-split
+    robomme-interference fetch namespace/name --index thumbnail --to my-buffers
     ```
     """
     from robomme_interference_data.data.fetch import fetch as fetch_parts
     from robomme_interference_data.data.fetch import plan_fetch
-    from robomme_interference_data.data.loading import load_split
+    from robomme_interference_data.data.loading import load_buffer_set
 
     check_output(to)
     with stoppable("What was fetched is kept"):
-        opened = load_split(split)
+        opened = load_buffer_set(buffer_set)
         parts = plan_fetch(opened, config)
         told = [
             {

@@ -58,14 +58,14 @@ def log_to_stderr() -> None:
 
 
 def check_output(*paths: Path | None) -> None:
-    """Refuse to write into a dataset or the manifests of a split, every file of which is hashed."""
+    """Refuse to write into a dataset or the manifests of a buffer set, every file of which is hashed."""
     for path in filter(None, paths):
         for folder in (path.resolve(), *path.resolve().parents):
             manifests = (folder / name for name in (MANIFEST_HEADER, MANIFEST_ROWS))
             if (folder / IDENTITY_PATH).is_file() or all(path.is_file() for path in manifests):
                 raise InvalidOptionError(
-                    f"{path} lies inside {folder}, whose files are a split's",
-                    "Give a place outside the split.",
+                    f"{path} lies inside {folder}, whose files are a buffer set's",
+                    "Give a place outside the buffer set.",
                 )
 
 

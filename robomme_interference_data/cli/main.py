@@ -41,15 +41,15 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take longer to load than all else
     pretty_exceptions_enable=False,
     help="History buffers for RoboMME-Interference: build, load, stream and score.",
-    epilog="""A split is a folder with demonstrations, distractor units and manifests of buffers.
+    epilog="""A buffer set is a folder with demonstrations, distractor units and manifests of buffers.
 An option that takes several values is repeated, or has commas between them (NAME,…).
 
 ```
 robomme-interference doctor
-robomme-interference build all --source robomme-h5:recordings/ --out my-split
-robomme-interference verify my-split
-robomme-interference list my-split
-robomme-interference show MoveCube/train/0 k3 --split my-split --out strip.png
+robomme-interference build all my-buffers --source robomme-h5:recordings/
+robomme-interference verify my-buffers
+robomme-interference list my-buffers
+robomme-interference show my-buffers MoveCube/train/0 k3 --out strip.png
 ```
 """,
 )
@@ -58,7 +58,7 @@ _GROUPS = {
     "Data": (
         ("doctor", commands.doctor),
         ("build", building.app),
-        ("new-split", building.new_split),
+        ("new-buffer-set", building.new_buffer_set),
         ("verify", building.verify),
         ("audit", building.audit),
         ("fetch", commands.fetch),

@@ -26,9 +26,8 @@ def split_commas(values: Sequence[str] | None) -> list[str] | None:
 _LIST: dict[str, Any] = {"callback": split_commas, "metavar": "NAME,…"}
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON to standard output.")]
-SplitFolder = Annotated[Path, typer.Argument(help="Folder of the split.")]
-SplitOption = Annotated[
-    Path, typer.Option(envvar="ROBOMME_INTERFERENCE_SPLIT", help="Folder of the split.")
+BufferSetFolder = Annotated[
+    Path, typer.Argument(metavar="BUFFER_SET", help="Folder of the buffer set.")
 ]
 QueryName = Annotated[str, typer.Argument(help="Episode id, such as VideoRepick/test/7.")]
 ConditionName = Annotated[str, typer.Argument(help="Condition, such as k3.")]

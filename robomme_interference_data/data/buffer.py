@@ -27,13 +27,13 @@ from robomme_interference_data.schema.manifest import (
 from robomme_interference_data.storage.cache import DecodedCache
 from robomme_interference_data.storage.digest import combine
 
-from .buffer_set_index import SplitIndex
+from .buffer_set_index import BufferSetIndex
 from .dataset import Dataset
 from .frame_reader import FrameReader, room_for
 from .query import Query
 
 _DAMAGED = "The data is damaged or belongs to another version: download or build it again."
-_VERIFY = "verify SPLIT"
+_VERIFY = "verify BUFFER_SET"
 
 
 @dataclass(frozen=True)
@@ -269,12 +269,12 @@ class Buffer:
             for decoder in decoders.values():
                 decoder.close()
 
-    def index(self, encoder: str, camera: str = "front") -> SplitIndex:
+    def index(self, encoder: str, camera: str = "front") -> BufferSetIndex:
         """Open the indexes of the datasets that the buffer needs; see `SplitIndex`."""
         needed = {DISTRACTORS, self.query.dataset.kind} & {*self._datasets}
         needed |= {entry.dataset for entry in self.manifest.sessions}
         datasets = {name: self._datasets[name] for name in sorted(needed)}
-        return SplitIndex(datasets, encoder, camera)
+        return BufferSetIndex(datasets, encoder, camera)
 
     def embeddings(self, encoder: str, camera: str = "front") -> NDArray[np.float32]:
         """Look up the embeddings of all frames; none is decoded.

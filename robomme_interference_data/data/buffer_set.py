@@ -1,4 +1,4 @@
-"""A split: datasets, and the manifests that name buffers of them."""
+"""A buffer set: datasets, and the manifests that name buffers of them."""
 
 import re
 from collections import Counter
@@ -42,8 +42,8 @@ _PLACE = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-class Split:
-    """A split; see `load_split`.
+class BufferSet:
+    """A buffer set; see `load_buffer_set`.
 
     Attributes:
         files: The folder, or the repository on the Hub, that holds its manifests.
@@ -69,7 +69,7 @@ class Split:
                 raise FormatError.damaged(path, f"{name} has the place {dataset.place!r}")
 
     def __repr__(self) -> str:
-        return f"Split({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
+        return f"BufferSet({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
 
     def _repr_html_(self) -> str:
         """Return the table of its buffers by family, as notebooks show it."""
@@ -90,7 +90,7 @@ class Split:
 
     @property
     def name(self) -> str:
-        """Name of the split: that of its folder or repository."""
+        """Name of the buffer set: that of its folder or repository."""
         files = self.files
         return files.repo_id if isinstance(files, HubFiles) else files.root.resolve().name
 
@@ -101,7 +101,7 @@ class Split:
 
     @cached_property
     def revision(self) -> str:
-        """Identity of the split: SHA-256 over its header, which names all data by hash.
+        """Identity of the buffer set: SHA-256 over its header, which names all data by hash.
 
         It is the same wherever the datasets lie.
         """
@@ -124,7 +124,7 @@ class Split:
         return _Datasets(self)
 
     def place(self, name: str) -> LocalFiles | HubFiles:
-        """Return where a dataset of the split lies.
+        """Return where a dataset of the buffer set lies.
 
         That is the folder of its name, if there is one or the manifests name no other place.
         """
@@ -136,8 +136,8 @@ class Split:
         if place is None:
             raise MissingFileError(
                 f"the manifests of {self.location} do not say where its {name} are",
-                "Those of a published split do.",
-                "publish SPLIT --repo-id NAMESPACE/NAME",
+                "Those of a published buffer set do.",
+                "publish BUFFER_SET --repo-id NAMESPACE/NAME",
             )
         return own if place == "." else HubFiles.parse(place)
 
@@ -179,7 +179,7 @@ class Split:
         command = f"build manifests {self.location}"
         if isinstance(self.files, HubFiles):  # what is published stays as it is
             place = self.header.datasets[DEMONSTRATIONS].place
-            command = f"new-split --demonstrations {place} --source KIND:PATH --out SPLIT"
+            command = f"new-buffer-set BUFFER_SET --demonstrations {place} --source KIND:PATH"
         return f"{command} --conditions {','.join(conditions)}"
 
     @property
@@ -200,7 +200,7 @@ class Split:
 
         Raises:
             InvalidIdError: `episode_id` does not read `<Family>/<split>/<index>`.
-            UnknownNameError: The split does not have this episode; offers the nearest.
+            UnknownNameError: The buffer set does not have this episode; offers the nearest.
         """
         episode = EpisodeId.parse(episode_id)
         self._check_episode(episode)
@@ -284,7 +284,9 @@ class Split:
     def _buffer(self, manifest: BufferManifest) -> Buffer:
         for entry in manifest.sessions:
             if entry.dataset not in self.datasets:
-                what = f"a session of {manifest} is of {entry.dataset!r}, no dataset of the split"
+                what = (
+                    f"a session of {manifest} is of {entry.dataset!r}, no dataset of the buffer set"
+                )
                 raise FormatError.damaged(self._table.path, what)
         return Buffer(
             manifest,
@@ -311,42 +313,42 @@ class Split:
 
 
 class _Datasets(Mapping[str, Dataset]):
-    """The datasets of a split, each opened on first use."""
+    """The datasets of a buffer set, each opened on first use."""
 
-    def __init__(self, split: Split):
-        self._split = split
+    def __init__(self, buffer_set: BufferSet):
+        self._buffer_set = buffer_set
         self._opened: dict[str, Dataset] = {}
 
     def __getitem__(self, name: str) -> Dataset:
         if name not in self._opened:
-            recorded = self._split.header.datasets[name]
-            dataset = Dataset(self._split.place(name))
+            recorded = self._buffer_set.header.datasets[name]
+            dataset = Dataset(self._buffer_set.place(name))
             if dataset.revision != recorded.revision:
-                local = isinstance(self._split.files, LocalFiles)
+                local = isinstance(self._buffer_set.files, LocalFiles)
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
-                    self._split.mend,
-                    f"build manifests {self._split.location}" if local else None,
+                    self._buffer_set.mend,
+                    f"build manifests {self._buffer_set.location}" if local else None,
                 )
             self._opened[name] = dataset
         return self._opened[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._split.header.datasets
+        return name in self._buffer_set.header.datasets
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._split.header.datasets)
+        return iter(self._buffer_set.header.datasets)
 
     def __len__(self) -> int:
-        return len(self._split.header.datasets)
+        return len(self._buffer_set.header.datasets)
 
 
 def _condition(condition: Condition | str | None, k: int | None) -> Condition:
     if (condition is None) == (k is None):
         raise InvalidOptionError(
             f"condition {condition!r} and k={k!r}; expected one of the two",
-            'For example: load_buffer("VideoRepick/test/7", "k3", split="my-split")',
+            'For example: load_buffer("VideoRepick/test/7", "k3", buffer_set="my-buffers")',
         )
     if k is None:
         return parse_condition(condition or "")

@@ -1,4 +1,4 @@
-"""The embeddings of a split: features from each dataset's index, centred on the distractor units.
+"""The embeddings of a buffer set: features from each dataset's index, centred on the distractor units.
 
 This is the one place where features become embeddings, those of stored frames and of live images.
 """
@@ -41,18 +41,18 @@ def normalised(
     return values
 
 
-class SplitIndex:
-    """The indexes of a split's datasets, of one encoder and camera, and what they have in common.
+class BufferSetIndex:
+    """The indexes of a buffer set's datasets, of one encoder and camera, and what they have in common.
 
     Args:
-        datasets: Those datasets of the split that are needed, the distractor units among them.
+        datasets: Those datasets of the buffer set that are needed, the distractor units among them.
         encoder: Name of the encoder, such as `thumbnail`.
         camera: Name of the camera, with or without `observation.images.`.
     """
 
     def __init__(self, datasets: Mapping[str, "Dataset"], encoder: str, camera: str = "front"):
         if DISTRACTORS not in datasets:
-            what = f"a split without {DISTRACTORS} has nothing to centre embeddings on"
+            what = f"a buffer set without {DISTRACTORS} has nothing to centre embeddings on"
             raise MissingIndexError(what)
         self._indexes = {name: one.index(encoder, camera) for name, one in datasets.items()}
         self._units = units = self._indexes[DISTRACTORS]
@@ -100,7 +100,7 @@ class SplitIndex:
         """Return the embeddings of stored frames `start` to `stop` (excluded) of an episode.
 
         Args:
-            dataset: Name of the dataset in the split.
+            dataset: Name of the dataset in the buffer set.
             episode_index: The episode in it.
             start: First frame.
             stop: Frame after the last one.

@@ -1,4 +1,4 @@
-"""One of a split's datasets, on disk or on the Hub: demonstrations, distractor units, ….
+"""One of a buffer set's datasets, on disk or on the Hub: demonstrations, distractor units, ….
 
 A LeRobot dataset in which every episode has files of its own, with our columns in `meta/episodes`,
 a lean copy of that table in `meta/interference.parquet`, and its identity in
@@ -58,7 +58,7 @@ def revision_of(records: Iterable[EpisodeRecord]) -> str:
 
 
 class Dataset:
-    """One of a split's datasets; which, its `kind` says.
+    """One of a buffer set's datasets; which, its `kind` says.
 
     Args:
         files: How to reach the files.
@@ -80,7 +80,7 @@ class Dataset:
                 f"{files.describe()} is a LeRobot dataset, but not one of history sessions: "
                 f"{IDENTITY_PATH} is missing",
                 "Build one from it.",
-                f"build distractors --source lerobot:{files.describe()} --out DIR",
+                f"build distractors DIR --source lerobot:{files.describe()}",
             ) from None
         self.identity = read_header(path, DatasetIdentity)
         self._indexes: dict[tuple[str, str], EmbeddingIndex] = {}
@@ -95,7 +95,7 @@ class Dataset:
 
     @property
     def kind(self) -> str:
-        """Name of the dataset in a split, such as `demonstrations`."""
+        """Name of the dataset in a buffer set, such as `demonstrations`."""
         return self.identity.kind
 
     @property
@@ -166,7 +166,7 @@ class Dataset:
             raise HashMismatchError(
                 f"the episode records of {self.files.describe()} are not those of its revision",
                 "The data is damaged: download or build it again.",
-                "verify SPLIT",
+                "verify BUFFER_SET",
             )
         self._checked = True
 

@@ -302,7 +302,7 @@ class EmbeddingIndex:
 
 
 def _remedy(files: Files, options: str) -> Remedy:
-    """Return how a dataset gets an index; a split's are indexed together."""
+    """Return how a dataset gets an index; a buffer set's are indexed together."""
     if not isinstance(files, LocalFiles):
         hint = (
             f"Fetch {files.describe()} to a folder and embed its frames, or ask its publisher to "
@@ -310,5 +310,5 @@ def _remedy(files: Files, options: str) -> Remedy:
         )
         return Remedy(hint, f"index FOLDER {options}")
     root = files.root
-    split = root.parent if root.name in DATASETS else root
-    return Remedy("Embed the frames of all its datasets (again).", f"index {split} {options}")
+    buffer_set = root.parent if root.name in DATASETS else root
+    return Remedy("Embed the frames of all its datasets (again).", f"index {buffer_set} {options}")

@@ -1,4 +1,4 @@
-"""Bring a split from the Hub to this machine, or the part of it that some buffers need."""
+"""Bring a buffer set from the Hub to this machine, or the part of it that some buffers need."""
 
 import filecmp
 import shutil
@@ -23,13 +23,13 @@ from robomme_interference_data.storage.files import atomic_path
 from robomme_interference_data.storage.hub import HubFiles
 
 if TYPE_CHECKING:
-    from .buffer_set import Split
+    from .buffer_set import BufferSet
     from .dataset import Dataset
 
 
 @dataclass(frozen=True)
 class FetchConfig:
-    """Which buffers of a split are wanted, and what of them."""
+    """Which buffers of a buffer set are wanted, and what of them."""
 
     families: tuple[str, ...] = setting((), help="Families of the queries; by default all.")
     conditions: tuple[str, ...] = setting((), help="Conditions; by default all that are planned.")
@@ -45,7 +45,7 @@ class Part:
 
     Attributes:
         files: The repository.
-        folder: Where its files go inside a fetched split's folder: empty for its root.
+        folder: Where its files go inside a fetched buffer set's folder: empty for its root.
         sizes: Path to bytes of every file that is wanted.
         missing: Those that are not in the cache yet.
     """
@@ -56,23 +56,23 @@ class Part:
     missing: tuple[str, ...]
 
 
-def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
+def plan_fetch(buffer_set: "BufferSet", config: FetchConfig) -> list[Part]:
     """Return what is to be fetched of each repository: its files are listed, none is fetched."""
-    if not isinstance(split.files, HubFiles):
+    if not isinstance(buffer_set.files, HubFiles):
         raise InvalidOptionError(
-            f"{split.location} is a folder on this machine; only a repository can be fetched",
-            "Give the split as namespace/name.",
+            f"{buffer_set.location} is a folder on this machine; only a repository can be fetched",
+            "Give the buffer set as namespace/name.",
         )
-    cameras = config.cameras or split.cameras
+    cameras = config.cameras or buffer_set.cameras
     whole = replace(config, index=None, questions=False) == FetchConfig()
-    episodes = _episodes(split, config)
-    others = {n: d.files for n, d in split.datasets.items() if d.files is not split.files}
+    episodes = _episodes(buffer_set, config)
+    others = {n: d.files for n, d in buffer_set.datasets.items() if d.files is not buffer_set.files}
     parts = []
-    for folder, files in {"": split.files, **others}.items():
-        assert isinstance(files, HubFiles)  # so is every place of a split on the Hub
+    for folder, files in {"": buffer_set.files, **others}.items():
+        assert isinstance(files, HubFiles)  # so is every place of a buffer set on the Hub
         sizes = files.sizes()
-        # What tells of a dataset or split is small: all in meta/ and manifests/, and at the root
-        # but for questions, which have pictures. All of a split is more than its buffers need:
+        # What tells of a dataset or buffer set is small: all in meta/ and manifests/, and at the root
+        # but for questions, which have pictures. All of a buffer set is more than its buffers need:
         # units that no query drew, too.
         wanted = {
             path
@@ -81,7 +81,7 @@ def plan_fetch(split: "Split", config: FetchConfig) -> list[Part]:
             or (not below and (config.questions or top != QUESTIONS_PATH))
             or (whole and top not in (INDEX_DIR, *OPTIONAL_DATASETS))
         }
-        for name, dataset in split.datasets.items():
+        for name, dataset in buffer_set.datasets.items():
             if dataset.files is files:
                 wanted |= {*_paths(dataset, episodes[name], cameras, config.index, sizes)}
         if lacking := sorted(wanted - sizes.keys()):
@@ -99,12 +99,12 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
     Args:
         parts: What `plan_fetch` returned.
         to: Folder to copy the files to; None leaves them in the Hub client's cache. It becomes a
-            split at the very end.
+            buffer set at the very end.
     """
     header = parts[0].files.path(MANIFEST_PATH)
     there = None if to is None else to / MANIFEST_PATH
     if there is not None and there.is_file() and there.read_bytes() != header.read_bytes():
-        raise InvalidOptionError(f"{to} holds another split", "Give another folder.")
+        raise InvalidOptionError(f"{to} holds another buffer set", "Give another folder.")
     for part in parts:
         part.files.fetch(part.sizes)
     if to is None:
@@ -116,22 +116,22 @@ def fetch(parts: Sequence[Part], to: Path | None = None) -> None:
     _copy(header, to / MANIFEST_PATH)
 
 
-def _episodes(split: "Split", config: FetchConfig) -> dict[str, set[int]]:
+def _episodes(buffer_set: "BufferSet", config: FetchConfig) -> dict[str, set[int]]:
     """Return the episodes of each dataset that the wanted buffers and their queries hold."""
     numbers = None if config.episodes is None else {*parse_numbers(config.episodes)}
-    found: dict[str, set[int]] = {name: set() for name in split.header.datasets}
-    for manifest in split.manifests(family=config.families, condition=config.conditions):
+    found: dict[str, set[int]] = {name: set() for name in buffer_set.header.datasets}
+    for manifest in buffer_set.manifests(family=config.families, condition=config.conditions):
         episode = manifest.episode_id
         if numbers is None or episode.index in numbers:
             found[manifest.query.dataset].add(manifest.query.episode_index)
             if SHIFTED in found:
-                found[SHIFTED].add(split.datasets[SHIFTED].index_of(episode))
+                found[SHIFTED].add(buffer_set.datasets[SHIFTED].index_of(episode))
             for entry in manifest.sessions:
                 found[entry.dataset].add(entry.episode_index)
     if not any(found.values()):
         raise InvalidOptionError(
-            f"no buffer of {split.location} is of episodes {config.episodes}",
-            command=f"list {split.location}",
+            f"no buffer of {buffer_set.location} is of episodes {config.episodes}",
+            command=f"list {buffer_set.location}",
         )
     return found
 

@@ -82,7 +82,7 @@ class FrameReader:
         return name, self._cache.get(name, shape, verify=self.verified)
 
     def _keep(self, name: str | None, frames: NDArray[np.uint8]) -> None:
-        # Under their own digest only: another split may hold the frames that are called so.
+        # Under their own digest only: another buffer set may hold the frames that are called so.
         if self._cache is not None and name is not None and frames_sha256(frames) == name:
             self._cache.put(name, frames)
 

@@ -1,4 +1,4 @@
-"""Open a split, load a buffer: from a folder, or from the Hub."""
+"""Open a buffer set, load a buffer: from a folder, or from the Hub."""
 
 import os
 from collections.abc import Sequence
@@ -12,20 +12,20 @@ from robomme_interference_data.storage.cache import DecodedCache, default_cache_
 from robomme_interference_data.storage.hub import locate
 
 from .buffer import Buffer
-from .buffer_set import Split
+from .buffer_set import BufferSet
 
 
-def load_split(
-    split: str | os.PathLike[str],
+def load_buffer_set(
+    buffer_set: str | os.PathLike[str],
     *,
     revision: str | None = None,
     cache: bool | str | os.PathLike[str] | DecodedCache = False,
     threads: int | None = None,
-) -> Split:
-    """Open a split, to list, filter and load its buffers.
+) -> BufferSet:
+    """Open a buffer set, to list, filter and load its buffers.
 
     Args:
-        split: Folder with `demonstrations/`, `distractors/` and `manifests/`; or a repository on
+        buffer_set: Folder with `demonstrations/`, `distractors/` and `manifests/`; or a repository on
             the Hub, `namespace/name`.
         revision: Branch, tag or commit of the repository, such as `data-1.0.0`.
         cache: Where to keep decoded frames for the next time: a cache, a folder for one of
@@ -33,24 +33,26 @@ def load_split(
         threads: Threads that decode side by side; None for one per processor.
 
     Raises:
-        MissingFileError: The folder is not a split.
+        MissingFileError: The folder is not a buffer set.
         FormatError: Its files are damaged, or of another format version.
         InvalidOptionError: An argument is not what it may be.
     """
-    files = locate(_place("split", split, "a folder, or namespace/name"), revision=revision)
+    files = locate(
+        _place("buffer_set", buffer_set, "a folder, or namespace/name"), revision=revision
+    )
     if threads is not None:
         expected = "a number from 1, or None"
         threads = whole_number("threads", threads, expected)
         if threads < 1:
             raise InvalidOptionError.expected("threads", threads, expected)
     try:
-        return Split(files, _cache(cache), threads)
+        return BufferSet(files, _cache(cache), threads)
     except MissingFileError as error:
         raise MissingFileError(
-            f"{files.describe()} is not a split: {MANIFEST_PATH} is missing",
+            f"{files.describe()} is not a buffer set: {MANIFEST_PATH} is missing",
             "Point to the folder that holds demonstrations/, distractors/ and manifests/, or make "
             "one.",
-            "build all --source KIND:PATH --out SPLIT",
+            "build all BUFFER_SET --source KIND:PATH",
         ) from error
 
 
@@ -58,7 +60,7 @@ def load_buffer(
     episode_id: EpisodeId | str,
     condition: Condition | str | None = None,
     *,
-    split: str | os.PathLike[str] | Split,
+    buffer_set: str | os.PathLike[str] | BufferSet,
     revision: str | None = None,
     k: int | None = None,
     verify: bool = False,
@@ -68,22 +70,22 @@ def load_buffer(
 ) -> Buffer:
     """Load the history buffer of one query episode.
 
-    Of a split on the Hub the manifests, the small metadata and the files of this buffer's sessions
+    Of a buffer set on the Hub the manifests, the small metadata and the files of this buffer's sessions
     are downloaded, nothing else; a second time none is. Frames are decoded when asked for.
 
     Args:
         episode_id: Id of the query episode, such as `VideoRepick/test/7`.
-        condition: Name of the condition, such as `k3`, one that the split has planned.
-        split: A folder, a repository on the Hub (`namespace/name`), or what `load_split` returned
+        condition: Name of the condition, such as `k3`, one that the buffer set has planned.
+        buffer_set: A folder, a repository on the Hub (`namespace/name`), or what `load_buffer_set` returned
             (then `revision`, `cache` and `threads` are its own).
-        revision: As for `load_split`.
+        revision: As for `load_buffer_set`.
         k: Short for the condition `k<k>`, instead of `condition`.
         verify: Decode everything now and compare it with the recorded SHA-256; and later what
             comes out of the cache.
         cameras: Whose frames are downloaded now, such as `["front"]`; None for all. Others follow
             when they are asked for.
-        cache: As for `load_split`.
-        threads: As for `load_split`.
+        cache: As for `load_buffer_set`.
+        threads: As for `load_buffer_set`.
 
     Returns:
         The buffer.
@@ -92,17 +94,17 @@ def load_buffer(
         InvalidIdError: `episode_id` or `condition` does not read as one.
         InvalidOptionError: Neither or both of `condition` and `k` are given, or an argument is
             not what it may be.
-        UnknownNameError: The split does not have this episode or condition; offers the nearest.
-        MissingFileError: It is not a split, or a file of it is missing.
+        UnknownNameError: The buffer set does not have this episode or condition; offers the nearest.
+        MissingFileError: It is not a buffer set, or a file of it is missing.
         HubError: The repository is unknown, needs permission, or cannot be reached.
         FormatError: A file is damaged or of another format version.
         HashMismatchError: The datasets are not the ones that the manifests were made for, or,
             with `verify`, data is not what the manifest names.
     """
     opened = (
-        split
-        if isinstance(split, Split)
-        else load_split(split, revision=revision, cache=cache, threads=threads)
+        buffer_set
+        if isinstance(buffer_set, BufferSet)
+        else load_buffer_set(buffer_set, revision=revision, cache=cache, threads=threads)
     )
     return opened.load(episode_id, condition, k=k, verify=verify, cameras=cameras)
 

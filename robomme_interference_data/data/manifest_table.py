@@ -1,4 +1,4 @@
-"""The manifest table of a split: which row holds which buffer, and its manifest."""
+"""The manifest table of a buffer set: which row holds which buffer, and its manifest."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -25,10 +25,10 @@ def pending_rows(header: ManifestHeader) -> str:
 
 
 class ManifestTable:
-    """The manifest table of a split.
+    """The manifest table of a buffer set.
 
     Args:
-        files: Where the split lies.
+        files: Where the buffer set lies.
         header: Header of its manifests.
     """
 

@@ -23,7 +23,7 @@ from .dataset import Dataset
 
 @dataclass(frozen=True)
 class Query:
-    """A query episode; made by `Split.query`.
+    """A query episode; made by `BufferSet.query`.
 
     Attributes:
         dataset: The demonstrations.

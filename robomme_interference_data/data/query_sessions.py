@@ -38,7 +38,7 @@ class SessionSource:
     """Datasets that sessions are drawn from.
 
     Attributes:
-        datasets: The datasets of a split by name: the query episodes, and what sessions are of.
+        datasets: The datasets of a buffer set by name: the query episodes, and what sessions are of.
         seed: Seed of the draw.
     """
 

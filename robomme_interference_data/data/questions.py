@@ -1,4 +1,4 @@
-"""Questions about the past that a split may have: one for each query, with a marked picture."""
+"""Questions about the past that a buffer set may have: one for each query, with a marked picture."""
 
 import string
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from robomme_interference_data.schema.codec import from_table, to_dict
 from robomme_interference_data.storage.files import LocalFiles, canonical_json
 from robomme_interference_data.storage.parquet import open_parquet, read_table
 
-from .buffer_set import Split
+from .buffer_set import BufferSet
 
 LETTERS = string.ascii_uppercase[:8]
 """Letters of options, in order."""
@@ -76,23 +76,23 @@ def digest_questions(questions: Iterable[Question]) -> str:
     return digest.hexdigest()
 
 
-def read_questions(split: Split) -> dict[EpisodeId, Question]:
-    """Read the questions of a split, by query episode."""
-    local = isinstance(split.files, LocalFiles)
+def read_questions(buffer_set: BufferSet) -> dict[EpisodeId, Question]:
+    """Read the questions of a buffer set, by query episode."""
+    local = isinstance(buffer_set.files, LocalFiles)
     hint = "" if local else "Only its publisher can make them again."
-    command = f"build questions {split.location}" if local else None
+    command = f"build questions {buffer_set.location}" if local else None
     try:
-        path = split.files.path(QUESTIONS_PATH)
+        path = buffer_set.files.path(QUESTIONS_PATH)
     except MissingFileError:
-        what = f"{split.location} has no questions ({QUESTIONS_PATH})"
+        what = f"{buffer_set.location} has no questions ({QUESTIONS_PATH})"
         raise MissingFileError(what, hint, command) from None
     table = read_table(open_parquet(path), path)
     found = {one.episode_id: one for one in from_table(Question, table, path)}
-    revision = split.datasets[DEMONSTRATIONS].identity.revision
+    revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
     if len(found) != len(table):
         raise FormatError.damaged(path, "a query has two questions")
     if any(one.revision != revision for one in found.values()):
         raise FormatError(f"{path} has questions for other demonstrations", hint, command)
-    if lacking := sorted({*split.episode_ids} - found.keys()):
+    if lacking := sorted({*buffer_set.episode_ids} - found.keys()):
         raise FormatError(f"{path} lacks the question of {lacking[0]}", hint, command)
     return found

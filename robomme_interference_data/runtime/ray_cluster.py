@@ -193,7 +193,7 @@ class _RayWorker:
                 )
             raise WorkerError(
                 f"node {_name(self._node)} of the cluster is not as this process is: {wrong}",
-                "Install the same on all nodes, and give a split that all of them see.",
+                "Install the same on all nodes, and give a buffer set that all of them see.",
             )
         self.ready = True
 

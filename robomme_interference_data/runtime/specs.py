@@ -136,7 +136,7 @@ def bind_options(
     """
     signature, declared = signature_of(factory), _declared_types(factory)
     values: dict[str, Any] = {}
-    for name, text in _split(what, options).items():
+    for name, text in _buffer_set(what, options).items():
         kinds = declared.get(name)
         value = text if kinds and str in kinds else _read(text)
         if kinds and float in kinds and type(value) is int:
@@ -170,7 +170,7 @@ def signature_of(factory: Factory) -> inspect.Signature:
         return inspect.signature(lambda **options: None)
 
 
-def _split(what: str, options: Iterable[str]) -> dict[str, str]:
+def _buffer_set(what: str, options: Iterable[str]) -> dict[str, str]:
     values: dict[str, str] = {}
     for option in options:
         name, equals, value = option.partition("=")

@@ -67,7 +67,7 @@ class Kind:
         rule: From a query's provider and `k` to its sessions.
         holds: The sessions in order, in words; units are those of `k<n>`.
         asks: What is asked by it.
-        needs: Datasets that a split must hold for it, beside demonstrations and distractors.
+        needs: Datasets that a buffer set must hold for it, beside demonstrations and distractors.
         own_family: Whether units are of the query's own family.
         counted: Whether its conditions have a `k` in their name.
     """
@@ -244,6 +244,6 @@ def in_order(conditions: Iterable[str | Condition]) -> tuple[Condition, ...]:
 
 
 def datasets_of(conditions: Iterable[Condition]) -> tuple[str, ...]:
-    """Return the datasets that a split must hold for conditions."""
+    """Return the datasets that a buffer set must hold for conditions."""
     further = {name for one in conditions for name in one.kind.needs}
     return tuple(n for n in DATASETS if n in further or n in (DEMONSTRATIONS, DISTRACTORS))

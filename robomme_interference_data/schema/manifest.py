@@ -31,7 +31,7 @@ class SessionEntry:
     role: Annotated[str, "One of `lesson`, `distractor`, `filler`, `contradiction`."]
     family: Annotated[str, "Family of the recorded episode."]
     source: Annotated[EpisodeId, "Id of the recorded episode."]
-    dataset: Annotated[str, "Name of the dataset in the split, such as `demonstrations`."]
+    dataset: Annotated[str, "Name of the dataset in the buffer set, such as `demonstrations`."]
     revision: Annotated[str, "Identity of that dataset."]
     episode_index: Annotated[int, "Number of the episode in that dataset."]
     start: Annotated[int, "First stored frame of the span."]
@@ -100,7 +100,7 @@ def layout_sessions(
 class QueryFrame:
     """Where the first live observation of a query episode is stored."""
 
-    dataset: Annotated[str, "Name of the dataset in the split."]
+    dataset: Annotated[str, "Name of the dataset in the buffer set."]
     revision: Annotated[str, "Identity of that dataset."]
     episode_index: Annotated[int, "Number of the episode in that dataset."]
     frame: Annotated[int, "The stored frame."]
@@ -160,20 +160,20 @@ class BufferManifest:
 class ManifestDataset:
     """A dataset that manifests name."""
 
-    kind: Annotated[str, "Name of the dataset in a split, such as `demonstrations`."]
+    kind: Annotated[str, "Name of the dataset in a buffer set, such as `demonstrations`."]
     version: Annotated[str, "Its version."]
     revision: Annotated[str, "Its revision: sessions name it."]
     identity: Annotated[str, "SHA-256 of its `meta/interference.json`."]
     place: Annotated[
         str | None,
-        "Where it lies: None for the folder of its name in the split, `.` for the split's own"
+        "Where it lies: None for the folder of its name in the buffer set, `.` for the buffer set's own"
         " root, `namespace/name@commit` for a repository on the Hub.",
     ] = None
 
 
 @dataclass(frozen=True)
 class ManifestHeader:
-    """`manifests/manifest.json`: how the buffers of a split were planned."""
+    """`manifests/manifest.json`: how the buffers of a buffer set were planned."""
 
     format_version: Annotated[int, "Of the files."]
     rule_version: Annotated[int, "Of the draw."]
@@ -182,7 +182,7 @@ class ManifestHeader:
     position_limit: Annotated[int | None, "Longest history and rollout together, or None."]
     datasets: Annotated[
         dict[str, ManifestDataset],
-        "The datasets by name, which are folders of the split.",
+        "The datasets by name, which are folders of the buffer set.",
     ]
     counts: Annotated[dict[str, int], "Numbers of `queries`, `buffers` and `sessions`."]
     rows: Annotated[str, "SHA-256 of `buffers.parquet`."]

@@ -168,7 +168,7 @@ class DatasetIdentity:
     """`meta/interference.json`: what a dataset is."""
 
     format_version: Annotated[int, "Of the files."]
-    kind: Annotated[str, "Name of the dataset in a split, such as `demonstrations`."]
+    kind: Annotated[str, "Name of the dataset in a buffer set, such as `demonstrations`."]
     version: Annotated[str, "Such as `1.0.0`."]
     revision: Annotated[str, "Identity of the content: SHA-256 over all episode records."]
     exact: Annotated[bool, "Whether all episodes are."]

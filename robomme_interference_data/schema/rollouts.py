@@ -29,11 +29,11 @@ FINAL = (Status.SUCCESS, Status.FAIL, Status.TIMEOUT, Status.ERROR)
 KEY_COLUMNS = (
     "system",
     "simulator",
-    "split",
+    "buffer_set",
     "revision",
     "family",
     "condition",
-    "episode_split",
+    "split",
     "episode",
     "shift",
     "model_seed",
@@ -57,11 +57,11 @@ class Rollout:
         str,
         "`tabletop` or `robomme`; `questions` where one was answered instead.",
     ]
-    split: Annotated[str, "Name of the split of buffers."]
-    revision: Annotated[str, "Identity of that split, `Split.revision`."]
+    buffer_set: Annotated[str, "Name of the buffer set."]
+    revision: Annotated[str, "Identity of that buffer set, `BufferSet.revision`."]
     family: Annotated[str, "Task family."]
     condition: Annotated[str, "`no-history`, `k0`, `k1`, …"]
-    episode_split: Annotated[str, "`train`, `val` or `test`."]
+    split: Annotated[str, "`train`, `val` or `test`."]
     episode: Annotated[int, "Index of the query episode."]
     shift: Annotated[
         str,
@@ -179,4 +179,4 @@ class Rollout:
     @property
     def episode_id(self) -> EpisodeId:
         """The query episode."""
-        return EpisodeId(self.family, self.episode_split, self.episode)
+        return EpisodeId(self.family, self.split, self.episode)

@@ -30,7 +30,7 @@ compare or write again."""
 
 
 class Files(Protocol):
-    """The one way in which this package reaches the files of a dataset or split.
+    """The one way in which this package reaches the files of a dataset or buffer set.
 
     A path is always relative, with `/`, such as `meta/info.json`. Paths come out of data files
     that a stranger may have written: none leads out of the dataset, not by a link either.

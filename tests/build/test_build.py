@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource
-from support.splits import GOLDEN, contents
 
 from robomme_interference_data.build_dataset.build import BuildResult, build_dataset
 from robomme_interference_data.build_dataset.config import (
@@ -244,7 +244,7 @@ def test_filters() -> None:
 
 
 def config(tmp_path: Path, *source: str, **changes: Any) -> AllConfig:
-    return AllConfig(source=source or ("sample",), out=tmp_path / "out", **changes)
+    return AllConfig(source=source or ("sample",), buffer_set=tmp_path / "out", **changes)
 
 
 def test_units_are_of_train_episodes(tmp_path: Path) -> None:
@@ -287,7 +287,7 @@ def test_views_under_shifts_are_of_the_queries(tmp_path: Path) -> None:
 def test_build_all_refuses_before_it_reads(
     tmp_path: Path, changes: dict[str, Any], plan: dict[str, Any], error: type[InterferenceError]
 ) -> None:
-    asked = {"source": ("sample",), "out": tmp_path / "out", **changes}
+    asked = {"source": ("sample",), "buffer_set": tmp_path / "out", **changes}
     with pytest.raises(error):
         plan_all(AllConfig(**asked), PlanConfig(**plan))
     assert list(tmp_path.iterdir()) == []

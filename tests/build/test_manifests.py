@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES, contents, copy_buffer_set
 from support.made_up import record, write_metadata
-from support.splits import CONDITIONS, GOLDEN, QUERIES, contents, copy_split
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.config import AllConfig, PlanConfig, plan_all
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
@@ -33,7 +33,7 @@ FAMILIES = ("MoveCube", "InsertPeg", "PatternLock", "Drawer")
 
 
 def made_up(root: Path, *, queries: Any = None, units: Any = None) -> Path:
-    """A split of metadata alone: four families, two queries and three units each."""
+    """A buffer set of metadata alone: four families, two queries and three units each."""
     asked = queries or [
         record("demonstrations", f"{family}/test/{n}", lesson=20 + 13 * n)
         for family in FAMILIES
@@ -49,9 +49,9 @@ def made_up(root: Path, *, queries: Any = None, units: Any = None) -> Path:
     return root
 
 
-@pytest.mark.parametrize("name", ["split", "not-utf-8-\udcff"])
+@pytest.mark.parametrize("name", ["buffer_set", "not-utf-8-\udcff"])
 def test_the_golden_manifests_come_out_again(tmp_path: Path, name: str) -> None:
-    root = copy_split(tmp_path / name)
+    root = copy_buffer_set(tmp_path / name)
     assert (
         sum(write_manifests(plan_manifests(in_folder(root), tuple(reversed(CONDITIONS))), root))
         == 15
@@ -180,8 +180,8 @@ def test_rules_ask_for_what_they_need(tmp_path: Path, monkeypatch: pytest.Monkey
     assert found["more-k1"] == found["more-k8"][:2]
     with pytest.raises(BuildError, match="needs 10 distractor units"):
         list(planned_buffers(plan_manifests(in_folder(root), ("more-k9",))))
-    split = tmp_path / "split"
-    asked = AllConfig(source=("sample:MoveCube,PatternLock",), out=split, split="test")
+    buffer_set = tmp_path / "buffer_set"
+    asked = AllConfig(source=("sample:MoveCube,PatternLock",), buffer_set=buffer_set, split="test")
     assert plan_all(asked, PlanConfig(conditions=("more-k1",)))
     with pytest.raises(BuildError, match="needs 4 distractor units"):
         plan_all(asked, PlanConfig(conditions=("more-k3",)))
@@ -231,7 +231,7 @@ def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int
 ) -> None:
     """A kill between any two files that appear; then the same command finishes."""
-    root, replace, left = copy_split(tmp_path / "split"), Path.replace, [steps]
+    root, replace, left = copy_buffer_set(tmp_path / "buffer_set"), Path.replace, [steps]
 
     def killed(path: Path, target: Path) -> Path:
         if target.parent == root / "manifests":
@@ -245,27 +245,31 @@ def test_an_interrupted_build_leaves_the_old_manifests_or_the_new_ones(
         patch.setattr(Path, "replace", killed)
         with suppress(KeyboardInterrupt):
             list(write_manifests(plan, root))
-    split = load_split(root)
-    assert split.conditions == (CONDITIONS if steps < 2 else ("k0",))
-    assert len(list(split.manifests())) == len(split) == len(QUERIES) * len(split.conditions)
-    assert split.load(QUERIES[0], "k0", verify=True).frames().any()
+    buffer_set = load_buffer_set(root)
+    assert buffer_set.conditions == (CONDITIONS if steps < 2 else ("k0",))
+    assert (
+        len(list(buffer_set.manifests()))
+        == len(buffer_set)
+        == len(QUERIES) * len(buffer_set.conditions)
+    )
+    assert buffer_set.load(QUERIES[0], "k0", verify=True).frames().any()
     list(write_manifests(plan, root))
     assert sorted(contents(root / "manifests")) == ["buffers.parquet", "manifest.json"]
-    assert len(load_split(root)) == len(QUERIES)
+    assert len(load_buffer_set(root)) == len(QUERIES)
 
 
 def test_a_buffer_is_planned_without_manifests() -> None:
-    split = load_split(GOLDEN)
-    record = split.query(QUERIES[1]).record
-    sessions = QuerySessions(SessionSource(split.datasets), record)
+    buffer_set = load_buffer_set(GOLDEN)
+    record = buffer_set.query(QUERIES[1]).record
+    sessions = QuerySessions(SessionSource(buffer_set.datasets), record)
     for name in CONDITIONS:
-        assert sessions.buffer(parse_condition(name)) == split.manifest(QUERIES[1], name)
+        assert sessions.buffer(parse_condition(name)) == buffer_set.manifest(QUERIES[1], name)
 
 
 def test_earlier_manifests_are_replaced_and_strangers_kept(tmp_path: Path) -> None:
-    root = copy_split(tmp_path / "split")
+    root = copy_buffer_set(tmp_path / "buffer_set")
     assert sum(write_manifests(plan_manifests(in_folder(root), ("k0",)), root)) == len(QUERIES)
-    assert load_split(root).conditions == ("k0",)
+    assert load_buffer_set(root).conditions == ("k0",)
     other = made_up(tmp_path / "other")
     (other / "manifests").mkdir()
     (other / "manifests" / "notes.txt").write_text("mine")

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.buffer_sets import GOLDEN
 from support.machine import full_disk
-from support.splits import GOLDEN
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop, scene_of
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset import question_pictures
 from robomme_interference_data.build_dataset.question_pictures import picture
 from robomme_interference_data.build_dataset.questions import (
@@ -48,8 +48,8 @@ MANY = ("InsertPeg", "PatternLock", "RouteStick")
 """Families of whose possible answers some are options; of the others all are."""
 
 
-def split_of(*episodes: EpisodeId, view: Any = GREY, **changes: Any) -> Any:
-    """What is asked of a split, with episodes of the suite that nobody has recorded."""
+def buffer_set_of(*episodes: EpisodeId, view: Any = GREY, **changes: Any) -> Any:
+    """What is asked of a buffer set, with episodes of the suite that nobody has recorded."""
 
     def query(episode: EpisodeId) -> Any:
         seed = seed_of(episode)
@@ -72,7 +72,7 @@ class Made:
 
 def make(*episodes: EpisodeId) -> list[Made]:
     """Make questions without their pictures."""
-    return [Made(one, tuple(marks)) for one, marks in planned_questions(split_of(*episodes))]
+    return [Made(one, tuple(marks)) for one, marks in planned_questions(buffer_set_of(*episodes))]
 
 
 @pytest.fixture(scope="module")
@@ -231,8 +231,8 @@ def bare(questions: Iterable[Question]) -> list[Question]:
 
 
 def test_the_golden_questions_come_out_again() -> None:
-    split = load_split(TABLETOP)
-    kept, again = read_questions(split), list(make_questions(split))
+    buffer_set = load_buffer_set(TABLETOP)
+    kept, again = read_questions(buffer_set), list(make_questions(buffer_set))
     assert bare(again) == bare(kept.values())
     assert tuple(kept) == QUERIES  # in canonical order
     for one in again:  # another Pillow may draw letters a little otherwise
@@ -245,21 +245,21 @@ def test_whatever_the_hash_seed_the_same_bytes(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "from pathlib import Path\n"
-        "from robomme_interference_data import load_split\n"
+        "from robomme_interference_data import load_buffer_set\n"
         "from robomme_interference_data.build_dataset.questions import *\n"
-        "questions = list(make_questions(load_split(sys.argv[1])))\n"
+        "questions = list(make_questions(load_buffer_set(sys.argv[1])))\n"
         "write_questions(reversed(questions[::-1]), Path(sys.argv[2]))\n"
     )
     command = [sys.executable, "-c", code, str(TABLETOP), str(tmp_path / "other")]
     subprocess.run(command, env=os.environ | {"PYTHONHASHSEED": "4711"}, check=True, timeout=60)
-    questions = list(make_questions(load_split(TABLETOP)))
+    questions = list(make_questions(load_buffer_set(TABLETOP)))
     here = write_questions(questions, tmp_path / "here")
     assert here.read_bytes() == (tmp_path / "other" / QUESTIONS_PATH).read_bytes()
     assert pq.ParquetFile(here).num_row_groups == len(questions)
 
 
 def test_the_digest_is_of_all_that_is_asked() -> None:
-    first, second = list(make_questions(split_of(*QUERIES[:2])))
+    first, second = list(make_questions(buffer_set_of(*QUERIES[:2])))
     digest = digest_questions([first, second])
     assert digest == digest_questions([second, first])
     for changes in ({"picture": b"x"}, {"right": (first.right + 1) % 3}, {"text": "What?"}):
@@ -333,7 +333,7 @@ def test_a_picture_is_what_the_view_shows(made: list[Made]) -> None:
     view = np.random.default_rng(0).integers(0, 256, GREY.shape, dtype=np.uint8)
     for family in FAMILIES:
         episode = EpisodeId(family, "test", 0)
-        [question] = make_questions(split_of(episode, view=view))
+        [question] = make_questions(buffer_set_of(episode, view=view))
         image = decode_image(question.picture)
         assert 480 < max(image.shape) <= 2 * 480
         [one] = [each for each in made if each.question.episode_id == episode]
@@ -360,13 +360,13 @@ def test_a_picture_is_what_the_view_shows(made: list[Made]) -> None:
 )
 def test_only_tabletops_episodes_have_questions(changes: dict[str, Any]) -> None:
     with pytest.raises(BuildError, match="MoveCube/test/0 .* possible answers are not known"):
-        list(make_questions(split_of(EpisodeId("MoveCube", "test", 0), **changes)))
+        list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), **changes)))
 
 
 def test_views_of_another_size_are_refused() -> None:
     wide = np.zeros((240, 320, 3), np.uint8)
     with pytest.raises(BuildError, match="320×240 pixels; where things are is known in 256×256"):
-        list(make_questions(split_of(EpisodeId("MoveCube", "test", 0), view=wide)))
+        list(make_questions(buffer_set_of(EpisodeId("MoveCube", "test", 0), view=wide)))
 
 
 # --- the command -------------------------------------------------------------------------------
@@ -374,8 +374,8 @@ def test_views_of_another_size_are_refused() -> None:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A copy of the golden split, without its questions."""
-    copied = copy_tabletop(tmp_path / "split")
+    """A copy of the golden buffer set, without its questions."""
+    copied = copy_tabletop(tmp_path / "buffer_set")
     (copied / QUESTIONS_PATH).unlink()
     return copied
 
@@ -383,8 +383,8 @@ def root(tmp_path: Path) -> Path:
 def test_the_command_makes_them(root: Path, run: Any) -> None:
     code, out, _ = run("build", "questions", root, "--json")
     assert code == 0 and f'"questions": {len(QUERIES)}' in out
-    assert bare(read_questions(load_split(root)).values()) == bare(
-        read_questions(load_split(TABLETOP)).values()
+    assert bare(read_questions(load_buffer_set(root)).values()) == bare(
+        read_questions(load_buffer_set(TABLETOP)).values()
     )
     code, out, err = run("build", "questions", root)
     assert (code, out) == (0, "") and f"{len(QUERIES)} questions" in err
@@ -398,8 +398,8 @@ def test_other_demonstrations_are_refused(run: Any) -> None:
 
 
 def test_where_there_is_no_folder(tmp_path: Path, run: Any) -> None:
-    """A split on the Hub is not written to, and no folder of its name is made."""
-    code, _, err = run("build", "questions", tmp_path / "somebody" / "split")
+    """A buffer set on the Hub is not written to, and no folder of its name is made."""
+    code, _, err = run("build", "questions", tmp_path / "somebody" / "buffer_set")
     assert code == 1 and "robomme-interference fetch" in err
     assert not (tmp_path / "somebody").exists()
 

@@ -180,7 +180,7 @@ def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         read(path.parent)
 
 
-# --- numbers, splits and seeds -------------------------------------------------------------------
+# --- numbers, buffer sets and seeds -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_no_family_and_no_h5py(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         # val: 1,000,000 + 10,000 · code + 100 · index + attempt; a few are 100 higher
         ("RouteStick", {5: 1_160_500, 6: 1_160_700, 7: 1_160_700}, "val/5 val/6 val/7"),
         ("RouteStick", {1: 1_160_100, 2: 1_160_100, 3: 1_160_200}, "val/0 val/1 val/2"),
-        # one file with several splits
+        # one file with several buffer sets
         ("MoveCube", {1: 14_000, 2: 640_100, 3: 1_140_200}, "train/0 test/1 val/2"),
         # no seeds, or a family that RoboMME does not have: numbering says it
         ("MoveCube", {1: None, 4: None}, "train/0 train/3"),

@@ -1,4 +1,4 @@
-"""Every kind of damage to a split is found, and named where it is; leaks are told apart."""
+"""Every kind of damage to a buffer set is found, and named where it is; leaks are told apart."""
 
 import json
 import re
@@ -13,20 +13,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.buffer_sets import GOLDEN, QUERIES, UNITS, renew_sums
 from support.damage import flipped_bits
 from support.made_up import record, write_metadata
 from support.retrieval import QUIET, TwoSums, make_index
-from support.splits import GOLDEN, QUERIES, UNITS, renew_sums
 from support.tabletop import TABLETOP, copy_tabletop
 
-from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_split
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.audit import Audit, Leak, audit_buffer_set
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import FormatError, MissingFileError
@@ -43,7 +43,10 @@ ROWS = "manifests/buffers.parquet"
 
 
 def found(root: Path, *, decode: bool = False) -> list[str]:
-    return [f"{one.where}: {one.what}" for one in verify_split(load_split(root), decode=decode)]
+    return [
+        f"{one.where}: {one.what}"
+        for one in verify_buffer_set(load_buffer_set(root), decode=decode)
+    ]
 
 
 def expect(root: Path, *patterns: str, decode: bool = False) -> None:
@@ -78,19 +81,19 @@ def as_text(name: str) -> Callable[[pa.Table], pa.Table]:
 # --- nothing to find -----------------------------------------------------------------------------
 
 
-def test_a_clean_split() -> None:
+def test_a_clean_buffer_set() -> None:
     counted: list[int] = []
     shown = SimpleNamespace(start=lambda text, frames: None, advance=counted.append)
-    assert list(verify_split(load_split(GOLDEN), progress=shown)) == []
+    assert list(verify_buffer_set(load_buffer_set(GOLDEN), progress=shown)) == []
     assert counted == [49] * len(QUERIES) + [32] * UNITS
     assert found(GOLDEN) == []
 
 
-def test_what_people_put_beside_a_dataset_is_no_violation(own_split: Path) -> None:
-    (own_split / "distractors" / "README.md").write_text("mine")
-    (own_split / "distractors" / "LICENSE").write_text("mine")
-    (own_split / "demonstrations" / ".gitattributes").write_text("")
-    assert found(own_split) == []
+def test_what_people_put_beside_a_dataset_is_no_violation(own_buffers: Path) -> None:
+    (own_buffers / "distractors" / "README.md").write_text("mine")
+    (own_buffers / "distractors" / "LICENSE").write_text("mine")
+    (own_buffers / "demonstrations" / ".gitattributes").write_text("")
+    assert found(own_buffers) == []
 
 
 # --- every byte ----------------------------------------------------------------------------------
@@ -100,31 +103,31 @@ ONE_OF_EACH = [name for name in FILES if "file-0" not in name or "file-000" in n
 
 
 @pytest.mark.parametrize("path", ONE_OF_EACH)
-def test_a_flipped_bit_anywhere(own_split: Path, path: str) -> None:
-    for _ in flipped_bits(own_split / path, 3):
+def test_a_flipped_bit_anywhere(own_buffers: Path, path: str) -> None:
+    for _ in flipped_bits(own_buffers / path, 3):
         if path == HEADER:
-            _expect_of_header(own_split)
+            _expect_of_header(own_buffers)
         else:
-            expect(own_split, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
+            expect(own_buffers, re.escape(Path(path).name) + "|" + path.split("/", maxsplit=1)[0])
 
 
-def test_a_flipped_bit_in_the_header_of_an_index(own_split: Path) -> None:
-    make_index(own_split)
-    assert found(own_split) == []
-    path = own_split / "distractors/index/thumbnail/index.json"
+def test_a_flipped_bit_in_the_header_of_an_index(own_buffers: Path) -> None:
+    make_index(own_buffers)
+    assert found(own_buffers) == []
+    path = own_buffers / "distractors/index/thumbnail/index.json"
     header = json.loads(path.read_text())
     for changes in ({"typical_cosine": 0.5}, {"computed": {}}, {"encoder": {"name": "thumbnail"}}):
         path.write_text(json.dumps(header | changes))
-        expect(own_split, "index/thumbnail: .*")
+        expect(own_buffers, "index/thumbnail: .*")
     path.write_text(json.dumps(header, indent=2))
     for _ in flipped_bits(path, 4):
-        expect(own_split, "distractors/index/thumbnail: .*")
+        expect(own_buffers, "distractors/index/thumbnail: .*")
 
 
-def test_indexes_of_different_encoders(own_split: Path) -> None:
-    make_index(own_split)
-    build_index([own_split / "demonstrations"], TwoSums(), QUIET)
-    expect(own_split, "demonstrations/index/thumbnail: .*another encoder")
+def test_indexes_of_different_encoders(own_buffers: Path) -> None:
+    make_index(own_buffers)
+    build_index([own_buffers / "demonstrations"], TwoSums(), QUIET)
+    expect(own_buffers, "demonstrations/index/thumbnail: .*another encoder")
 
 
 def _expect_of_header(root: Path) -> None:
@@ -133,19 +136,19 @@ def _expect_of_header(root: Path) -> None:
         told = found(root)
     except FormatError:
         return
-    # Its hash is the split's revision, which rows of rollouts name.
-    assert told or load_split(root).revision != load_split(GOLDEN).revision
+    # Its hash is the buffer set's revision, which rows of rollouts name.
+    assert told or load_buffer_set(root).revision != load_buffer_set(GOLDEN).revision
 
 
 @pytest.mark.parametrize(
     "path", [EPISODES, RECORDS, DATA, VIDEO, ROWS, "distractors/meta/tasks.parquet"]
 )
-def test_missing_and_cut_files(own_split: Path, path: str) -> None:
-    file = own_split / path
+def test_missing_and_cut_files(own_buffers: Path, path: str) -> None:
+    file = own_buffers / path
     file.write_bytes(file.read_bytes()[:-9])
-    expect(own_split, "SHA-256|cannot be read", decode=path == VIDEO)
+    expect(own_buffers, "SHA-256|cannot be read", decode=path == VIDEO)
     file.unlink()
-    expect(own_split, "missing", decode=path == VIDEO)
+    expect(own_buffers, "missing", decode=path == VIDEO)
 
 
 @pytest.mark.parametrize(
@@ -156,11 +159,11 @@ def test_missing_and_cut_files(own_split: Path, path: str) -> None:
         ("/chunk-{chunk_index:03d}", "\\ud800"),
     ],
 )
-def test_info_that_is_wrong(own_split: Path, before: str, after: str) -> None:
-    info = own_split / "distractors" / "meta" / "info.json"
+def test_info_that_is_wrong(own_buffers: Path, before: str, after: str) -> None:
+    info = own_buffers / "distractors" / "meta" / "info.json"
     assert before in info.read_text()
     info.write_text(info.read_text().replace(before, after))
-    expect(own_split, "info.json: does not have", "observation.state|is too long|is no path")
+    expect(own_buffers, "info.json: does not have", "observation.state|is too long|is no path")
 
 
 @pytest.mark.parametrize(
@@ -173,22 +176,22 @@ def test_info_that_is_wrong(own_split: Path, before: str, after: str) -> None:
         ("manifests/x.parquet", "is too many"),
     ],
 )
-def test_a_file_too_many(own_split: Path, path: str, told: str) -> None:
-    file = own_split / path
+def test_a_file_too_many(own_buffers: Path, path: str, told: str) -> None:
+    file = own_buffers / path
     file = file / "x.npy" if path.endswith("other") else file
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("?")
-    expect(own_split, f"{path}: .*{told}")
+    expect(own_buffers, f"{path}: .*{told}")
 
 
-def test_links_that_lead_nowhere(own_split: Path) -> None:
+def test_links_that_lead_nowhere(own_buffers: Path) -> None:
     for path in ("distractors/videos/x.mp4", "demonstrations/index/other/x.npy"):
-        (own_split / path).parent.mkdir(parents=True, exist_ok=True)
-        (own_split / path).symlink_to("nowhere")
-    expect(own_split, r"videos/x\.mp4: is too many", r"index/other/x\.npy: leads nowhere")
-    (own_split / VIDEO).unlink()
-    (own_split / VIDEO).symlink_to("nowhere")
-    expect(own_split, f"{VIDEO}: is missing")
+        (own_buffers / path).parent.mkdir(parents=True, exist_ok=True)
+        (own_buffers / path).symlink_to("nowhere")
+    expect(own_buffers, r"videos/x\.mp4: is too many", r"index/other/x\.npy: leads nowhere")
+    (own_buffers / VIDEO).unlink()
+    (own_buffers / VIDEO).symlink_to("nowhere")
+    expect(own_buffers, f"{VIDEO}: is missing")
 
 
 # --- what the bytes mean: the sums are written anew by whoever changed the files -----------------
@@ -233,11 +236,11 @@ def test_links_that_lead_nowhere(own_split: Path) -> None:
     ],
 )
 def test_tables_that_mean_something_else(
-    own_split: Path, path: str, change: Callable[[pa.Table], pa.Table], told: str
+    own_buffers: Path, path: str, change: Callable[[pa.Table], pa.Table], told: str
 ) -> None:
-    edit(own_split / path, change)
-    renew_sums(own_split / "distractors")
-    expect(own_split, told)
+    edit(own_buffers / path, change)
+    renew_sums(own_buffers / "distractors")
+    expect(own_buffers, told)
 
 
 @pytest.mark.parametrize(
@@ -262,12 +265,12 @@ def test_tables_that_mean_something_else(
     ],
 )
 def test_json_that_means_something_else(
-    own_split: Path, name: str, field: str, value: Any, told: str
+    own_buffers: Path, name: str, field: str, value: Any, told: str
 ) -> None:
-    path = own_split / f"distractors/meta/{name}.json"
+    path = own_buffers / f"distractors/meta/{name}.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
-    renew_sums(own_split / "distractors")
-    expect(own_split, told)
+    renew_sums(own_buffers / "distractors")
+    expect(own_buffers, told)
 
 
 def change_statistic(root: Path, feature: str) -> None:
@@ -286,10 +289,10 @@ def change_statistic(root: Path, feature: str) -> None:
 
 
 @pytest.mark.parametrize("feature", ["observation.state", "observation.images.front"])
-def test_statistics_that_are_not_those_of_the_data(own_split: Path, feature: str) -> None:
-    change_statistic(own_split, feature)
-    renew_sums(own_split / "distractors")
-    expect(own_split, f"stats/{feature}/mean .*is not that of its", decode=True)
+def test_statistics_that_are_not_those_of_the_data(own_buffers: Path, feature: str) -> None:
+    change_statistic(own_buffers, feature)
+    renew_sums(own_buffers / "distractors")
+    expect(own_buffers, f"stats/{feature}/mean .*is not that of its", decode=True)
 
 
 def as_bytes(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
@@ -342,43 +345,43 @@ def skipping(path: Path) -> None:
     ],
 )
 def test_what_only_the_meaning_shows(
-    own_split: Path, path: str, change: Callable[[Path], object], told: str
+    own_buffers: Path, path: str, change: Callable[[Path], object], told: str
 ) -> None:
-    change(own_split / path)
+    change(own_buffers / path)
     if path == ROWS:
-        renew_header(own_split)
+        renew_header(own_buffers)
     if path.startswith("distractors"):
-        renew_sums(own_split / "distractors")
-    expect(own_split, told)
+        renew_sums(own_buffers / "distractors")
+    expect(own_buffers, told)
 
 
-def test_line_ends_of_the_sums(own_split: Path) -> None:
+def test_line_ends_of_the_sums(own_buffers: Path) -> None:
     path, identity = (
-        own_split / f"distractors/meta/{n}" for n in ("SHA256SUMS", "interference.json")
+        own_buffers / f"distractors/meta/{n}" for n in ("SHA256SUMS", "interference.json")
     )
     before = sha256_file(path)
     path.write_bytes(with_carriage_returns(path.read_bytes()))
     identity.write_text(identity.read_text().replace(before, sha256_file(path)))
-    expect(own_split, "SHA256SUMS: is not written as")
+    expect(own_buffers, "SHA256SUMS: is not written as")
 
 
-def test_frames_that_are_not_the_hashed_ones(own_split: Path) -> None:
-    videos = own_split / f"distractors/{FRONT}/chunk-000"
+def test_frames_that_are_not_the_hashed_ones(own_buffers: Path) -> None:
+    videos = own_buffers / f"distractors/{FRONT}/chunk-000"
     shutil.copyfile(videos / "file-005.mp4", videos / "file-003.mp4")
-    renew_sums(own_split / "distractors")
-    expect(own_split, r"observation\.images\.front does not have", decode=True)
+    renew_sums(own_buffers / "distractors")
+    expect(own_buffers, r"observation\.images\.front does not have", decode=True)
 
 
-def test_vectors_that_are_not_the_hashed_ones(own_split: Path) -> None:
+def test_vectors_that_are_not_the_hashed_ones(own_buffers: Path) -> None:
     def change(table: pa.Table) -> pa.Table:
         states = np.array(table["observation.state"].to_pylist(), np.float32)
         states[17, 3] = np.nextafter(states[17, 3], 9, dtype=np.float32)
         return put(table, "observation.state", states.tolist())
 
-    edit(own_split / "demonstrations/data/chunk-000/file-001.parquet", change)
-    renew_sums(own_split / "demonstrations")
+    edit(own_buffers / "demonstrations/data/chunk-000/file-001.parquet", change)
+    renew_sums(own_buffers / "demonstrations")
     expect(
-        own_split,
+        own_buffers,
         r"MoveCube/test/0: observation\.state does not",
         r"MoveCube/test/0: frames 0 to 23 \(first\) do not",
         decode=True,
@@ -406,11 +409,11 @@ def renew_header(root: Path, **changes: Any) -> None:
     ],
 )
 def test_rows_that_the_rules_do_not_give(
-    own_split: Path, change: Callable[[pa.Table], pa.Table], told: str
+    own_buffers: Path, change: Callable[[pa.Table], pa.Table], told: str
 ) -> None:
-    edit(own_split / ROWS, change)
-    renew_header(own_split)
-    expect(own_split, told)
+    edit(own_buffers / ROWS, change)
+    renew_header(own_buffers)
+    expect(own_buffers, told)
 
 
 @pytest.mark.parametrize(
@@ -425,25 +428,25 @@ def test_rows_that_the_rules_do_not_give(
     ],
 )
 def test_headers_that_say_something_else(
-    own_split: Path, changes: dict[str, Any], told: str
+    own_buffers: Path, changes: dict[str, Any], told: str
 ) -> None:
-    renew_header(own_split, **changes)
-    expect(own_split, told)
+    renew_header(own_buffers, **changes)
+    expect(own_buffers, told)
 
 
 @pytest.mark.parametrize("datasets", [{}, {"x": {}}, None])
-def test_headers_that_cannot_be_read(own_split: Path, datasets: Any) -> None:
-    renew_header(own_split, datasets=datasets)
+def test_headers_that_cannot_be_read(own_buffers: Path, datasets: Any) -> None:
+    renew_header(own_buffers, datasets=datasets)
     with pytest.raises(FormatError, match=r"manifest\.json"):
-        found(own_split)
+        found(own_buffers)
 
 
-def test_a_dataset_that_is_gone(own_split: Path) -> None:
-    shutil.rmtree(own_split / "distractors")
-    expect(own_split, "distractors: .*missing")
-    shutil.rmtree(own_split / "manifests")
-    with pytest.raises(MissingFileError, match="is not a split"):
-        found(own_split)
+def test_a_dataset_that_is_gone(own_buffers: Path) -> None:
+    shutil.rmtree(own_buffers / "distractors")
+    expect(own_buffers, "distractors: .*missing")
+    shutil.rmtree(own_buffers / "manifests")
+    with pytest.raises(MissingFileError, match="is not a buffer set"):
+        found(own_buffers)
 
 
 # --- audit ---------------------------------------------------------------------------------------
@@ -454,7 +457,7 @@ def audited(root: Path, queries: list[Any], units: list[Any], *conditions: str) 
     write_metadata(root / "distractors", "distractors", units)
     for _ in write_manifests(plan_manifests(in_folder(root), conditions or ("k0",)), root):
         pass
-    return audit_split(load_split(root))
+    return audit_buffer_set(load_buffer_set(root))
 
 
 query, unit = partial(record, "demonstrations"), partial(record, "distractors")
@@ -478,8 +481,8 @@ def test_use_by_hand(tmp_path: Path) -> None:
     assert units == {"MoveCube/train/0": 1, "Drawer/train/5": 2}
 
 
-def test_the_golden_split_leaks_nothing() -> None:
-    report = audit_split(load_split(GOLDEN))
+def test_the_golden_buffer_set_leaks_nothing() -> None:
+    report = audit_buffer_set(load_buffer_set(GOLDEN))
     assert report.leaks == []
     assert sum(report.uses["k7"].values()) == 3 * 7
 
@@ -517,10 +520,10 @@ def test_leaks_in_the_pool(tmp_path: Path) -> None:
     ],
 )
 def test_what_kinds_may_hold(
-    own_split: Path, condition: str, source: str, role: str, leaks: list[str]
+    own_buffers: Path, condition: str, source: str, role: str, leaks: list[str]
 ) -> None:
     """Under the first condition, one session more is added, of what some kinds alone may hold."""
-    header = own_split / "manifests/manifest.json"
+    header = own_buffers / "manifests/manifest.json"
     header.write_text(header.read_text().replace('"k0"', f'"{condition}"'))
 
     def change(table: pa.Table) -> pa.Table:
@@ -534,8 +537,8 @@ def test_what_kinds_may_hold(
         changed = put(put(table, "sessions", rows), "history_frames", frames)
         return put(changed, "condition", names)
 
-    edit(own_split / ROWS, change)
-    assert [leak.kind for leak in audit_split(load_split(own_split)).leaks] == leaks
+    edit(own_buffers / ROWS, change)
+    assert [leak.kind for leak in audit_buffer_set(load_buffer_set(own_buffers)).leaks] == leaks
 
 
 @pytest.mark.parametrize(
@@ -550,7 +553,7 @@ def test_what_kinds_may_hold(
         ("MoveCube/test/0/1", "contradiction", "not a train episode"),
     ],
 )
-def test_leaks_in_a_buffer(own_split: Path, source: str, role: str, kind: str) -> None:
+def test_leaks_in_a_buffer(own_buffers: Path, source: str, role: str, kind: str) -> None:
     def change(table: pa.Table) -> pa.Table:
         rows = table["sessions"].to_pylist()
         place = table["condition"].to_pylist().index("k3", 5)  # MoveCube's
@@ -559,16 +562,16 @@ def test_leaks_in_a_buffer(own_split: Path, source: str, role: str, kind: str) -
         second |= {"source": wanted, "family": wanted.split("/")[0], "role": role}
         return put(table, "sessions", rows)
 
-    edit(own_split / ROWS, change)
-    leaks = audit_split(load_split(own_split)).leaks
+    edit(own_buffers / ROWS, change)
+    leaks = audit_buffer_set(load_buffer_set(own_buffers)).leaks
     assert [leak.kind for leak in leaks] == [kind]
     assert leaks[0].where.startswith("MoveCube/test/0 under k3")
 
 
-def test_a_header_without_a_condition_of_the_rows(own_split: Path) -> None:
-    renew_header(own_split, conditions=["no-history", "k0"])
+def test_a_header_without_a_condition_of_the_rows(own_buffers: Path) -> None:
+    renew_header(own_buffers, conditions=["no-history", "k0"])
     with pytest.raises(FormatError, match="k1 is not among its conditions"):
-        audit_split(load_split(own_split))
+        audit_buffer_set(load_buffer_set(own_buffers))
 
 
 # --- questions -----------------------------------------------------------------------------------
@@ -576,7 +579,7 @@ def test_a_header_without_a_condition_of_the_rows(own_split: Path) -> None:
 
 def test_questions_are_planned_anew(tmp_path: Path) -> None:
     assert found(TABLETOP, decode=False) == []
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     path = root / QUESTIONS_PATH
     sound = path.read_bytes()
     for name, value in (("right", 2), ("text", "Which?"), ("options", ["a", "b", "c"])):
@@ -590,11 +593,11 @@ def test_questions_are_planned_anew(tmp_path: Path) -> None:
 
 
 def test_a_flipped_bit_in_questions_is_told_or_changes_none(tmp_path: Path) -> None:
-    root = copy_tabletop(tmp_path / "split")
-    sound, told = read_questions(load_split(root)), 0
+    root = copy_tabletop(tmp_path / "buffer_set")
+    sound, told = read_questions(load_buffer_set(root)), 0
     for _ in flipped_bits(root / QUESTIONS_PATH, 40):
         try:
-            assert read_questions(load_split(root)) == sound  # statistics, say, are not read
+            assert read_questions(load_buffer_set(root)) == sound  # statistics, say, are not read
         except FormatError as error:
             told += "questions.parquet" in error.message
     assert told > 30

@@ -6,18 +6,18 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from support.cards import CARDS, OF_SPLIT, without_version
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
+from support.cards import CARDS, OF_BUFFER_SET, without_version
 
-from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards.croissant import BIBTEX, PAPER
-from robomme_interference_data.cards.facts import split_facts
+from robomme_interference_data.cards.facts import buffer_set_facts
 from robomme_interference_data.cards.film import STRIP
 from robomme_interference_data.cards.render import CROISSANT, README, card_files, size_category
 from robomme_interference_data.constants import RECORDS_PATH
 
-NAMES = ("demonstrations", "split", "results")
+NAMES = ("demonstrations", "buffer_set", "results")
 ROOT = Path(__file__).parents[2]
 
 
@@ -33,8 +33,8 @@ def test_golden_cards(made: dict[str, dict[str, bytes]], name: str) -> None:
 
 
 def test_the_same_data_gives_the_same_bytes(made: dict[str, dict[str, bytes]]) -> None:
-    again = card_files(split_facts(load_split(GOLDEN)), OF_SPLIT)
-    assert again == made["split"]
+    again = card_files(buffer_set_facts(load_buffer_set(GOLDEN)), OF_BUFFER_SET)
+    assert again == made["buffer_set"]
     assert again[STRIP] != made["demonstrations"][STRIP]
 
 
@@ -46,7 +46,7 @@ def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> Non
     for link in links:
         assert link == PAPER or (published / name / link).is_file()
     for path in re.findall(r"`((?:manifests|meta)/[\w./]+\.\w+)`", text):
-        root = published / ("split" if path.startswith("manifests") else name)
+        root = published / ("buffer_set" if path.startswith("manifests") else name)
         assert (root / path).is_file(), path
 
 
@@ -56,8 +56,8 @@ def test_every_link_of_a_card_leads_somewhere(published: Path, name: str) -> Non
 @pytest.mark.parametrize(
     ("tree", "name", "split", "file"),
     [
-        ("split", "buffers", "test", "manifests/buffers.parquet"),
-        ("split", "episodes", "train", RECORDS_PATH),
+        ("buffer_set", "buffers", "test", "manifests/buffers.parquet"),
+        ("buffer_set", "episodes", "train", RECORDS_PATH),
         ("demonstrations", "episodes", "test", RECORDS_PATH),
     ],
 )
@@ -91,12 +91,12 @@ def test_size_categories(count: int, category: str) -> None:
 
 
 def test_a_card_beside_the_data_is_no_violation(
-    own_split: Path, made: dict[str, dict[str, bytes]]
+    own_buffers: Path, made: dict[str, dict[str, bytes]]
 ) -> None:
-    for name, files in (("demonstrations", "demonstrations"), ("distractors", "split")):
+    for name, files in (("demonstrations", "demonstrations"), ("distractors", "buffer_set")):
         for path, content in made[files].items():
-            (own_split / name / path).write_bytes(content)
-    assert list(verify_split(load_split(own_split), decode=False)) == []
+            (own_buffers / name / path).write_bytes(content)
+    assert list(verify_buffer_set(load_buffer_set(own_buffers), decode=False)) == []
 
 
 def test_the_citation_is_the_project_s() -> None:

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.hub import BASE, SPLIT, push_split, running_hub
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
+from support.hub import BASE, BUFFER_SET, push_buffer_set, running_hub
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards.commands import facts_of
-from robomme_interference_data.cards.facts import split_facts
+from robomme_interference_data.cards.facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
 
@@ -33,11 +33,13 @@ def test_a_card_of_what_is_on_the_hub(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with running_hub(tmp_path / "cache", monkeypatch) as hub:
-        _, base = push_split(hub, GOLDEN, tmp_path / "work")
-        code, out, _ = run("card", SPLIT, "--repo-id", SPLIT)
+        _, base = push_buffer_set(hub, GOLDEN, tmp_path / "work")
+        code, out, _ = run("card", BUFFER_SET, "--repo-id", BUFFER_SET)
         assert code == 0
         place = f"{BASE}@{base}"
-        assert out == card_text(split_facts(load_split(GOLDEN)), Publication(SPLIT, base=place))
+        assert out == card_text(
+            buffer_set_facts(load_buffer_set(GOLDEN)), Publication(BUFFER_SET, base=place)
+        )
         assert not [path for path in hub.downloads() if path.endswith(".mp4")]
         code, out, _ = run("card", place, "--repo-id", BASE)
         assert code == 0
@@ -49,7 +51,7 @@ def test_a_card_of_what_is_on_the_hub(
     [
         ((GOLDEN, "--license", "MIT License"), "--license 'MIT License'"),
         ((GOLDEN / "distractors",), "dataset of distractors"),
-        ((GOLDEN / "demonstrations" / "data",), "holds no split"),
+        ((GOLDEN / "demonstrations" / "data",), "holds no buffer set"),
         (("nowhere",), "neither a folder"),
         (("nobody/nothing",), "HF_HUB_OFFLINE"),
     ],

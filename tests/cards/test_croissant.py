@@ -8,13 +8,13 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from support.cards import OF_SPLIT
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
+from support.cards import OF_BUFFER_SET
 from support.tabletop import TABLETOP
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards.croissant import as_bytes, croissant
-from robomme_interference_data.cards.facts import split_facts
+from robomme_interference_data.cards.facts import buffer_set_facts
 from robomme_interference_data.cards.render import CROISSANT, card_text
 from robomme_interference_data.cards.tables import columns_of
 from robomme_interference_data.constants import RECORDS_PATH
@@ -25,7 +25,7 @@ from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.schema.rollouts import Rollout
 from robomme_interference_data.storage.files import sha256_file
 
-NAMES = ("demonstrations", "split", "results")
+NAMES = ("demonstrations", "buffer_set", "results")
 MINIMAL = (
     "rai:dataLimitations",
     "rai:dataBiases",
@@ -79,7 +79,7 @@ def test_the_reference_library_finds_no_fault(published: Path, name: str) -> Non
 
 
 def test_the_reference_library_reads_the_rows(published: Path) -> None:
-    root = published / "split"
+    root = published / "buffer_set"
     files = {path: root / path for path in ("manifests/buffers.parquet", RECORDS_PATH)}
     dataset = read(root / CROISSANT, files)
     table = pq.read_table(root / "manifests" / "buffers.parquet")
@@ -117,11 +117,11 @@ def test_columns_are_described_without_docstrings() -> None:
     assert done.stdout == "True\n"
 
 
-@pytest.mark.parametrize(("split", "has_questions"), [(TABLETOP, True), (GOLDEN, False)])
-def test_questions_are_a_table_of_their_own(split: Path, has_questions: bool) -> None:
-    facts = split_facts(load_split(split))
-    sets = {one["name"]: one for one in json.loads(croissant(facts, OF_SPLIT))["recordSet"]}
-    text = card_text(facts, OF_SPLIT)
+@pytest.mark.parametrize(("buffer_set", "has_questions"), [(TABLETOP, True), (GOLDEN, False)])
+def test_questions_are_a_table_of_their_own(buffer_set: Path, has_questions: bool) -> None:
+    facts = buffer_set_facts(load_buffer_set(buffer_set))
+    sets = {one["name"]: one for one in json.loads(croissant(facts, OF_BUFFER_SET))["recordSet"]}
+    text = card_text(facts, OF_BUFFER_SET)
     assert ("`questions.parquet`" in text) == ("questions" in sets) == has_questions
     assert ("config_name: questions" in text) == has_questions
     if has_questions:
@@ -130,6 +130,6 @@ def test_questions_are_a_table_of_their_own(split: Path, has_questions: bool) ->
 
 
 def test_the_file_is_safe_in_a_page() -> None:
-    data = as_bytes({"a": "</script>", "b": OF_SPLIT.repo_id, "c": "\udcff"})
+    data = as_bytes({"a": "</script>", "b": OF_BUFFER_SET.repo_id, "c": "\udcff"})
     assert b"<" not in data
     assert json.loads(data)["a"] == "</script>"

@@ -47,7 +47,7 @@ def test_settings_that_are_an_error(options: dict[str, str], words: str) -> None
         PublishConfig(**{"repo_id": "people/tiny", **options})
 
 
-@pytest.mark.parametrize("location", [None, ".", "demo/split", 7, f"demos@{COMMIT}"])
+@pytest.mark.parametrize("location", [None, ".", "demo/buffers", 7, f"demos@{COMMIT}"])
 def test_a_base_is_a_commit_on_the_hub(location: object) -> None:
     about = Publication("people/tiny").made_for(location)
     assert about.base is None

@@ -1,4 +1,4 @@
-"""Publish over real HTTP, with the Hub's own client: splits, their versions, and results."""
+"""Publish over real HTTP, with the Hub's own client: buffer sets, their versions, and results."""
 
 import io
 import json
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import runs, worlds
+from support.buffer_sets import CONDITIONS, GOLDEN, contents, copy_buffer_set
 from support.hub_server import HubServer
 from support.machine import full_disk
 from support.publishing import (
@@ -24,16 +25,15 @@ from support.publishing import (
     publish,
     tags,
 )
-from support.splits import CONDITIONS, GOLDEN, contents, copy_split
 from support.tabletop import TABLETOP, copy_tabletop
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.audit import Audit, Leak
 from robomme_interference_data.build_dataset.questions import write_questions
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards import checks, results
 from robomme_interference_data.cards import publish as publish_module
-from robomme_interference_data.cards.checks import check_split
+from robomme_interference_data.cards.checks import check_buffer_set
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import HubError, PublishError
 from robomme_interference_data.storage.files import canonical_json
@@ -53,7 +53,7 @@ def _somebody(login: Login, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the checks, which decode everything and import lerobot."""
-    monkeypatch.setattr(checks, "check_split", lambda *_: None)
+    monkeypatch.setattr(checks, "check_buffer_set", lambda *_: None)
 
 
 def writes(hub: HubServer) -> list[str]:
@@ -61,10 +61,10 @@ def writes(hub: HubServer) -> list[str]:
     return [one for one in hub.requests if not one.startswith(("GET", "HEAD"))]
 
 
-# --- a split -------------------------------------------------------------------------------------
+# --- a buffer set -------------------------------------------------------------------------------------
 
 
-def test_a_published_split_is_the_one_on_disk(hub: HubServer, tmp_path: Path) -> None:
+def test_a_published_buffer_set_is_the_one_on_disk(hub: HubServer, tmp_path: Path) -> None:
     for planned in plan(GOLDEN)[2]:
         report = planned.to_dict()
         assert report["new_repository"] and report["commit"] is None
@@ -73,12 +73,12 @@ def test_a_published_split_is_the_one_on_disk(hub: HubServer, tmp_path: Path) ->
 
     lessons, units = publish(GOLDEN)
     assert report["bytes"] == sum(map(len, files(hub, UNITS).values()))
-    golden, published = load_split(GOLDEN), load_split(UNITS, revision="data-1.0.0")
+    golden, published = load_buffer_set(GOLDEN), load_buffer_set(UNITS, revision="data-1.0.0")
     assert published.revision == golden.revision
     assert published.location == f"{UNITS}@{units.published}"
     assert [*published.manifests()] == [*golden.manifests()]
-    mine = load_buffer(QUERY, "k3", split=golden)
-    theirs = load_buffer(QUERY, "k3", split=published, verify=True)
+    mine = load_buffer(QUERY, "k3", buffer_set=golden)
+    theirs = load_buffer(QUERY, "k3", buffer_set=published, verify=True)
     for camera in mine.cameras:
         assert np.array_equal(theirs.frames(camera), mine.frames(camera))
     for done, name in ((lessons, "demonstrations"), (units, "distractors")):
@@ -120,38 +120,38 @@ def test_a_published_split_is_the_one_on_disk(hub: HubServer, tmp_path: Path) ->
 def test_private_repositories(hub: HubServer, login: Login) -> None:
     publish(GOLDEN, private=True)
     assert all(one.private for one in hub.repositories.values())
-    assert len(load_split(UNITS)) == 15
+    assert len(load_buffer_set(UNITS)) == 15
     login("stranger")
     with pytest.raises(HubError, match="no dataset repository"):
-        load_split(UNITS)
+        load_buffer_set(UNITS)
 
 
-def test_questions_are_parts_of_a_split(hub: HubServer, tmp_path: Path, run: Run) -> None:
+def test_questions_are_parts_of_a_buffer_set(hub: HubServer, tmp_path: Path, run: Run) -> None:
     publish(TABLETOP)
     assert files(hub, UNITS)["questions.parquet"] == (TABLETOP / "questions.parquet").read_bytes()
-    published = load_split(UNITS, revision="data-1.0.0")
+    published = load_buffer_set(UNITS, revision="data-1.0.0")
     questions = read_questions(published)
-    assert questions == read_questions(load_split(TABLETOP))
-    assert [*verify_split(published)] == []
+    assert questions == read_questions(load_buffer_set(TABLETOP))
+    assert [*verify_buffer_set(published)] == []
     part = ("--families", "MoveCube")
     for options, comes in ((part, False), ((*part, "--questions"), True), ((), True)):
         out = tmp_path / str(len(options))
         assert run("fetch", f"{UNITS}@data-1.0.0", *options, "--to", out)[0] == 0
         assert (out / "questions.parquet").exists() == comes
-    split = copy_tabletop(tmp_path / "split")
+    buffer_set = copy_tabletop(tmp_path / "buffer_set")
     first, *others = questions.values()
     turned = replace(first, right=(first.right + 1) % len(first.options))
-    write_questions([turned, *others], split)
+    write_questions([turned, *others], buffer_set)
     with pytest.raises(PublishError, match=r'version="2\.0\.0"'):
-        plan(split)
+        plan(buffer_set)
 
 
 # --- versions ------------------------------------------------------------------------------------
 
 
 def changed(tmp_path: Path, how: str) -> tuple[Path, dict[str, str]]:
-    """Return a split that is not the golden one any more, and options that go with it."""
-    root = copy_split(tmp_path / "changed")
+    """Return a buffer set that is not the golden one any more, and options that go with it."""
+    root = copy_buffer_set(tmp_path / "changed")
     if how == "index":
         (root / "distractors" / "index" / "thumbnail").mkdir(parents=True)
         (root / "distractors" / "index" / "thumbnail" / "index.json").write_text("{}")
@@ -185,7 +185,7 @@ def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, follo
         assert hub.uploads() == [rows]
     # The demonstrations are as they were; with another license, their card is not.
     assert (kept.published == lessons.published) == (how != "card")
-    assert load_split(UNITS).header.datasets["demonstrations"].place == (
+    assert load_buffer_set(UNITS).header.datasets["demonstrations"].place == (
         f"{LESSONS}@{lessons.published}"
     )
     assert tags(hub, UNITS) == {
@@ -193,10 +193,10 @@ def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, follo
         f"data-{following}": new.published,
         "v3.0": new.published,
     }
-    old = load_split(UNITS, revision="data-1.0.0")
-    assert [*old.manifests()] == [*load_split(GOLDEN).manifests()]
-    now = load_split(UNITS, revision=f"data-{following}")
-    assert [*now.manifests()] == [*load_split(root).manifests()]
+    old = load_buffer_set(UNITS, revision="data-1.0.0")
+    assert [*old.manifests()] == [*load_buffer_set(GOLDEN).manifests()]
+    now = load_buffer_set(UNITS, revision=f"data-{following}")
+    assert [*now.manifests()] == [*load_buffer_set(root).manifests()]
 
 
 def test_an_older_version_is_not_published_after_a_newer_one(
@@ -223,7 +223,7 @@ def test_demonstrations_count_their_own_versions(
         found = plain(facts, about)
         return found | {"README.md": b"---\n---\nmore"} if about.repo_id == LESSONS else found
 
-    # Their card alone: the split names the first commit, which holds the data.
+    # Their card alone: the buffer set names the first commit, which holds the data.
     with monkeypatch.context() as patch:
         patch.setattr(publish_module, "card_files", card)
         for _ in range(2):
@@ -231,17 +231,17 @@ def test_demonstrations_count_their_own_versions(
             assert (str(new.version), kept.published) == ("1.0.1", units.published)
         assert tags(hub, LESSONS)["data-1.0.1"] == new.published != lessons.published
         publish(GOLDEN, "someone/other", demonstrations_id=LESSONS)
-        header = load_split("someone/other").header.datasets["demonstrations"]
+        header = load_buffer_set("someone/other").header.datasets["demonstrations"]
         assert header.place == f"{LESSONS}@{lessons.published}"
-    # Their data: the split has to be another version.
-    root = copy_split(tmp_path / "split")
+    # Their data: the buffer set has to be another version.
+    root = copy_buffer_set(tmp_path / "buffer_set")
     (root / "demonstrations" / "index").mkdir()
     (root / "demonstrations" / "index" / "more").write_bytes(b"more")
     with pytest.raises(PublishError):
         publish(root)
     new, units = publish(root, version="3.0.0")
     assert (str(new.version), str(units.version)) == ("1.0.2", "3.0.0")
-    header = load_split(UNITS).header.datasets["demonstrations"]
+    header = load_buffer_set(UNITS).header.datasets["demonstrations"]
     assert header.place == f"{LESSONS}@{new.published}"
 
 
@@ -249,9 +249,9 @@ def test_demonstrations_count_their_own_versions(
 
 
 def placed(hub: HubServer, tmp_path: Path, commit: str | None = None) -> Path:
-    """Return a split whose manifests name demonstrations on the Hub."""
+    """Return a buffer set whose manifests name demonstrations on the Hub."""
     commit = commit or hub.push("datasets/others/lessons", GOLDEN / "demonstrations")
-    root = copy_split(tmp_path / "placed")
+    root = copy_buffer_set(tmp_path / "placed")
     path = root / "manifests" / "manifest.json"
     header = json.loads(path.read_text(encoding="utf-8"))
     header["datasets"]["demonstrations"]["place"] = f"others/lessons@{commit}"
@@ -259,13 +259,13 @@ def placed(hub: HubServer, tmp_path: Path, commit: str | None = None) -> Path:
     return root
 
 
-def test_a_split_of_published_demonstrations(hub: HubServer, tmp_path: Path) -> None:
+def test_a_buffer_set_of_published_demonstrations(hub: HubServer, tmp_path: Path) -> None:
     root = placed(hub, tmp_path)
     assert len(publish(root)) == 1
     assert hub.repositories.keys() == {"datasets/others/lessons", f"datasets/{UNITS}"}
-    assert len(load_buffer(QUERY, "k1", split=UNITS, verify=True).sessions) == 2
+    assert len(load_buffer(QUERY, "k1", buffer_set=UNITS, verify=True).sessions) == 2
     lessons, _ = publish(root, "someone/again", demonstrations_id="someone/mine")
-    header = load_split("someone/again").header.datasets["demonstrations"]
+    header = load_buffer_set("someone/again").header.datasets["demonstrations"]
     assert header.place == f"someone/mine@{lessons.published}"
 
 
@@ -308,7 +308,7 @@ def test_nobody_is_logged_in(
     hub: HubServer, run: Run, monkeypatch: pytest.MonkeyPatch, token: str
 ) -> None:
     monkeypatch.setenv("HF_TOKEN", token)
-    monkeypatch.setattr(checks, "check_split", lambda *_: pytest.fail("checks take hours"))
+    monkeypatch.setattr(checks, "check_buffer_set", lambda *_: pytest.fail("checks take hours"))
     code, _, err = run("publish", GOLDEN, "--repo-id", UNITS, "--yes")
     assert (code, len(hub.requests) <= 1) == (1, True)
     assert "does not know this login" in err and "hf auth login" in err
@@ -363,14 +363,14 @@ def test_the_command(
         assert one["sent_files"] == one["files"] > 0
     code, out, err = run(*asked)
     assert (code, out, err.count("published, ")) == (0, "", 2)
-    assert f'load_split("{UNITS}", revision="data-1.2.3")' in err
+    assert f'load_buffer_set("{UNITS}", revision="data-1.2.3")' in err
     root, _ = changed(tmp_path, "added")
     asked = ("publish", root, *asked[2:])
     code, _, err = run(*asked, "--yes")
     assert (code, "--version 1.3.0" in err) == (1, True)
     monkeypatch.setattr(sys, "stdin", Terminal("y\n"))
     assert run(*asked, "--version", "1.3.0")[0] == 0
-    assert len(load_split(UNITS, revision="data-1.3.0")) == 18
+    assert len(load_buffer_set(UNITS, revision="data-1.3.0")) == 18
 
 
 @pytest.mark.usefixtures("_unchecked")
@@ -384,24 +384,24 @@ def test_the_command_into_a_folder(hub: HubServer, run: Run, tmp_path: Path) -> 
     assert (code, json.loads(text)) == (0, expected)
     assert "already there" in run(*asked, "--to", out)[2]
     assert hub.requests == []
-    root = copy_split(tmp_path / "split")
+    root = copy_buffer_set(tmp_path / "buffer_set")
     before = contents(root)
     code, _, err = run("publish", root, "--repo-id", UNITS, "--to", root / "distractors" / "out")
     assert (code, "inside" in err, contents(root)) == (1, True, before)
 
 
-def test_a_split_that_fails_a_check_is_not_published(
+def test_a_buffer_set_that_fails_a_check_is_not_published(
     hub: HubServer, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = copy_split(tmp_path / "split")
+    root = copy_buffer_set(tmp_path / "buffer_set")
     (root / "distractors" / "meta" / "build_report.json").write_text("{}\n")
     code, _, err = run("publish", root, "--repo-id", UNITS, "--yes")
     assert (code, writes(hub)) == (1, [])
     assert "build_report.json" in err and f"robomme-interference verify {root}" in err
     audit = Audit({}, leaks=[Leak("same scene", "unit MoveCube/train/0"), Leak("other", "b")])
-    monkeypatch.setattr(checks, "audit_split", lambda _: audit)
+    monkeypatch.setattr(checks, "audit_buffer_set", lambda _: audit)
     with pytest.raises(PublishError, match="2 leaks, such as same scene: unit MoveCube") as caught:
-        check_split(load_split(GOLDEN))
+        check_buffer_set(load_buffer_set(GOLDEN))
     assert caught.value.command == f"audit {GOLDEN}"
 
 
@@ -411,7 +411,7 @@ def test_a_split_that_fails_a_check_is_not_published(
 @pytest.fixture
 def ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of one rollout that has ended."""
-    monkeypatch.setenv(worlds.SPLIT, str(GOLDEN))
+    monkeypatch.setenv(worlds.BUFFER_SET, str(GOLDEN))
     runs.run_one(tmp_path / "run")
     return tmp_path / "run"
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 from huggingface_hub import constants
+from support.buffer_sets import CONDITIONS, GOLDEN, copy_buffer_set
 from support.hub_server import HubServer
 from support.machine import full_disk
 from support.publishing import LESSONS, UNITS, files, plain_cards, plan_again, publish, tags
-from support.splits import CONDITIONS, GOLDEN, copy_split
 
 from robomme_interference_data.cards import checks
 from robomme_interference_data.cards.checks import open_with_lerobot
@@ -158,7 +158,7 @@ def test_what_arrived_is_compared(hub: HubServer) -> None:
 
 def test_a_full_disk_while_versions_are_compared(hub: HubServer, tmp_path: Path) -> None:
     _, units = publish(GOLDEN)
-    root = copy_split(tmp_path / "split")
+    root = copy_buffer_set(tmp_path / "buffer_set")
     plan_again(root, [*CONDITIONS, "k2"])
     with full_disk(), pytest.raises(OSError, match="File too large") as caught:
         publish(root, version="1.1.0")
@@ -184,7 +184,7 @@ def test_a_full_disk_while_lerobot_looks(tmp_path: Path, monkeypatch: pytest.Mon
 def test_stopped_while_publishing(
     hub: HubServer, run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checks, "check_split", lambda *_: None)
+    monkeypatch.setattr(checks, "check_buffer_set", lambda *_: None)
     interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
     hub.fault("PUT", "/store/datasets/someone/tiny/", after=20, call=interrupt)
     command = ("publish", GOLDEN, "--repo-id", UNITS, "--yes")

@@ -1,4 +1,4 @@
-"""The files of a repository: how they differ from others, in a folder, and what a split has."""
+"""The files of a repository: how they differ from others, in a folder, and what a buffer set has."""
 
 import hashlib
 from pathlib import Path
@@ -9,13 +9,13 @@ import pytest
 from huggingface_hub.hf_api import RepoFile
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buffer_sets import GOLDEN, contents, copy_buffer_set
 from support.hub_repositories import Blob
 from support.machine import full_disk
 from support.publishing import content_of, plain_cards
-from support.splits import GOLDEN, contents, copy_split
 
-from robomme_interference_data import load_buffer, load_split
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.cards.repo import (
     LocalFile,
     RepoFiles,
@@ -63,11 +63,11 @@ def test_what_is_unmanaged_is_left_alone() -> None:
     assert compare({}, existing).removed == ("LICENSES/x", "NOTICE", "data/.x")
 
 
-# --- what the repository of a split holds --------------------------------------------------------
+# --- what the repository of a buffer set holds --------------------------------------------------------
 
 
-def test_the_files_of_a_split(tmp_path: Path) -> None:
-    root = copy_split(tmp_path / "split")
+def test_the_files_of_a_buffer_set(tmp_path: Path) -> None:
+    root = copy_buffer_set(tmp_path / "buffer_set")
     for path in ("index/thumbnail/a.npy", "index/.thumbnail.building/b.npy", "LICENSE", ".x"):
         (root / "distractors" / path).parent.mkdir(parents=True, exist_ok=True)
         (root / "distractors" / path).write_bytes(b"more")
@@ -96,14 +96,14 @@ def folder(root: Path, **options: Any) -> RepoFiles:
 
 
 @pytest.mark.usefixtures("_plain")
-def test_a_folder_is_a_split(tmp_path: Path) -> None:
+def test_a_folder_is_a_buffer_set(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     assert write_folder(folder(GOLDEN), one)
-    golden, written = load_split(GOLDEN), load_split(one)
+    golden, written = load_buffer_set(GOLDEN), load_buffer_set(one)
     assert written.revision == golden.revision
-    assert [*verify_split(written)] == []
-    mine = load_buffer("MoveCube/test/0", "k7", split=golden).frames("front")
-    theirs = load_buffer("MoveCube/test/0", "k7", split=written, verify=True).frames("front")
+    assert [*verify_buffer_set(written)] == []
+    mine = load_buffer("MoveCube/test/0", "k7", buffer_set=golden).frames("front")
+    theirs = load_buffer("MoveCube/test/0", "k7", buffer_set=written, verify=True).frames("front")
     assert np.array_equal(mine, theirs)
     assert write_folder(folder(one), two)
     assert contents(two) == contents(one)
@@ -124,11 +124,11 @@ def test_an_earlier_version_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_plain")
-@pytest.mark.parametrize("other", ["file", "split", ".git/config", "LICENSE"])
+@pytest.mark.parametrize("other", ["file", "buffer_set", ".git/config", "LICENSE"])
 def test_a_folder_of_something_else_is_kept(tmp_path: Path, other: str) -> None:
     out = tmp_path / "out"
-    if other == "split":
-        copy_split(out)
+    if other == "buffer_set":
+        copy_buffer_set(out)
     elif other == "file":
         out.write_bytes(b"mine")
     else:

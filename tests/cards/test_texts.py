@@ -7,21 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.cards import OF_DEMONSTRATIONS, OF_RESULTS, OF_SPLIT, RUN
+from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN
 from support.made_up import record, write_metadata
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
     write_manifests,
 )
 from robomme_interference_data.cards.facts import (
+    buffer_set_facts,
     count_same_family,
     demonstrations_facts,
-    split_facts,
 )
-from robomme_interference_data.cards.film import film_of_split
+from robomme_interference_data.cards.film import film_of_buffer_set
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_files, card_text
 from robomme_interference_data.cards.results import results_facts
@@ -32,7 +32,7 @@ from robomme_interference_data.constants import (
     REPORT_PATH,
     SUMS_PATH,
 )
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.score.config import Settings
 from robomme_interference_data.evaluate.score.scoring import Score, score
@@ -50,8 +50,8 @@ def made_up(
     identity: dict[str, Any] | None = None,
     report: dict[str, Any] | None = None,
     **options: Any,
-) -> Split:
-    """A split of metadata alone: one query, and two units of each of three families."""
+) -> BufferSet:
+    """A buffer set of metadata alone: one query, and two units of each of three families."""
     asked = [record("demonstrations", "MoveCube/test/0", **(query or {}))]
     pool = [
         record("distractors", f"{family}/train/{number}", **(unit or {}))
@@ -68,15 +68,15 @@ def made_up(
     planned = {"conditions": ("no-history", "k0", "k1", "k3"), **options}
     for _ in write_manifests(plan_manifests(in_folder(root), **planned), root):
         pass
-    return load_split(root)
+    return load_buffer_set(root)
 
 
-def split_text(split: Split, about: Publication) -> str:
-    return card_text(split_facts(split), about)
+def buffer_set_text(buffer_set: BufferSet, about: Publication) -> str:
+    return card_text(buffer_set_facts(buffer_set), about)
 
 
-def demonstrations_text(split: Split) -> str:
-    return card_text(demonstrations_facts(split.datasets["demonstrations"]), OF_DEMONSTRATIONS)
+def demonstrations_text(buffer_set: BufferSet) -> str:
+    return card_text(demonstrations_facts(buffer_set.datasets["demonstrations"]), OF_DEMONSTRATIONS)
 
 
 def results_text(results: Score | Path, about: Publication) -> str:
@@ -85,18 +85,18 @@ def results_text(results: Score | Path, about: Publication) -> str:
 
 @pytest.mark.parametrize(("part", "inexact"), [("query", 4), ("unit", 2)])
 def test_lossy_data_is_called_so(tmp_path: Path, part: str, inexact: int) -> None:
-    split = made_up(tmp_path, **{part: {"exact": False}})  # no-history and k0 hold no unit
-    text = split_text(split, OF_SPLIT)
+    buffer_set = made_up(tmp_path, **{part: {"exact": False}})  # no-history and k0 hold no unit
+    text = buffer_set_text(buffer_set, OF_BUFFER_SET)
     assert "**Exact.**" not in text
     assert f"**Lossy.** {inexact} of 4 buffers" in text
-    demonstrations = demonstrations_text(split)
+    demonstrations = demonstrations_text(buffer_set)
     assert ("**Lossy.** 1 of 1 episodes" in demonstrations) == (part == "query")
 
 
 def test_the_lossy_copy_of_the_recordings_is_named(tmp_path: Path) -> None:
     source = {"kind": "lerobot", "repo": "lerobot/robomme", "revision": COMMIT}
-    split = made_up(tmp_path, query={"exact": False}, identity={"sources": [source]})
-    text = split_text(split, Publication("people/tiny"))
+    buffer_set = made_up(tmp_path, query={"exact": False}, identity={"sources": [source]})
+    text = buffer_set_text(buffer_set, Publication("people/tiny"))
     assert "It was built from `lerobot/robomme`, the AV1-lossy copy" in text
     assert f"`lerobot/robomme@{COMMIT}`" in text
     assert "source_datasets:\n- lerobot/robomme\n" in text
@@ -108,10 +108,10 @@ HOSTILE = (
 
 
 def test_hostile_goals_are_text(tmp_path: Path) -> None:
-    split = made_up(tmp_path, query={"goals": (HOSTILE,), "difficulty": HOSTILE})
+    buffer_set = made_up(tmp_path, query={"goals": (HOSTILE,), "difficulty": HOSTILE})
     for text in (
-        split_text(split, OF_SPLIT),
-        demonstrations_text(split),
+        buffer_set_text(buffer_set, OF_BUFFER_SET),
+        demonstrations_text(buffer_set),
     ):
         assert "{{ about }} &#124; \\`x\\` &lt;script&gt;" in text
         assert "<script" not in text
@@ -130,7 +130,7 @@ def test_hostile_goals_are_text(tmp_path: Path) -> None:
     ],
 )
 def test_hostile_sources_are_text(tmp_path: Path, source: dict[str, Any]) -> None:
-    text = split_text(made_up(tmp_path, identity={"sources": [source]}), OF_SPLIT)
+    text = buffer_set_text(made_up(tmp_path, identity={"sources": [source]}), OF_BUFFER_SET)
     assert "\n# x" not in text
     front = text.split("---\n")[1]
     assert "../" not in front
@@ -138,25 +138,25 @@ def test_hostile_sources_are_text(tmp_path: Path, source: dict[str, Any]) -> Non
     assert "`a/b@" not in text
 
 
-def test_a_split_of_the_own_family_is_labelled(
+def test_a_buffer_set_of_the_own_family_is_labelled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    split = made_up(tmp_path, conditions=("k0", "k1"))
-    [k0, k1] = split.manifests()
+    buffer_set = made_up(tmp_path, conditions=("k0", "k1"))
+    [k0, k1] = buffer_set.manifests()
     lesson, unit = k1.sessions
     own = replace(unit, family="MoveCube", source=lesson.source)
     other = BufferManifest(**{**vars(k1), "sessions": (lesson, own)})
     assert (count_same_family([k0, k1]), count_same_family([k0, other])) == (0, 1)
-    assert "own family" not in split_text(split, OF_SPLIT)
-    monkeypatch.setattr(split, "manifests", lambda: [k0, other])
-    text = split_text(split, OF_SPLIT)
+    assert "own family" not in buffer_set_text(buffer_set, OF_BUFFER_SET)
+    monkeypatch.setattr(buffer_set, "manifests", lambda: [k0, other])
+    text = buffer_set_text(buffer_set, OF_BUFFER_SET)
     assert "**Not the paper's protocol: 1 of 2 buffers hold" in text
-    assert any("own family" in one for one in split_facts(split).limits)
+    assert any("own family" in one for one in buffer_set_facts(buffer_set).limits)
 
 
 def test_conditions_and_limits_beyond_the_paper(tmp_path: Path) -> None:
-    split = made_up(tmp_path, conditions=("k0", "k2"), position_limit=None, seed=3)
-    text = split_text(split, OF_SPLIT)
+    buffer_set = made_up(tmp_path, conditions=("k0", "k2"), position_limit=None, seed=3)
+    text = buffer_set_text(buffer_set, OF_BUFFER_SET)
     assert "- Beyond the paper's conditions, `k2`: lesson, n units." in text
     assert "no limit on the length" in text
     assert "seed 3" in text
@@ -180,27 +180,31 @@ def test_where_episodes_come_from(simulators: list[str], told: str) -> None:
 
 def test_what_yielded_nothing_is_counted(tmp_path: Path) -> None:
     report = {"skipped": [{"episode_id": "MoveCube/train/9", "why": "short"}] * 3}
-    split = made_up(tmp_path, report=report)
-    assert "(3 recorded episodes yielded nothing here" in split_text(split, OF_SPLIT)
-    text = demonstrations_text(split)
+    buffer_set = made_up(tmp_path, report=report)
+    assert "(3 recorded episodes yielded nothing here" in buffer_set_text(buffer_set, OF_BUFFER_SET)
+    text = demonstrations_text(buffer_set)
     assert "3 recorded episodes yielded no demonstration" in text
 
 
 def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
-    split = made_up(tmp_path)
-    header = split.header
+    buffer_set = made_up(tmp_path)
+    header = buffer_set.header
     place = f"people/demonstrations@{COMMIT}"
     placed = replace(header.datasets["demonstrations"], place=place)
-    split.header = replace(header, datasets={**header.datasets, "demonstrations": placed})
-    assert f"| demonstrations | `{place}` |" in split_text(split, Publication("people/tiny"))
-    assert "| demonstrations | not published |" not in split_text(split, OF_SPLIT)
-    split.header = header
-    assert "| demonstrations | not published |" in split_text(split, Publication("people/tiny"))
+    buffer_set.header = replace(header, datasets={**header.datasets, "demonstrations": placed})
+    assert f"| demonstrations | `{place}` |" in buffer_set_text(
+        buffer_set, Publication("people/tiny")
+    )
+    assert "| demonstrations | not published |" not in buffer_set_text(buffer_set, OF_BUFFER_SET)
+    buffer_set.header = header
+    assert "| demonstrations | not published |" in buffer_set_text(
+        buffer_set, Publication("people/tiny")
+    )
 
 
-def test_a_split_without_buffers(tmp_path: Path) -> None:
+def test_a_buffer_set_without_buffers(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no buffers"):
-        film_of_split(made_up(tmp_path), (), ())
+        film_of_buffer_set(made_up(tmp_path), (), ())
 
 
 # --- results --------------------------------------------------------------------------------------
@@ -231,14 +235,14 @@ def test_results_of_rows_without_a_run(tmp_path: Path) -> None:
     assert "The run is" not in text
 
 
-def test_results_name_the_split_that_the_run_names(tmp_path: Path) -> None:
+def test_results_name_the_buffer_set_that_the_run_names(tmp_path: Path) -> None:
     place = f"people/tiny@{COMMIT}"
     (tmp_path / "rollouts.jsonl").write_bytes((RUN / "rollouts.jsonl").read_bytes())
     header = json.loads((RUN / "run.json").read_text())
-    header["starts"][0]["settings"]["split"] = place
+    header["starts"][0]["settings"]["buffer_set"] = place
     header["identity"]["policy"] = "a | `b`"
     write_json(tmp_path / "run.json", header)
     text = results_text(tmp_path, Publication("people/results"))
-    assert f"| published split | `{place}` |" in text
+    assert f"| published buffer set | `{place}` |" in text
     assert "source_datasets:\n- people/tiny\n" in text
     assert "| policy | <code>a &#124; &#96;b&#96;</code> |" in text

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.splits import (
+from support.buffer_sets import (
     CONDITIONS,
     GOLDEN,
     LESSON,
@@ -22,7 +22,7 @@ from support.splits import (
     with_sessions,
 )
 
-from robomme_interference_data import Buffer, DecodedCache, SessionEntry, load_split
+from robomme_interference_data import Buffer, DecodedCache, SessionEntry, load_buffer_set
 from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
@@ -30,18 +30,18 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.storage.files import LocalFiles
 
-SPLIT = load_split(GOLDEN)
+BUFFER_SET = load_buffer_set(GOLDEN)
 CAMERAS = ("front", "wrist")
 
 
 def buffer(condition: str = "k3", episode: str = QUERIES[1], **options: object) -> Buffer:
-    return load_split(GOLDEN, **options).load(episode, condition)  # type: ignore[arg-type]
+    return load_buffer_set(GOLDEN, **options).load(episode, condition)  # type: ignore[arg-type]
 
 
 def of_sessions(*entries: SessionEntry) -> Buffer:
     """A buffer that no condition has yet: any sessions in any order."""
     made = buffer()
-    return Buffer(with_sessions(made.manifest, *entries), made.query, SPLIT.datasets)
+    return Buffer(with_sessions(made.manifest, *entries), made.query, BUFFER_SET.datasets)
 
 
 def unusual() -> Buffer:
@@ -206,7 +206,7 @@ def test_chunk_must_be_positive(chunk: int) -> None:
 
 
 def test_the_query_needs_no_buffer() -> None:
-    query = SPLIT.query("PatternLock/test/0")
+    query = BUFFER_SET.query("PatternLock/test/0")
     assert str(query.episode_id) == "PatternLock/test/0"
     assert query.goal == "watch the video carefully, then do the PatternLock task again"
     assert (query.difficulty, query.simulator, query.lesson_frames) == ("easy", "sample", LESSON)
@@ -215,7 +215,7 @@ def test_the_query_needs_no_buffer() -> None:
         np.testing.assert_array_equal(query.frame(camera), frames[LESSON])
     states = stored_states("demonstrations", query.episode_id)
     np.testing.assert_array_equal(query.state(), states[LESSON])
-    made = SPLIT.load("PatternLock/test/0", "no-history")
+    made = BUFFER_SET.load("PatternLock/test/0", "no-history")
     assert made.query.record == query.record
     assert made.manifest.query == query.first_frame
     assert query.seed == made.manifest.seed
@@ -272,7 +272,7 @@ def test_verify_names_what_differs() -> None:
     made = buffer("k1")
     lesson, unit = made.manifest.sessions
     changed = with_sessions(made.manifest, lesson, replace(unit, sha256="0" * 64))
-    other = Buffer(changed, made.query, SPLIT.datasets)
+    other = Buffer(changed, made.query, BUFFER_SET.datasets)
     with pytest.raises(HashMismatchError, match=f"distractor {unit.source} .*recorded SHA-256"):
         other.verify()
 
@@ -291,18 +291,18 @@ def test_cached_frames_are_those_that_are_decoded(tmp_path: Path) -> None:
     assert len(list(cache.folder.iterdir())) == 4  # lesson and three units of the front camera
 
 
-def test_what_is_cached_is_not_decoded(tmp_path: Path, own_split: Path) -> None:
-    made = load_split(own_split, cache=tmp_path / "cache").load(QUERIES[1], "k1")
+def test_what_is_cached_is_not_decoded(tmp_path: Path, own_buffers: Path) -> None:
+    made = load_buffer_set(own_buffers, cache=tmp_path / "cache").load(QUERIES[1], "k1")
     before = made.frames("front")
-    for video in own_split.glob("*/videos/observation.images.front/*/*.mp4"):
+    for video in own_buffers.glob("*/videos/observation.images.front/*/*.mp4"):
         video.unlink()
-    again = load_split(own_split, cache=tmp_path / "cache").load(QUERIES[1], "k1")
+    again = load_buffer_set(own_buffers, cache=tmp_path / "cache").load(QUERIES[1], "k1")
     np.testing.assert_array_equal(again.frames("front"), before)
     held = replace(again.manifest.sessions[1], repeat=2)
     held_buffer = Buffer(
         with_sessions(again.manifest, held),
         again.query,
-        load_split(own_split).datasets,
+        load_buffer_set(own_buffers).datasets,
         cache=DecodedCache(tmp_path / "cache"),
     )
     np.testing.assert_array_equal(held_buffer.frames("front"), np.repeat(before[LESSON:], 2, 0))
@@ -311,7 +311,7 @@ def test_what_is_cached_is_not_decoded(tmp_path: Path, own_split: Path) -> None:
 def test_what_was_verified_never_takes_other_frames_from_the_cache(tmp_path: Path) -> None:
     cache = DecodedCache(tmp_path)
     expected = buffer("k1", cache=cache).frames()
-    made = load_split(GOLDEN, cache=cache).load(QUERIES[1], "k1", verify=True)
+    made = load_buffer_set(GOLDEN, cache=cache).load(QUERIES[1], "k1", verify=True)
     for read in (made.frames, lambda: np.concatenate([c.frames["front"] for c in made.stream(9)])):
         for path in tmp_path.iterdir():
             data = path.read_bytes()

@@ -117,7 +117,7 @@ def test_order() -> None:
             in_order(names)
 
 
-def test_what_a_split_must_hold() -> None:
+def test_what_a_buffer_set_must_hold() -> None:
     def needed(*names: str) -> tuple[str, ...]:
         return datasets_of(map(parse_condition, names))
 

@@ -25,11 +25,11 @@ def test_each_is_a_builtin_too_and_travels_between_processes(
 ) -> None:
     builtins = [base for base in error.__mro__ if base.__module__ == "builtins"]
     assert len(builtins) > 3  # beyond Exception, BaseException and object there is a telling one
-    raised = error("what was found", "what to do", "verify my-split")
+    raised = error("what was found", "what to do", "verify my-buffers")
     for one in (raised, pickle.loads(pickle.dumps(raised))):
         assert type(one) is error
         assert str(one) == "what was found\nwhat to do"
-        assert (one.hint, one.command) == ("what to do", "verify my-split")
+        assert (one.hint, one.command) == ("what to do", "verify my-buffers")
     assert str(error("only this")) == "only this"
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buffer_sets import LESSON, QUERIES
 from support.made_up import record
 from support.retrieval import remade
-from support.splits import LESSON, QUERIES
 
-from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load_split
+from robomme_interference_data import EpisodeId, SessionEntry, load_buffer, load_buffer_set
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.schema.evidence import (
@@ -112,22 +112,22 @@ def test_evidence_of_a_lesson_may_be_unknown(role: str) -> None:
     assert map_evidence(sessions, lambda entry: known.get(entry.dataset)) is None
 
 
-def test_a_buffer_tells_its_evidence(tiny_split: Path) -> None:
+def test_a_buffer_tells_its_evidence(tiny_buffers: Path) -> None:
     """The source `sample`: VideoRepick's gripper turns after 20 steps."""
-    opened = load_split(tiny_split)
+    opened = load_buffer_set(tiny_buffers)
     [lesson] = opened.manifest(QUERIES[0], "k0").sessions
-    whole = load_buffer(QUERIES[0], "k3", split=tiny_split)
+    whole = load_buffer(QUERIES[0], "k3", buffer_set=tiny_buffers)
     assert whole.evidence is not None
     assert [(one.span.text, one.start, one.stop) for one in whole.evidence] == [
         ("leaves the left edge", 0, 4),
         ("turns at the right edge", 16, 24),
     ]
     parts = replace(lesson, stop=20), replace(lesson, start=20)
-    parted = remade(tiny_split, (parts[1], parts[0]))
+    parted = remade(tiny_buffers, (parts[1], parts[0]))
     assert parted.evidence is not None
     turned = LESSON - 20
     assert places(parted.evidence) == [(1, 0, 4), (0, turned, turned + 4), (1, turned + 16, LESSON)]
-    nothing = load_buffer(QUERIES[0], "no-history", split=tiny_split)
+    nothing = load_buffer(QUERIES[0], "no-history", buffer_set=tiny_buffers)
     assert nothing.evidence == ()
 
 

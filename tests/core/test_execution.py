@@ -159,7 +159,7 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_function_says_what_has_to_be_the_same_everywhere() -> None:
     class Told(Noted):
         def describe(self) -> dict[str, str]:
-            return {"the split's revision": "abc"}
+            return {"the buffer set's revision": "abc"}
 
     assert {"python", "robomme-interference-data"} == describe(Noted()).keys()
-    assert describe(Told())["the split's revision"] == "abc"
+    assert describe(Told())["the buffer set's revision"] == "abc"

@@ -1,4 +1,4 @@
-"""A split from a stranger is data: whatever a file holds, reading it ends, within bounds."""
+"""A buffer set from a stranger is data: whatever a file holds, reading it ends, within bounds."""
 
 import json
 import random
@@ -13,17 +13,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.bombs import BOMBS
-from support.hostile import TARGETS, mutated, places
-from support.splits import (
+from support.buffer_sets import (
     GOLDEN,
     QUERIES,
     contents,
-    copy_split,
+    copy_buffer_set,
     expected_frames,
     with_sessions,
 )
+from support.hostile import TARGETS, mutated, places
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.codec import from_dict, to_dict
@@ -129,7 +129,7 @@ def test_every_bomb_has_its_message(told: dict[str, str]) -> None:
     ],
 )
 def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> None:
-    session = to_dict(load_buffer(QUERIES[0], "k1", split=GOLDEN).manifest.sessions[0])
+    session = to_dict(load_buffer(QUERIES[0], "k1", buffer_set=GOLDEN).manifest.sessions[0])
     assert from_dict(SessionEntry, session, "here")
     with pytest.raises(FormatError, match="here: .*session span"):
         from_dict(SessionEntry, session | change, "here")
@@ -137,7 +137,7 @@ def test_a_session_has_a_bounded_number_of_frames(change: dict[str, int]) -> Non
 
 @pytest.mark.parametrize("change", [{"repeat": 2**13}, {"repeat": 1}])
 def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, int]) -> None:
-    manifest = to_dict(load_buffer(QUERIES[0], "k1", split=GOLDEN).manifest)
+    manifest = to_dict(load_buffer(QUERIES[0], "k1", buffer_set=GOLDEN).manifest)
     many = [manifest["sessions"][1] | change] * (2**13 // change["repeat"])
     with pytest.raises(FormatError, match="in .* sessions; expected at most"):
         from_dict(BufferManifest, manifest | {"sessions": many * 2}, "here")
@@ -145,8 +145,8 @@ def test_a_buffer_has_a_bounded_number_of_frames_and_sessions(change: dict[str, 
 
 @pytest.mark.parametrize("called", ["../../written", "/written", "0" * 64, "", "x\0"])
 def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, called: str) -> None:
-    """Else a split could write elsewhere, or give another one its frames."""
-    root = copy_split(tmp_path / "split")
+    """Else a buffer set could write elsewhere, or give another one its frames."""
+    root = copy_buffer_set(tmp_path / "buffer_set")
     path = root / "distractors/meta/interference.parquet"
     rows = pq.read_table(path).to_pylist()
     for row in rows:
@@ -155,7 +155,7 @@ def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, cal
     before = contents(tmp_path)
     cache = tmp_path / "cache" / "inner"
     for _ in range(2):
-        buffer = load_buffer(QUERIES[0], "k1", split=root, cache=cache)
+        buffer = load_buffer(QUERIES[0], "k1", buffer_set=root, cache=cache)
         expected = expected_frames(buffer.manifest.sessions, "front")
         assert np.array_equal(buffer.frames(), expected)
         streamed = [chunk.frames["front"] for chunk in buffer.stream(cameras=["front"])]
@@ -165,19 +165,19 @@ def test_the_cache_keeps_frames_under_their_own_digest_alone(tmp_path: Path, cal
 
 
 def test_frames_that_take_too_much_at_once_are_refused(tmp_path: Path) -> None:
-    root = copy_split(tmp_path / "split")
+    root = copy_buffer_set(tmp_path / "buffer_set")
     info = root / "demonstrations/meta/info.json"
     told = json.loads(info.read_text())
     told["features"]["observation.images.front"]["shape"] = [4096, 4096, 3]
     info.write_text(json.dumps(told))
-    buffer = load_buffer(QUERIES[0], "k7", split=root)
-    short = load_buffer(QUERIES[0], "no-history", split=root)
+    buffer = load_buffer(QUERIES[0], "k7", buffer_set=root)
+    short = load_buffer(QUERIES[0], "no-history", buffer_set=root)
     assert len(buffer) * 4096 * 4096 * 3 <= 16 * 2**30  # so its videos are looked at
     with pytest.raises(FormatError, match="pixels; the dataset's info.json says 4096×4096"):
         buffer.frames()
     assert short.frames().shape == (0, 4096, 4096, 3)
     many = with_sessions(buffer.manifest, *buffer.manifest.sessions * 8)
-    held = Buffer(many, buffer.query, load_split(root).datasets)
+    held = Buffer(many, buffer.query, load_buffer_set(root).datasets)
     with pytest.raises(FormatError, match="are held at once") as caught:
         held.frames()
     assert "stream" in str(caught.value.hint)

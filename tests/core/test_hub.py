@@ -13,7 +13,7 @@ from huggingface_hub import HfApi, constants
 from support.hub_server import HubServer
 from support.lerobot_layouts import write_lerobot
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import (
     FormatError,
@@ -90,7 +90,7 @@ def test_no_path_leads_out(hub: HubServer, path: str) -> None:
 @pytest.mark.parametrize("text", ["./a/b", "a//b", "a/b/"])
 def test_a_folder_that_is_not_there_is_not_asked_for_on_the_hub(hub: HubServer, text: str) -> None:
     with pytest.raises(InvalidOptionError, match="neither a folder nor"):
-        load_split(text)
+        load_buffer_set(text)
     assert hub.requests == []
 
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from huggingface_hub import constants
-from support.hub import BASE, SPLIT, push_split, running_hub
+from support.buffer_sets import GOLDEN
+from support.hub import BASE, BUFFER_SET, push_buffer_set, running_hub
 from support.hub_server import HubServer
 from support.machine import full_disk
-from support.splits import GOLDEN
 
-from robomme_interference_data import Buffer, load_buffer, load_split
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data import Buffer, load_buffer, load_buffer_set
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 
 Run = Callable[..., tuple[int, str, str]]
@@ -29,17 +29,17 @@ STATES = r"/data/.*\.parquet"
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
     with running_hub(tmp_path / "cache", monkeypatch) as server:
-        push_split(server, GOLDEN, tmp_path / "work")
+        push_buffer_set(server, GOLDEN, tmp_path / "work")
         yield server
 
 
 def load() -> Buffer:
-    return load_buffer(QUERY, "k3", split=SPLIT, revision=VERSION, verify=True)
+    return load_buffer(QUERY, "k3", buffer_set=BUFFER_SET, revision=VERSION, verify=True)
 
 
 def whole() -> bool:
     """Whether the buffer comes as it is on disk."""
-    return np.array_equal(load().frames(), load_buffer(QUERY, "k3", split=GOLDEN).frames())
+    return np.array_equal(load().frames(), load_buffer(QUERY, "k3", buffer_set=GOLDEN).frames())
 
 
 @pytest.mark.parametrize("path", [ROWS, VIDEO, STATES])
@@ -88,7 +88,7 @@ def test_a_full_disk(hub: HubServer, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("where", ["cache", "folder"])
 def test_a_full_disk_while_fetching(hub: HubServer, tmp_path: Path, run: Run, where: str) -> None:
-    out, command = tmp_path / "out", ["fetch", f"{SPLIT}@{VERSION}", "--to", tmp_path / "out"]
+    out, command = tmp_path / "out", ["fetch", f"{BUFFER_SET}@{VERSION}", "--to", tmp_path / "out"]
     if where == "folder":
         assert run(*command[:2])[0] == 0
     with full_disk(12_000):
@@ -99,13 +99,13 @@ def test_a_full_disk_while_fetching(hub: HubServer, tmp_path: Path, run: Run, wh
     assert "space left on the disk" in err
     assert leftovers(tmp_path) == [] and not (out / "manifests" / "manifest.json").exists()
     assert run(*command)[0] == 0
-    assert [*verify_split(load_split(out))] == []
+    assert [*verify_buffer_set(load_buffer_set(out))] == []
 
 
 def test_a_cache_that_cannot_be_written(
     hub: HubServer, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ("fetch", f"{SPLIT}@{VERSION}", "--conditions", "k1")
+    command = ("fetch", f"{BUFFER_SET}@{VERSION}", "--conditions", "k1")
     (tmp_path / "file").write_bytes(b"")  # a folder's rights would not bind root
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "file" / "cache"))
     code, _, err = run(*command)
@@ -118,21 +118,21 @@ def test_a_cache_that_cannot_be_written(
 
 @pytest.mark.parametrize("revision", [VERSION, "main"])
 def test_a_cache_that_can_only_be_read(hub: HubServer, tmp_path: Path, revision: str) -> None:
-    loaded = load_buffer(QUERY, "k3", split=SPLIT, revision=revision).frames()
+    loaded = load_buffer(QUERY, "k3", buffer_set=BUFFER_SET, revision=revision).frames()
     for folder in (
         "cache/.locks",
-        *[f"cache/datasets--{one.replace('/', '--')}/refs" for one in (SPLIT, BASE)],
+        *[f"cache/datasets--{one.replace('/', '--')}/refs" for one in (BUFFER_SET, BASE)],
     ):
         shutil.rmtree(tmp_path / folder, ignore_errors=True)
         (tmp_path / folder).write_bytes(b"")
     before = len(hub.downloads())
-    again = load_buffer(QUERY, "k3", split=SPLIT, revision=revision, verify=True)
+    again = load_buffer(QUERY, "k3", buffer_set=BUFFER_SET, revision=revision, verify=True)
     assert np.array_equal(again.frames(), loaded)
     assert len(hub.downloads()) == before
 
 
 def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> None:
-    command = ("fetch", f"{SPLIT}@{VERSION}", "--to", tmp_path / "out")
+    command = ("fetch", f"{BUFFER_SET}@{VERSION}", "--to", tmp_path / "out")
     hub.fault("GET", VIDEO, after=3, call=partial(os.kill, os.getpid(), signal.SIGINT))
     code, _, err = run(*command)
     assert code == 130 and "kept; go on with:\nrobomme-interference fetch" in err
@@ -143,8 +143,8 @@ def test_stopped_while_fetching(hub: HubServer, tmp_path: Path, run: Run) -> Non
     assert len(came) - len({*came}) <= 8  # those that were on their way come again
 
 
-def test_nothing_is_asked_of_a_split_that_is_open(hub: HubServer) -> None:
-    split = load_split(SPLIT, revision=VERSION)
-    split.load(QUERY, "k3")
+def test_nothing_is_asked_of_a_buffer_set_that_is_open(hub: HubServer) -> None:
+    buffer_set = load_buffer_set(BUFFER_SET, revision=VERSION)
+    buffer_set.load(QUERY, "k3")
     hub.down = True
-    split.load(QUERY, "k3", verify=True)
+    buffer_set.load(QUERY, "k3", verify=True)

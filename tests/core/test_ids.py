@@ -55,7 +55,7 @@ def test_the_scene_of_another_answer() -> None:
     assert EpisodeId("MoveCube", "test", 1, 2).scene == EpisodeId("MoveCube", "test", 1)
 
 
-def test_a_slip_in_the_split_is_offered() -> None:
+def test_a_slip_in_the_buffer_set_is_offered() -> None:
     with pytest.raises(InvalidIdError) as caught:
         EpisodeId.parse("MoveCube/tset/1")
     assert caught.value.hint == "Did you mean 'test'?"

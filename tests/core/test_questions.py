@@ -1,4 +1,4 @@
-"""Questions as a split has them: how they are stored, and what is refused."""
+"""Questions as a buffer set has them: how they are stored, and what is refused."""
 
 import json
 from collections.abc import Callable
@@ -8,10 +8,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.splits import copy_split
+from support.buffer_sets import copy_buffer_set
 from support.tabletop import QUERIES, TABLETOP, copy_tabletop
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import QUESTIONS_PATH
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
@@ -66,7 +66,7 @@ def test_the_columns_are_these() -> None:
 
 
 def test_the_golden_questions() -> None:
-    found = read_questions(load_split(TABLETOP))
+    found = read_questions(load_buffer_set(TABLETOP))
     assert tuple(found) == QUERIES
     one, peg = found[MOVE], found[EpisodeId("InsertPeg", "test", 0)]
     assert one.text == "In which manner was the cube moved to the target?"
@@ -118,19 +118,19 @@ DAMAGED: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damage_is_one_error(tmp_path: Path, name: str) -> None:
     change, words = DAMAGED[name]
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     rewrite(root, change)
     with pytest.raises(FormatError) as raised:
-        read_questions(load_split(root))
+        read_questions(load_buffer_set(root))
     assert words in raised.value.message and str(root / QUESTIONS_PATH) in raised.value.message
 
 
 @pytest.mark.parametrize("data", [b"", b"PAR1", b"questions", b"PAR1" + b"\xff" * 100 + b"PAR1"])
 def test_what_is_no_table(tmp_path: Path, data: bytes) -> None:
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     (root / QUESTIONS_PATH).write_bytes(data)
     with pytest.raises(FormatError, match=QUESTIONS_PATH):
-        read_questions(load_split(root))
+        read_questions(load_buffer_set(root))
 
 
 @pytest.mark.parametrize(
@@ -144,39 +144,39 @@ def test_what_is_no_table(tmp_path: Path, data: bytes) -> None:
 def test_questions_of_other_demonstrations_are_stale(
     tmp_path: Path, change: Any, words: str
 ) -> None:
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     rewrite(root, change)
     with pytest.raises(FormatError, match=words) as raised:
-        read_questions(load_split(root))
+        read_questions(load_buffer_set(root))
     assert raised.value.command == f"build questions {root}"
 
 
 def test_further_columns_are_left_aside(tmp_path: Path) -> None:
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     rewrite(root, lambda table: table.append_column("colour", pa.array(["red"] * len(table))))
-    assert len(read_questions(load_split(root))) == len(QUERIES)
+    assert len(read_questions(load_buffer_set(root))) == len(QUERIES)
 
 
-def test_a_split_without_questions_says_how_to_make_them(tmp_path: Path) -> None:
-    root = copy_split(tmp_path / "split")
+def test_a_buffer_set_without_questions_says_how_to_make_them(tmp_path: Path) -> None:
+    root = copy_buffer_set(tmp_path / "buffer_set")
     with pytest.raises(MissingFileError, match="has no questions") as raised:
-        read_questions(load_split(root))
+        read_questions(load_buffer_set(root))
     assert raised.value.command == f"build questions {root}"
     (root / QUESTIONS_PATH).mkdir()
     with pytest.raises(InterferenceError):
-        read_questions(load_split(root))
+        read_questions(load_buffer_set(root))
 
 
 # --- the command `question` --------------------------------------------------------------------
 
 
 def test_a_question_is_shown_in_words_and_as_a_picture(tmp_path: Path, run: Any) -> None:
-    code, out, err = run("question", MOVE, "--split", TABLETOP, "--out", tmp_path / "q.png")
-    one = read_questions(load_split(TABLETOP))[MOVE]
+    code, out, err = run("question", TABLETOP, MOVE, "--out", tmp_path / "q.png")
+    one = read_questions(load_buffer_set(TABLETOP))[MOVE]
     assert code == 0 and str(tmp_path / "q.png") in err
     assert (tmp_path / "q.png").read_bytes() == one.picture
     assert [line[10:] for line in out.splitlines()[1:]] == [one.text, *one.lines, "A"]
-    code, out, _ = run("question", MOVE, "--split", TABLETOP, "--json")
+    code, out, _ = run("question", TABLETOP, MOVE, "--json")
     assert code == 0 and json.loads(out)["options"] == list(one.lines)
 
 
@@ -186,9 +186,9 @@ def test_a_question_is_shown_in_words_and_as_a_picture(tmp_path: Path, run: Any)
         (("MoveCube/test/9",), "'MoveCube/test/9' is not in"),
         (("MoveCube",), "is not an episode id"),
         ((MOVE, "--out", "q.svg"), "a name that ends in .png"),
-        ((MOVE, "--out", TABLETOP / "manifests" / "q.png"), "whose files are a split's"),
+        ((MOVE, "--out", TABLETOP / "manifests" / "q.png"), "whose files are a buffer set's"),
     ],
 )
 def test_what_cannot_be_shown(words: tuple[object, ...], message: str, run: Any) -> None:
-    code, out, err = run("question", *words, "--split", TABLETOP)
+    code, out, err = run("question", TABLETOP, *words)
     assert (code, out) == (1, "") and message in err

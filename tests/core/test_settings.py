@@ -14,11 +14,11 @@ from robomme_interference_data.schema.settings import setting
 
 @dataclass(frozen=True)
 class Config:
-    split: Path = setting(help="The split.", name="-")
+    buffer_set: Path = setting(help="The buffer set.", name="-")
     out: Path = setting(help="The folder.")
     families: tuple[str, ...] = setting(("all",), help="Families.")
     source: tuple[str, ...] = setting((), help="Sources.", whole=True)
-    episode_split: str = setting("test", help="Split.")
+    split: str = setting("test", help="Split.")
     k: int | None = setting(None, help="Number.", env="OF_THE_TEST_K")
     videos: bool = setting(False, help="Clips.", name="--videos")
 
@@ -52,7 +52,7 @@ def test_defaults_are_those_of_the_dataclass() -> None:
 def test_lists_are_repeated_or_separated_by_commas(families: list[str]) -> None:
     repeated = [word for family in families for word in ("--families", family)]
     config, _ = called(*repeated, "S", "--out", "o")
-    assert (config.split, config.families) == (Path("S"), ("A", "B", "C"))
+    assert (config.buffer_set, config.families) == (Path("S"), ("A", "B", "C"))
 
 
 def test_whole_values_keep_their_commas() -> None:
@@ -62,8 +62,8 @@ def test_whole_values_keep_their_commas() -> None:
 
 def test_all_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OF_THE_TEST_K", "7")
-    config, as_json = called("S", "--videos", "--episode-split=val", "--out=o", "--json")
-    assert config == Config(Path("S"), Path("o"), k=7, episode_split="val", videos=True)
+    config, as_json = called("S", "--videos", "--split=val", "--out=o", "--json")
+    assert config == Config(Path("S"), Path("o"), k=7, split="val", videos=True)
     assert as_json
 
 

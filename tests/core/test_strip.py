@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.buffer_sets import QUERIES
 from support.retrieval import remade
-from support.splits import QUERIES
 
-from robomme_interference_data import Buffer, load_buffer, load_split
+from robomme_interference_data import Buffer, load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.viz.filmstrip import (
@@ -48,21 +48,21 @@ def coarse(image: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.array([[f.mean((0, 1)) for f in np.array_split(r, 4, axis=1)] for r in rows])
 
 
-def of_lengths(split: Path, frames: Sequence[int], **changes: object) -> Buffer:
+def of_lengths(buffer_set: Path, frames: Sequence[int], **changes: object) -> Buffer:
     """A lesson and then units in turn, of so many frames each: more are had by holding them."""
-    lesson, *units = load_split(split).manifest(QUERIES[0], "k3").sessions
+    lesson, *units = load_buffer_set(buffer_set).manifest(QUERIES[0], "k3").sessions
     entries = []
     for number, count in enumerate(frames):
         entry = units[number % 3] if number else lesson
         repeat = -(-count // entry.stop)
         entries.append(replace(entry, stop=count // repeat, repeat=repeat))
-    return remade(split, entries, **changes)
+    return remade(buffer_set, entries, **changes)
 
 
 @pytest.fixture(scope="module")
-def buffer(tiny_split: Path) -> Buffer:
+def buffer(tiny_buffers: Path) -> Buffer:
     """A lesson of 48 frames and three units of 32."""
-    return load_buffer(QUERIES[0], "k3", split=tiny_split)
+    return load_buffer(QUERIES[0], "k3", buffer_set=tiny_buffers)
 
 
 @pytest.fixture(scope="module")
@@ -134,9 +134,9 @@ def test_shows_the_right_frames_in_order_and_the_live_one_last(strip: Path, buff
 @pytest.mark.parametrize(
     "frames", [[36], [1, 1], [1100, *[32] * 15]], ids=["k0", "tiny", "long-k15"]
 )
-def test_any_number_of_sessions(tiny_split: Path, tmp_path: Path, frames: list[int]) -> None:
+def test_any_number_of_sessions(tiny_buffers: Path, tmp_path: Path, frames: list[int]) -> None:
     out = tmp_path / "strip.svg"
-    made = of_lengths(tiny_split, frames)
+    made = of_lengths(tiny_buffers, frames)
     draw_strip(made, out, camera="wrist")
     lengths = [len(session) for session in made.sessions]
     found = labels(out)
@@ -162,14 +162,14 @@ def test_any_number_of_sessions(tiny_split: Path, tmp_path: Path, frames: list[i
     ids=["dollars", "control characters", "Chinese", "long"],
 )
 def test_odd_goals(
-    tiny_split: Path,
+    tiny_buffers: Path,
     tmp_path: Path,
     goal: str,
     line: str,
     count: int,
     recwarn: pytest.WarningsRecorder,
 ) -> None:
-    draw_strip(of_lengths(tiny_split, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
+    draw_strip(of_lengths(tiny_buffers, [36, 32], goals=(goal,)), tmp_path / "strip.svg")
     ET.parse(tmp_path / "strip.svg")
     lines = labels(tmp_path / "strip.svg")[2 : 2 + count]
     assert lines[0].startswith(line) and (count == 1 or lines[3].endswith(" word199"))

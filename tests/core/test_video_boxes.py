@@ -10,7 +10,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.storage.untrusted.video_boxes import _check_declared, find_container

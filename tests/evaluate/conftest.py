@@ -1,4 +1,4 @@
-"""The world of the tests of rollouts: a simulator without physics over the tiny split."""
+"""The world of the tests of rollouts: a simulator without physics over the tiny buffer set."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,9 +9,9 @@ from support.policy_server import PolicyServer
 
 
 @pytest.fixture
-def world(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the simulator `support.worlds:World` find the split, in other processes too."""
-    monkeypatch.setenv(worlds.SPLIT, str(tiny_split))
+def world(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the simulator `support.worlds:World` find the buffer set, in other processes too."""
+    monkeypatch.setenv(worlds.BUFFER_SET, str(tiny_buffers))
 
 
 @pytest.fixture

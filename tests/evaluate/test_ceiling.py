@@ -8,13 +8,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from support.buffer_sets import copy_buffer_set
 from support.made_up import record
 from support.retrieval import make_index
 from support.shifted import add_shifted
-from support.splits import copy_split
 
-from robomme_interference_data import load_split
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.evaluate.ceiling import ALL, ceiling, chance
@@ -25,61 +25,65 @@ from robomme_interference_data.simulators.tabletop.episodes import difficulty_of
 from robomme_interference_data.simulators.tabletop.families import draw_episode
 
 
-def kept(split: Path, **settings: Any) -> dict[tuple[str, str], float | None]:
-    cells = ceiling(load_split(split), CeilingConfig(**settings))
+def kept(buffer_set: Path, **settings: Any) -> dict[tuple[str, str], float | None]:
+    cells = ceiling(load_buffer_set(buffer_set), CeilingConfig(**settings))
     assert all(cell.success is None for cell in cells)  # made-up episodes have no answers
     return {(cell.family, cell.condition): cell.evidence_kept for cell in cells}
 
 
-def test_evidence_kept_by_hand(tiny_split: Path) -> None:
+def test_evidence_kept_by_hand(tiny_buffers: Path) -> None:
     """Lessons of 48 frames show the answer in frames 0 to 3, and in eight round 20, 35 and 41."""
     families = ("VideoRepick", "MoveCube", "PatternLock")
-    window = kept(tiny_split, memory="window", conditions=("k0", "k1"))
+    window = kept(tiny_buffers, memory="window", conditions=("k0", "k1"))
     # Of 48 frames the last 31 begin with 17; of 80 none is of the lesson.
     assert window == {
         **{(family, "k0"): 0.5 for family in (*families, ALL)},
         **{(family, "k1"): 0 for family in (*families, ALL)},
     }
     # Of 272 frames every ninth: 0, 8, 17, 26, 35, 43.
-    assert set(kept(tiny_split, conditions=("k7",)).values()) == {1}
-    assert set(kept(tiny_split, conditions=("no-history",)).values()) == {None}  # without a lesson
+    assert set(kept(tiny_buffers, conditions=("k7",)).values()) == {1}
+    assert set(kept(tiny_buffers, conditions=("no-history",)).values()) == {
+        None
+    }  # without a lesson
 
 
 def test_a_retrieval_step_in_front(tmp_path: Path) -> None:
-    split = copy_split(tmp_path / "split")
-    make_index(split)
-    found = kept(split, memory="window", retrieval="thumbnail", retrieval_rule="oracle")
+    buffer_set = copy_buffer_set(tmp_path / "buffer_set")
+    make_index(buffer_set)
+    found = kept(buffer_set, memory="window", retrieval="thumbnail", retrieval_rule="oracle")
     assert {condition for _, condition in found} == {"k0", "k1", "k3", "k7"}  # without a history
     assert set(found.values()) == {0.5}  # of the lesson alone, whatever follows it
-    last = kept(split, memory="full", retrieval="thumbnail", retrieval_rule="last")
+    last = kept(buffer_set, memory="full", retrieval="thumbnail", retrieval_rule="last")
     assert last["MoveCube", "k7"] == 0
 
 
 def test_retrieval_by_what_is_seen_under_a_shift(tmp_path: Path) -> None:
-    split = copy_split(tmp_path / "split")
-    add_shifted(split)
-    make_index(split, names=("demonstrations", "distractors", "shifted"))
+    buffer_set = copy_buffer_set(tmp_path / "buffer_set")
+    add_shifted(buffer_set)
+    make_index(buffer_set, names=("demonstrations", "distractors", "shifted"))
     options: dict[str, Any] = {"memory": "full", "retrieval": "thumbnail", "conditions": ("k7",)}
-    plain, same, black = (kept(split, shift=s, **options) for s in ("none", "light:1", "clutter:3"))
+    plain, same, black = (
+        kept(buffer_set, shift=s, **options) for s in ("none", "light:1", "clutter:3")
+    )
     assert plain == same != black  # light:1 looks as always, clutter:3 is black
     with pytest.raises(InvalidOptionError, match="the shift light:1 says nothing"):
-        ceiling(load_split(split), CeilingConfig(shift="light:1"))
+        ceiling(load_buffer_set(buffer_set), CeilingConfig(shift="light:1"))
 
 
-def test_what_cannot_be_told(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    split = load_split(tiny_split)
+def test_what_cannot_be_told(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    buffer_set = load_buffer_set(tiny_buffers)
     with pytest.raises(UnknownNameError, match=r"'framesmap'(.|\n)*framesamp"):
-        ceiling(split, CeilingConfig("framesmap"))
+        ceiling(buffer_set, CeilingConfig("framesmap"))
     with pytest.raises(UnknownNameError, match="k9"):
-        ceiling(split, CeilingConfig(conditions=("k9",)))
+        ceiling(buffer_set, CeilingConfig(conditions=("k9",)))
     with pytest.raises(InvalidOptionError, match="`retrieval_rule` has no effect"):
-        ceiling(split, CeilingConfig(retrieval_rule="last"))
+        ceiling(buffer_set, CeilingConfig(retrieval_rule="last"))
     with pytest.raises(InvalidOptionError, match="nothing to retrieve from under no-history"):
-        ceiling(split, CeilingConfig(retrieval="thumbnail", conditions=("no-history", "k0")))
+        ceiling(buffer_set, CeilingConfig(retrieval="thumbnail", conditions=("no-history", "k0")))
     untold = SimpleNamespace(record=SimpleNamespace(evidence=None))
-    monkeypatch.setattr(Split, "query", lambda *_: untold)
+    monkeypatch.setattr(BufferSet, "query", lambda *_: untold)
     with pytest.raises(InvalidOptionError, match="unknown which frames"):
-        ceiling(split, CeilingConfig())
+        ceiling(buffer_set, CeilingConfig())
 
 
 # --- the ideal observer --------------------------------------------------------------------------

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import QUERIES, copy_buffer_set
 from support.retrieval import QUIET, make_index
 from support.runs import CHEAT, config, run, run_one
-from support.splits import QUERIES, copy_split
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import (
@@ -56,7 +56,7 @@ SAYS = {"policy": "python:support.own_policies:says"}
         ({"simulator": "tabletop"}, InvalidOptionError, "recorded on 'sample', the run is on"),
         ({"shift": "fog:1"}, InvalidOptionError, "shift 'fog:1'; expected none, or light"),
         ({"shift": "light:2"}, InvalidOptionError, "on support.worlds:World: it cannot"),
-        ({"episode_split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
+        ({"split": "tset"}, InvalidOptionError, "'tset' is none of train, val, test"),
         ({"conditions": ("k2",)}, UnknownNameError, "condition 'k2' is not in"),
         ({"workers": 0}, InvalidOptionError, "workers 0; expected more than 0"),
         ({"rollout_timeout": float("nan")}, InvalidOptionError, "rollout_timeout nan"),
@@ -83,14 +83,14 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
 
 
 def test_every_condition_must_have_its_indexes(tmp_path: Path) -> None:
-    split, source = copy_split(tmp_path / "split"), SampleSource(size=32)
+    buffer_set, source = copy_buffer_set(tmp_path / "buffer_set"), SampleSource(size=32)
     listed = list_episodes((source,), split="test", families=[one.split("/")[0] for one in QUERIES])
     tasks = tuple((number, source.contradict(one)) for number, one in listed)
     plan = BuildPlan(CONTRADICTIONS, (source,), tasks)
-    build_dataset(plan, split / CONTRADICTIONS, Serial(), QUIET)
-    sum(write_manifests(plan_manifests(in_folder(split), ("k0", "stale-k0")), split))
-    make_index(split)
-    asked = {"split": split, "retrieval": "thumbnail", "families": ("MoveCube",)}
+    build_dataset(plan, buffer_set / CONTRADICTIONS, Serial(), QUIET)
+    sum(write_manifests(plan_manifests(in_folder(buffer_set), ("k0", "stale-k0")), buffer_set))
+    make_index(buffer_set)
+    asked = {"buffer_set": buffer_set, "retrieval": "thumbnail", "families": ("MoveCube",)}
     with pytest.raises(MissingIndexError, match=f"{CONTRADICTIONS} has no embeddings"):
         run(tmp_path / "run", **asked, conditions=("k0", "stale-k0"))
     assert not (tmp_path / "run").exists()
@@ -182,34 +182,34 @@ def test_only_what_somebody_looks_at_is_drawn() -> None:
     assert options("robomme", "front", **oracle)["subgoals"] is True
 
 
-def test_recall_needs_evidence(tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    split = load_split(tiny_split)
-    queries = {one: split.query(one) for one in split.episode_ids}
+def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    buffer_set = load_buffer_set(tiny_buffers)
+    queries = {one: buffer_set.query(one) for one in buffer_set.episode_ids}
     known = {one: replace(q, record=replace(q.record, evidence=None)) for one, q in queries.items()}
-    monkeypatch.setattr(split, "query", lambda episode: known[episode])
+    monkeypatch.setattr(buffer_set, "query", lambda episode: known[episode])
     settings = config(policy="recall:window")
-    plan = plan_work(split.episode_ids, conditions=("k0",))
+    plan = plan_work(buffer_set.episode_ids, conditions=("k0",))
     with pytest.raises(InvalidOptionError, match=r"MoveCube/test/0|VideoRepick/test/0") as raised:
-        check_plan(settings, name_system("recall-window"), split, plan, plan.items())
+        check_plan(settings, name_system("recall-window"), buffer_set, plan, plan.items())
     assert "docs/sources.md" in (raised.value.hint or "")
 
 
 # --- names -------------------------------------------------------------------------------------
 
 
-def check_name(tiny_split: Path, system: str, **changes: Any) -> None:
+def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop"} | changes)
-    check_settings(settings, system, load_split(tiny_split), make_policy("hold"))
+    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("hold"))
 
 
-def test_replay_that_goes_on_is_a_system_of_its_own(tiny_split: Path) -> None:
+def test_replay_that_goes_on_is_a_system_of_its_own(tiny_buffers: Path) -> None:
     going = {"policy": "replay:framesamp", "policy_options": ("go_on=true",)}
     assert default_system(config(**going)) == "replay-framesamp-go-on"
     step = going | {"retrieval": "thumbnail"}
     assert default_system(config(**step)) == "retrieval-replay-framesamp-go-on"
-    check_name(tiny_split, "replay-framesamp-go-on", **going)
+    check_name(tiny_buffers, "replay-framesamp-go-on", **going)
     with pytest.raises(InvalidOptionError, match="is not the control replay-framesamp"):
-        check_name(tiny_split, "replay-framesamp", **going)
+        check_name(tiny_buffers, "replay-framesamp", **going)
 
 
 @pytest.mark.parametrize(
@@ -227,13 +227,13 @@ def test_replay_that_goes_on_is_a_system_of_its_own(tiny_split: Path) -> None:
     ],
 )
 def test_a_name_of_the_table_is_for_the_policy_that_it_stands_for(
-    tiny_split: Path, policy: str, system: str, words: str | None
+    tiny_buffers: Path, policy: str, system: str, words: str | None
 ) -> None:
     if words is None:
-        check_name(tiny_split, system, policy=policy)
+        check_name(tiny_buffers, system, policy=policy)
         return
     with pytest.raises(InvalidOptionError, match=words) as raised:
-        check_name(tiny_split, system, policy=policy)
+        check_name(tiny_buffers, system, policy=policy)
     assert raised.value.hint is not None and "name of your own" in raised.value.hint
 
 
@@ -248,20 +248,20 @@ def test_a_name_of_the_table_is_for_the_policy_that_it_stands_for(
     ],
 )
 def test_rows_are_named_after_policy_and_retrieval_step(
-    tiny_split: Path, step: dict[str, str], name: str
+    tiny_buffers: Path, step: dict[str, str], name: str
 ) -> None:
     assert default_system(config(policy="replay:window", **step)) == name
-    check_name(tiny_split, name, policy="replay:window", **step)
+    check_name(tiny_buffers, name, policy="replay:window", **step)
     if "retrieval_rule" in step:
         with pytest.raises(InvalidOptionError, match="not the control"):
-            check_name(tiny_split, "retrieval-replay-window", policy="replay:window", **step)
+            check_name(tiny_buffers, "retrieval-replay-window", policy="replay:window", **step)
     assert default_system(config(policy="python:my.module:make")) == "my.module-make"
 
 
-def test_the_papers_retrieval_system_chooses_by_max(tiny_split: Path) -> None:
+def test_the_papers_retrieval_system_chooses_by_max(tiny_buffers: Path) -> None:
     served = {"policy": "websocket://h:1", "retrieval": "siglip"}
-    check_name(tiny_split, "retrieval-framesamp-modul", **served)
+    check_name(tiny_buffers, "retrieval-framesamp-modul", **served)
     with pytest.raises(InvalidOptionError, match="chooses by max, not by last"):
-        check_name(tiny_split, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
+        check_name(tiny_buffers, "retrieval-framesamp-modul", retrieval_rule="last/0.9", **served)
     with pytest.raises(InvalidOptionError, match="has no retrieval step, and one is given"):
-        check_name(tiny_split, "perceptual-framesamp-modul", **served)
+        check_name(tiny_buffers, "perceptual-framesamp-modul", **served)

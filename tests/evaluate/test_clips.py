@@ -23,8 +23,8 @@ K1 = WorkItem("k1", EPISODE)
 
 
 @pytest.fixture
-def buffer(tiny_split: Path) -> Buffer:
-    return load_buffer(EPISODE, "k1", split=tiny_split)
+def buffer(tiny_buffers: Path) -> Buffer:
+    return load_buffer(EPISODE, "k1", buffer_set=tiny_buffers)
 
 
 def frames(path: Path) -> list[np.ndarray]:

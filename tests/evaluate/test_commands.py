@@ -32,8 +32,8 @@ def type_in(line: str) -> Any:
     return CliRunner().invoke(APP, line.split())
 
 
-def test_ceiling_prints_a_table_or_json(tiny_split: Path) -> None:
-    line = f"ceiling {tiny_split} --memory window --conditions k0,k1"
+def test_ceiling_prints_a_table_or_json(tiny_buffers: Path) -> None:
+    line = f"ceiling {tiny_buffers} --memory window --conditions k0,k1"
     done = type_in(line)
     assert done.exit_code == 0, done.output
     lines = [line.split() for line in done.stdout.splitlines()]
@@ -49,9 +49,11 @@ def test_ceiling_prints_a_table_or_json(tiny_split: Path) -> None:
 
 
 @pytest.mark.parametrize("families", ["MoveCube --families VideoRepick", "MoveCube,VideoRepick"])
-def test_evaluate_writes_the_rows_as_json(tmp_path: Path, tiny_split: Path, families: str) -> None:
-    line = f"evaluate --policy hold {USUAL} --families {families} --conditions no-history,k1 --json"
-    done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'}")
+def test_evaluate_writes_the_rows_as_json(
+    tmp_path: Path, tiny_buffers: Path, families: str
+) -> None:
+    line = f"evaluate {tiny_buffers} --policy hold {USUAL} --families {families} --conditions no-history,k1 --json"
+    done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 0, done.output
     assert [
         (row["family"], row["condition"], row["status"]) for row in json.loads(done.stdout)
@@ -63,9 +65,9 @@ def test_evaluate_writes_the_rows_as_json(tmp_path: Path, tiny_split: Path, fami
     ]
 
 
-def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_split: Path) -> None:
-    line = f"evaluate --policy python:support.own_policies:Still {USUAL} --families MoveCube"
-    line += f" --split {tiny_split} --out {tmp_path / 'run'} --policy-option gripper=-1"
+def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_buffers: Path) -> None:
+    line = f"evaluate {tiny_buffers} --policy python:support.own_policies:Still {USUAL} --families MoveCube"
+    line += f" --out {tmp_path / 'run'} --policy-option gripper=-1"
     done = type_in(line)
     assert done.exit_code == 0, done.output
     assert "1 of 1 rollouts in" in done.stdout and "0/1 0%" in done.stdout
@@ -74,11 +76,13 @@ def test_options_of_the_policy_are_typed(tmp_path: Path, tiny_split: Path) -> No
 
 
 def test_what_broke_is_told_with_the_command_to_go_on(
-    tmp_path: Path, trouble: Path, tiny_split: Path
+    tmp_path: Path, trouble: Path, tiny_buffers: Path
 ) -> None:
     (trouble / "MoveCube-0").write_text("raise")
-    line = f"evaluate --policy hold {USUAL} --families MoveCube --conditions no-history"
-    done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'} --max-errors 1")
+    line = (
+        f"evaluate {tiny_buffers} --policy hold {USUAL} --families MoveCube --conditions no-history"
+    )
+    done = type_in(f"{line} --out {tmp_path / 'run'} --max-errors 1")
     assert done.exit_code == 1
     assert "1 rollouts broke (see" in done.stderr
     assert "Stopped: 1 in a row broke" in done.stderr
@@ -86,12 +90,12 @@ def test_what_broke_is_told_with_the_command_to_go_on(
 
 
 def test_a_full_disk_names_the_file_and_the_command_to_go_on(
-    tmp_path: Path, tiny_split: Path
+    tmp_path: Path, tiny_buffers: Path
 ) -> None:
-    line = f"evaluate --policy python:support.own_policies:Filler {USUAL} --families MoveCube"
+    line = f"evaluate {tiny_buffers} --policy python:support.own_policies:Filler {USUAL} --families MoveCube"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
-        done = type_in(f"{line} --split {tiny_split} --out {tmp_path / 'run'}")
+        done = type_in(f"{line} --out {tmp_path / 'run'}")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert isinstance(done.exception, OSError)
@@ -102,13 +106,13 @@ def test_a_full_disk_names_the_file_and_the_command_to_go_on(
 
 @pytest.mark.parametrize("begun", [True, False])
 def test_a_stop_tells_of_rollouts_only_where_there_are_some(
-    begun: bool, tmp_path: Path, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
+    begun: bool, tmp_path: Path, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run_module, "_run_items" if begun else "plan_work", stop)
-    line = f"evaluate --policy hold {USUAL} --families MoveCube --split {tiny_split}"
+    line = f"evaluate {tiny_buffers} --policy hold {USUAL} --families MoveCube"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 130 and "go on with:\nrobomme-interference" in done.stderr
     assert (f"Finished rollouts are in {tmp_path / 'run'}" in done.stderr) == begun

@@ -24,7 +24,7 @@ def test_every_setting_is_classed() -> None:
         *("policy", "policy_options"),  # by policy_identity
         *("retrieval", "retrieval_rule", "retrieval_camera"),  # by Selector.identity
         *("subgoals", "subgoal_prompt", "subgoal_options"),  # by subgoals_identity
-        *("system", "simulator", "split", "episode_split", "shift", "model_seed"),
+        *("system", "simulator", "buffer_set", "split", "shift", "model_seed"),
     }
     plan = {"families", "episodes", "conditions", "shard"}
     may_differ = {

@@ -7,7 +7,7 @@ from support.runs import EPISODE, roll
 from support.worlds import Cheat
 
 from robomme_interference_data import load_buffer
-from robomme_interference_data.data.buffer_set import Split
+from robomme_interference_data.data.buffer_set import BufferSet
 
 pytestmark = pytest.mark.usefixtures("world")
 
@@ -27,8 +27,8 @@ def test_without_history_even_a_cheat_sees_nothing_of_the_demonstration() -> Non
 
 
 def test_a_buffer_that_is_not_empty_is_found_too(
-    monkeypatch: pytest.MonkeyPatch, tiny_split: Any
+    monkeypatch: pytest.MonkeyPatch, tiny_buffers: Any
 ) -> None:
-    lesson = load_buffer(EPISODE, "k0", split=tiny_split)
-    monkeypatch.setattr(Split, "load", lambda *_, **__: lesson)
+    lesson = load_buffer(EPISODE, "k0", buffer_set=tiny_buffers)
+    monkeypatch.setattr(BufferSet, "load", lambda *_, **__: lesson)
     assert roll("no-history", Cheat()).status == "success"

@@ -34,7 +34,7 @@ ROWS = list(KNOWN.values())
 @pytest.mark.parametrize("name", ["run", "not-utf-8-\udcff"])
 def test_golden_files(tmp_path: Path, name: str) -> None:
     out = tmp_path / name
-    with open_log(out, HEADER.identity, HEADER.split) as log:
+    with open_log(out, HEADER.identity, HEADER.buffer_set) as log:
         log.begin(HEADER.starts[0])
         for row in ROWS:
             log.append(row, trace="Traceback\n…" if row.error else None)
@@ -47,7 +47,7 @@ def test_golden_files(tmp_path: Path, name: str) -> None:
 
 def test_a_killed_run_stands_as_its_record_says(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with open_log(out, HEADER.identity, "my-split") as log:
+    with open_log(out, HEADER.identity, "my-buffers") as log:
         log.begin(HEADER.starts[0])
         for row in ROWS[:2]:
             log.append(row)
@@ -83,7 +83,7 @@ def test_a_line_that_was_cut_short_is_dropped_and_only_that_one(
     (out / "rollouts.jsonl").write_bytes(text)
     kept = text.count(b"\n")
     assert list(read_record(out).values()) == ROWS[:kept]
-    with open_log(out, HEADER.identity, "my-split") as log:
+    with open_log(out, HEADER.identity, "my-buffers") as log:
         assert list(log.rows.values()) == ROWS[:kept]
     assert (out / "rollouts.jsonl").read_bytes() == b"".join(whole.splitlines(True)[:kept])
 

@@ -32,7 +32,7 @@ def test_shards_make_the_run(tmp_path: Path) -> None:
     assert untimed(merged.rows) == untimed(whole.rows)
     assert (merged.planned, merged.missing, merged.broken, merged.duplicates) == (4, (), (), ())
     found, one = header(tmp_path / "merged"), header(tmp_path / "whole")
-    for name in ("identity", "plans", "counts", "planned", "status", "split"):
+    for name in ("identity", "plans", "counts", "planned", "status", "buffer_set"):
         assert found[name] == one[name]
     assert found["merged"] == ["shard-1", "shard-2", "shard-3"]
     assert len(found["starts"]) == 3

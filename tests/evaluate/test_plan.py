@@ -50,12 +50,12 @@ def test_the_order_of_input_does_not_matter(known: list[EpisodeId], names: list[
             "MoveCube/test/3 and 1 more\nIt has episodes 0-2,5 of",
         ),
         (
-            {"episode_split": "val", "families": ["MoveCube"]},
+            {"split": "val", "families": ["MoveCube"]},
             UnknownNameError,
             "It has none of MoveCube/val",
         ),
         ({"families": ["MoveCub"]}, UnknownNameError, "Did you mean 'MoveCube'?"),
-        ({"episode_split": "train"}, InvalidOptionError, "no train episode\nSet `episode_split`"),
+        ({"split": "train"}, InvalidOptionError, "no train episode\nSet `split`"),
         ({"episodes": "3-1"}, InvalidOptionError, "not a list of episode numbers"),
         ({"conditions": ["k0", "k64"]}, InvalidIdError, "'k64' is not a condition"),
         ({"conditions": ["k0", "k0"]}, InvalidOptionError, "each once"),
@@ -108,6 +108,6 @@ def test_a_header_plans_no_more_than_can_be_listed() -> None:
     conditions = tuple(f"k{k}" for k in range(64))
     plans = tuple(Plan({"MoveCube/test": f"0-{16_000 + n}"}, conditions) for n in range(2))
     assert plans[0].most == 64 * 16_001
-    assert RunHeader(1, {}, "split", plans[:1]).plans == plans[:1]
+    assert RunHeader(1, {}, "buffer_set", plans[:1]).plans == plans[:1]
     with pytest.raises(FormatError, match="rollouts; expected at most"):
-        RunHeader(1, {}, "split", plans)
+        RunHeader(1, {}, "buffer_set", plans)

@@ -20,7 +20,7 @@ PLAN = [
 def row(item: WorkItem, status: str) -> Rollout:
     success = None if status == "error" else status == "success"
     return Rollout(
-        *("mine", "world", "split", "r", item.episode.family, item.condition, "test"),
+        *("mine", "world", "buffer_set", "r", item.episode.family, item.condition, "test"),
         *(item.episode.index, "none", 0, 1, 7, "easy", "a goal", status, success, 0, 0, 0, None),
         error="it \x1b[2Jbroke" if status == "error" else None,
     )

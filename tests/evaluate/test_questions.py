@@ -9,6 +9,7 @@ import numpy as np
 import openai
 import pytest
 from support.asking import ask, behind, look, pixels, questions, right_letter
+from support.buffer_sets import copy_buffer_set
 from support.chat_server import (
     BROKEN,
     BUSY,
@@ -25,7 +26,6 @@ from support.chat_server import (
 )
 from support.retrieval import make_index
 from support.runs import header
-from support.splits import copy_split
 from support.tabletop import (
     LESSON,
     NOBODY,
@@ -36,7 +36,7 @@ from support.tabletop import (
     shown,
 )
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.questions import write_questions
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
 from robomme_interference_data.data.questions import Question, digest_questions, read_questions
@@ -118,12 +118,12 @@ def test_who_has_seen_a_part_draws_from_what_is_left(tmp_path: Path) -> None:
 
 
 def test_guesses_are_right_by_chance() -> None:
-    split = load_split(TABLETOP)
+    buffer_set = load_buffer_set(TABLETOP)
     hits, expected, variance = 0, 0.0, 0.0
     for episode, question in questions().items():
         for seed in range(100):
             asked = Prompted(
-                question, split.query(episode), seed, None, lambda: np.empty(0, np.uint8)
+                question, buffer_set.query(episode), seed, None, lambda: np.empty(0, np.uint8)
             )
             hits += guess(asked) == question.letters[question.right]
             expected += question.chance
@@ -153,7 +153,7 @@ def test_the_kept_frames_and_no_others_are_sent(
     with ChatServer(lambda seen: "B") as server:
         [row] = ask(tmp_path / "run", **ONE, **behind(server, **settings)).rows
         [seen] = server.seen
-    buffer = load_split(TABLETOP).load(MOVE, row.condition)
+    buffer = load_buffer_set(TABLETOP).load(MOVE, row.condition)
     expected = buffer.frames("front")
     assert len(seen.images) == len(kept) + 1
     for image, place in zip(seen.images, kept, strict=False):
@@ -217,13 +217,13 @@ def test_controls_hide_the_past_or_all_images(tmp_path: Path) -> None:
 
 
 def test_retrieval_in_front(tmp_path: Path) -> None:
-    split = copy_tabletop(tmp_path / "split")
-    make_index(split)
+    buffer_set = copy_tabletop(tmp_path / "buffer_set")
+    make_index(buffer_set)
     found = {}
     with ChatServer(look) as server:
         for rule in ("oracle", "last"):
             settings = {"retrieval": "thumbnail", "retrieval_rule": rule, "sampling": "full"}
-            settings |= {"split": split, "conditions": ("k1",), "families": ("MoveCube",)}
+            settings |= {"buffer_set": buffer_set, "conditions": ("k1",), "families": ("MoveCube",)}
             rows = ask(tmp_path / rule, **behind(server, **settings)).rows
             found[rule] = {(row.success, row.lesson_frames) for row in rows}
             own = ask(tmp_path / f"recall-{rule}", **settings).rows
@@ -311,14 +311,14 @@ def test_a_token_count_that_no_file_can_hold_is_a_fault(
 
 
 def test_a_damaged_picture_breaks_its_question_alone(tmp_path: Path) -> None:
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     damaged = [
         dataclasses.replace(one, picture=one.picture[:500]) if one.episode_id == MOVE else one
         for one in questions().values()
     ]
     write_questions(damaged, root)
     with ChatServer(look) as server:
-        rows = ask(tmp_path / "run", split=root, **behind(server, frames=3, **FOUR)).rows
+        rows = ask(tmp_path / "run", buffer_set=root, **behind(server, frames=3, **FOUR)).rows
     broken, *others = rows
     assert broken.episode_id == MOVE and "MoveCube/test/0: an image is damaged" in str(broken.error)
     assert [row.status for row in others] == ["success"] * 3
@@ -333,7 +333,7 @@ def test_every_setting_is_classed() -> None:
         *("model", "model_options", "prompt"),  # by model_identity, and the prompt's digest
         *("retrieval", "retrieval_rule", "retrieval_camera"),  # by Selector.identity
         *("frames", "sampling", "control"),
-        *("system", "split", "episode_split", "model_seed"),
+        *("system", "buffer_set", "split", "model_seed"),
     }
     plan = {"families", "episodes", "conditions", "shard"}
     who = {"workers", "executor", "ray_address", "cpus_per_worker", "gpus_per_worker"}
@@ -383,8 +383,8 @@ def test_what_may_differ_goes_on_with_the_run(tmp_path: Path) -> None:
 
 
 def test_other_questions_make_another_run(tmp_path: Path) -> None:
-    root = copy_tabletop(tmp_path / "split")
-    ask(tmp_path / "run", split=root)
+    root = copy_tabletop(tmp_path / "buffer_set")
+    ask(tmp_path / "run", buffer_set=root)
     turned = [
         dataclasses.replace(
             one,
@@ -396,11 +396,11 @@ def test_other_questions_make_another_run(tmp_path: Path) -> None:
     ]
     write_questions(turned, root)
     with pytest.raises(RunFolderError, match="questions is"):
-        ask(tmp_path / "run", split=root)
+        ask(tmp_path / "run", buffer_set=root)
     told = header(tmp_path / "run")["identity"]["questions"]
     assert told == digest_questions(questions().values())
     # The ideal observer is right whatever the order, if it has seen all.
-    full = ask(tmp_path / "full", split=root, sampling="full")
+    full = ask(tmp_path / "full", buffer_set=root, sampling="full")
     assert full.counts["success"] == len(QUERIES)
 
 
@@ -434,34 +434,34 @@ def test_settings_are_checked_before_the_first_question(
 
 def test_where_answers_are_not_known_a_model_can_be_asked(tmp_path: Path) -> None:
     """Questions that others have made of other demonstrations, in the same format."""
-    root = copy_split(tmp_path / "split")
-    split = load_split(root)
-    revision = split.datasets[DEMONSTRATIONS].identity.revision
+    root = copy_buffer_set(tmp_path / "buffer_set")
+    buffer_set = load_buffer_set(root)
+    revision = buffer_set.datasets[DEMONSTRATIONS].identity.revision
     picture = questions()[MOVE].picture
     write_questions(
         [
             Question(episode, revision, "Which?", ("red", "blue"), (0, 1), 1, picture)
-            for episode in split.episode_ids
+            for episode in buffer_set.episode_ids
         ],
         root,
     )
-    assert len(read_questions(split)) == 3
+    assert len(read_questions(buffer_set)) == 3
     with pytest.raises(InvalidOptionError, match="recall does not know"):
-        ask(tmp_path / "recall", split=root)
+        ask(tmp_path / "recall", buffer_set=root)
     with ChatServer(lambda seen: "B") as server:
-        rows = ask(tmp_path / "run", split=root, **behind(server, frames=3)).rows
+        rows = ask(tmp_path / "run", buffer_set=root, **behind(server, frames=3)).rows
     assert [(row.status, row.chance) for row in rows] == [("success", 0.5)] * 3
-    assert len(ask(tmp_path / "guess", split=root, model="guess").rows) == 3
+    assert len(ask(tmp_path / "guess", buffer_set=root, model="guess").rows) == 3
 
 
 def test_stale_or_damaged_questions_are_refused(tmp_path: Path) -> None:
-    root = copy_tabletop(tmp_path / "split")
+    root = copy_tabletop(tmp_path / "buffer_set")
     (root / "questions.parquet").write_bytes(b"PAR1")
     with pytest.raises(FormatError, match="questions.parquet"):
-        ask(tmp_path / "run", split=root)
+        ask(tmp_path / "run", buffer_set=root)
     write_questions([dataclasses.replace(o, revision="0") for o in questions().values()], root)
     with pytest.raises(FormatError, match="other demonstrations"):
-        ask(tmp_path / "run", split=root)
+        ask(tmp_path / "run", buffer_set=root)
     assert not (tmp_path / "run").exists()
 
 
@@ -487,12 +487,24 @@ def test_the_command_prints_results_and_how_to_resume(
     monkeypatch.setattr(evaluation, "make_executor", lambda config: Serial())
     with ChatServer(look, faults=[BROKEN] * 9) as server:
         usual = {"model": f"openai:{server.url}#tiny", "system": "tiny", "families": "MoveCube"}
-        usual |= {"split": TABLETOP, "out": tmp_path / "run", "conditions": "k0", "max-errors": 1}
+        usual |= {
+            "out": tmp_path / "run",
+            "conditions": "k0",
+            "max-errors": 1,
+        }
         usual |= {"model-option": "repeats=0"}
-        line = ["ask", *(str(word) for one in usual.items() for word in (f"--{one[0]}", one[1]))]
+        line = [
+            "ask",
+            str(TABLETOP),
+            *(str(word) for one in usual.items() for word in (f"--{one[0]}", one[1])),
+        ]
         code, _, err = run(*line)
         assert code == 1 and "Stopped: 1 in a row broke" in err and "1 questions broke" in err
-        assert err.rstrip().splitlines()[-1].startswith("robomme-interference ask --model 'openai:")
+        assert (
+            err.rstrip()
+            .splitlines()[-1]
+            .startswith(f"robomme-interference ask {TABLETOP} --model 'openai:")
+        )
         server.faults = []
         code, out, _ = run(*line)
     assert code == 0 and "2 of 2 questions" in out and "chance is 33.3%" in out

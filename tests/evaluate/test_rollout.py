@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.runs import EPISODE, roll, run
 from support.worlds import Cheat, World
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.errors import (
     HistoryTooLongError,
@@ -31,10 +31,10 @@ pytestmark = pytest.mark.usefixtures("world")
 
 
 @pytest.mark.parametrize("chunk", [10, 500])
-def test_the_history_is_the_buffer_in_chunks(chunk: int, tiny_split: Path) -> None:
+def test_the_history_is_the_buffer_in_chunks(chunk: int, tiny_buffers: Path) -> None:
     policy = Cheat()
     roll("k3", policy, history_chunk=chunk)
-    buffer = load_split(tiny_split).load(EPISODE, "k3")
+    buffer = load_buffer_set(tiny_buffers).load(EPISODE, "k3")
     assert len(buffer) == 48 + 3 * 32
     np.testing.assert_array_equal(np.stack(policy.states), buffer.states)
     sizes = [size for size, _ in policy.chunks]
@@ -155,11 +155,11 @@ def test_what_retrieval_chose_keeps_the_position_limit() -> None:
 # --- the row -----------------------------------------------------------------------------------
 
 
-def test_the_row_says_what_was_given(tiny_split: Path) -> None:
-    row, split = roll("k3", Cheat()), load_split(tiny_split)
-    manifest = split.manifest(EPISODE, "k3")
+def test_the_row_says_what_was_given(tiny_buffers: Path) -> None:
+    row, buffer_set = roll("k3", Cheat()), load_buffer_set(tiny_buffers)
+    manifest = buffer_set.manifest(EPISODE, "k3")
     assert row.key == (
-        *("mine", "support.worlds:World", "split", split.revision),
+        *("mine", "support.worlds:World", "buffer_set", buffer_set.revision),
         *("MoveCube", "k3", "test", 0, "none", 0, 1),
     )
     assert (row.seed, row.difficulty, row.goal) == (

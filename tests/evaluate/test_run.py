@@ -262,12 +262,14 @@ def test_a_run_that_stopped_before_its_header_begins_again(tmp_path: Path) -> No
         run(out)
 
 
-def test_the_split_may_lie_elsewhere_and_keeps_its_label(tmp_path: Path, tiny_split: Path) -> None:
+def test_the_buffer_set_may_lie_elsewhere_and_keeps_its_label(
+    tmp_path: Path, tiny_buffers: Path
+) -> None:
     run_one(tmp_path / "run")
-    moved = shutil.copytree(tiny_split, tmp_path / "moved")
-    both = run(tmp_path / "run", split=moved, conditions=("no-history",))
-    assert [(row.family, row.split) for row in both.rows] == [
-        ("VideoRepick", "split"),
-        ("MoveCube", "split"),
+    moved = shutil.copytree(tiny_buffers, tmp_path / "moved")
+    both = run(tmp_path / "run", buffer_set=moved, conditions=("no-history",))
+    assert [(row.family, row.buffer_set) for row in both.rows] == [
+        ("VideoRepick", "buffer_set"),
+        ("MoveCube", "buffer_set"),
     ]
     assert len(read_record(tmp_path / "run")) == 2

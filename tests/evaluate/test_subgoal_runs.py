@@ -22,7 +22,7 @@ from support.own_policies import Told
 from support.policy_server import PolicyServer
 from support.runs import config, header, roll, run, run_one
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.errors import (
     InterferenceError,
     InvalidOptionError,
@@ -151,9 +151,9 @@ def test_a_wrong_model_is_refused_before_the_run(tmp_path: Path) -> None:
 # --- names and settings --------------------------------------------------------------------------
 
 
-def checked(tiny_split: Path, system: str, **changes: Any) -> None:
+def checked(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop", "policy": "websocket://h:1"} | changes)
-    check_settings(settings, system, load_split(tiny_split), make_policy("hold"))
+    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("hold"))
 
 
 MODEL = {"subgoals": "openai:http://h/v1#m"}
@@ -170,8 +170,8 @@ MODEL = {"subgoals": "openai:http://h/v1#m"}
         ("mine", {**MODEL, "policy": TOLD}),
     ],
 )
-def test_what_goes_together(tiny_split: Path, system: str, changes: dict[str, Any]) -> None:
-    checked(tiny_split, system, **changes)
+def test_what_goes_together(tiny_buffers: Path, system: str, changes: dict[str, Any]) -> None:
+    checked(tiny_buffers, system, **changes)
 
 
 @pytest.mark.parametrize(
@@ -188,9 +188,11 @@ def test_what_goes_together(tiny_split: Path, system: str, changes: dict[str, An
         ("mine", {**MODEL, "subgoal_prompt": "nowhere.toml"}, "no prompt"),
     ],
 )
-def test_what_does_not(tiny_split: Path, system: str, changes: dict[str, Any], words: str) -> None:
+def test_what_does_not(
+    tiny_buffers: Path, system: str, changes: dict[str, Any], words: str
+) -> None:
     with pytest.raises(InterferenceError) as raised:
-        checked(tiny_split, system, **changes)
+        checked(tiny_buffers, system, **changes)
     assert words in raised.value.message
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.worlds import split_here
+from support.worlds import buffer_set_here
 
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate.models.model import ChatModel, Message, Part, Reply, Video
@@ -43,7 +43,7 @@ def seen(number: int) -> Observation:
 
 
 def begun(model: ChatModel, condition: str = "k0", prompt: str = "grounded", **o: int) -> Any:
-    buffer = split_here().load("MoveCube/test/0", condition)
+    buffer = buffer_set_here().load("MoveCube/test/0", condition)
     writer = ModelWriter(model, prompt, **o)
     info = RolloutInfo("move it", len(buffer), 0)
     writer.start(History(buffer, range(len(buffer))), info, None)  # type: ignore[arg-type]
@@ -65,7 +65,7 @@ def test_it_is_shown_an_even_sample_of_the_history_and_what_is_seen_now() -> Non
     assert told(writer, 7, 0) == Subgoal("pick it up at <point>", ((128, 64),))
     [parts] = model.asked
     [video] = [part for part in parts if isinstance(part, Video)]
-    frames = split_here().load("MoveCube/test/0", "k0").frames("front")
+    frames = buffer_set_here().load("MoveCube/test/0", "k0").frames("front")
     # 48 frames: 0, 47/4 = 11.75, 23.5, 35.25, 47; 47 tenths of a second, 4 steps.
     assert np.array_equal(video.frames, frames[[0, 11, 23, 35, 47]])
     assert video.fps == pytest.approx(4 / 4.7)

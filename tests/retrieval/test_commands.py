@@ -9,10 +9,10 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from support.buffer_sets import QUERIES
 from support.retrieval import FRAMES, change_header, remade
-from support.splits import QUERIES
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.retrieval import drawing, explain, select
 
 Run = Callable[..., tuple[int, str, str]]
@@ -38,18 +38,18 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 # --- index -------------------------------------------------------------------------------------
 
 
-def test_index(own_split: Path, run: Run) -> None:
-    places = [f"{own_split}/{name}/index/thumbnail" for name in ("demonstrations", "distractors")]
-    code, out, err = run("index", own_split, "--encoder", "thumbnail", "--threads", 1)
+def test_index(own_buffers: Path, run: Run) -> None:
+    places = [f"{own_buffers}/{name}/index/thumbnail" for name in ("demonstrations", "distractors")]
+    code, out, err = run("index", own_buffers, "--encoder", "thumbnail", "--threads", 1)
     assert code == 0 and "frames/s" in err
     assert out.splitlines() == [
         f"{place}: {count} frames, {count} embedded now"
         for place, count in zip(places, FRAMES, strict=True)
     ]
-    header = own_split / "distractors/index/thumbnail/index.json"
+    header = own_buffers / "distractors/index/thumbnail/index.json"
     change_header(header, computed={"in": "cuda, bfloat16", "batch": 32})
-    assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_split)[2]
-    code, out, err = run("index", own_split, "--json")
+    assert f"{places[1]} is kept, computed with cuda, bfloat16, 32" in run("index", own_buffers)[2]
+    code, out, err = run("index", own_buffers, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
     assert [(one["folder"], one["header"]["frames"], one["embedded"]) for one in found] == [
@@ -111,8 +111,8 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
     found = json.loads(runs[0][1])
     cells = {(cell["family"], cell["condition"]): cell for cell in found.pop("cells")}
     assert found == {
-        "split": "split",
-        "revision": load_split(indexed).revision,
+        "buffer_set": "buffer_set",
+        "revision": load_buffer_set(indexed).revision,
         "encoder": "thumbnail",
         "camera": "front",
         "shift": "none",
@@ -129,7 +129,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("index nowhere", "build all --source KIND:PATH"),
+        ("index nowhere", "build all nowhere --source KIND:PATH"),
         ("index {bare} --encoder thumbnial", "Did you mean 'thumbnail'"),
         ("index {bare} --encoder thumbnail:x", "expected thumbnail"),
         ("index {bare} --encoder siglip:", "siglip:ID"),
@@ -139,21 +139,21 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
         ("index {bare} --threads 0", "threads 0"),
         ("index {bare} --workers 0", "workers 0"),
         ("retrieval-score {bare}", "robomme-interference index {bare} --encoder thumbnail"),
-        ("retrieval-score {split} --rules best", "there is no method 'best'"),
-        ("retrieval-score {split} --encoder clip", "there is no encoder 'clip'"),
-        (f"retrieve {EPISODE} k2 --split {{split}}", "condition 'k2'"),
-        (f"retrieve {EPISODE} no-history --split {{split}}", "the history is empty"),
-        ("retrieve VideoRepick/test/9 k1 --split {split}", "VideoRepick/test/9"),
-        (f"retrieve {EPISODE} k1 --split {{split}} --out why.gif", "ends in"),
-        ("calibrate {split} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
+        ("retrieval-score {buffer_set} --rules best", "there is no method 'best'"),
+        ("retrieval-score {buffer_set} --encoder clip", "there is no encoder 'clip'"),
+        (f"retrieve {{buffer_set}} {EPISODE} k2", "condition 'k2'"),
+        (f"retrieve {{buffer_set}} {EPISODE} no-history", "the history is empty"),
+        ("retrieve {buffer_set} VideoRepick/test/9 k1", "VideoRepick/test/9"),
+        (f"retrieve {{buffer_set}} {EPISODE} k1 --out why.gif", "ends in"),
+        ("calibrate {buffer_set} --sweep 0.9 0.8", "sweep (0.9, 0.8)"),
     ],
 )
-def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_split: Path) -> None:
-    places = {"split": indexed, "bare": tiny_split}
+def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_buffers: Path) -> None:
+    places = {"buffer_set": indexed, "bare": tiny_buffers}
     code, out, err = run(*words.format(**places).split())
     assert (code, out) == (1, "")
     assert said.format(**places) in err and "Traceback" not in err
-    assert not list(tiny_split.glob("*/index"))
+    assert not list(tiny_buffers.glob("*/index"))
 
 
 # --- retrieve ----------------------------------------------------------------------------------
@@ -161,7 +161,7 @@ def test_refusals(words: str, said: str, run: Run, indexed: Path, tiny_split: Pa
 
 def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
     out_file = tmp_path / "why.png"
-    words = ("retrieve", EPISODE, "k3", "--split", indexed, "--out", out_file)
+    words = ("retrieve", indexed, EPISODE, "k3", "--out", out_file)
     code, out, err = run(*words, "--rule", "oracle")
     assert code == 0 and f"{out_file} written" in err
     first, chosen, why, closest, lesson = out.splitlines()
@@ -179,7 +179,7 @@ def test_why(run: Run, tmp_path: Path, indexed: Path) -> None:
 
 @pytest.mark.parametrize("rule", ["max/-1", "mean/-1", "last/-1"])
 def test_why_is_the_reason_of_the_rule(rule: str, run: Run, indexed: Path) -> None:
-    words = ("retrieve", EPISODE, "k1", "--split", indexed, "--rule", rule)
+    words = ("retrieve", indexed, EPISODE, "k1", "--rule", rule)
     code, out, _ = run(*words)
     method, why = rule.partition("/")[0], out.splitlines()[2]
     assert code == 0 and why.startswith(f"Why: {method} takes {select.METHODS[method]}")
@@ -204,7 +204,7 @@ def test_why_is_the_reason_of_the_rule(rule: str, run: Run, indexed: Path) -> No
 def test_why_wherever_the_lesson_lies(
     order: list[int], said: str, indexed: Path, tmp_path: Path
 ) -> None:
-    planned = load_split(indexed).manifest(EPISODE, "k1").sessions
+    planned = load_buffer_set(indexed).manifest(EPISODE, "k1").sessions
     buffer = remade(indexed, [planned[number] for number in order])
     rule = select.Rule("max", -1.0)
     measured = select.measure(buffer, "thumbnail")
@@ -237,7 +237,7 @@ def test_calibration(run: Run, tmp_path: Path, indexed: Path) -> None:
     swept = [round(0.8 + n / 100, 2) for n in range(20)]
     assert [trial["threshold"] for trial in found["sweep"][::4]] == swept
     # Units return in many buffers, and cuts under several conditions: each counts once.
-    rows = list(load_split(indexed).manifests(condition="k7"))
+    rows = list(load_buffer_set(indexed).manifests(condition="k7"))
     pairs = {(a.source, b.source) for m in rows for a, b in pairwise(m.sessions)}
     assert len(found["cuts"]) == len(pairs)
     assert len(found["lowest"]) == len({s.source for m in rows for s in m.sessions})

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from support.buffer_sets import QUERIES, UNITS
 from support.retrieval import (
     FRAMES,
     QUIET,
@@ -19,9 +20,8 @@ from support.retrieval import (
     make_index,
     remade,
 )
-from support.splits import QUERIES, UNITS
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.data.embeddings import EmbeddingIndex
 from robomme_interference_data.errors import BuildError, MissingIndexError
@@ -34,15 +34,15 @@ from robomme_interference_data.storage.staging import file_lock, staging_path
 GOLDEN = Path(__file__).parents[1] / "golden" / "index"
 
 
-def units_index(split: Path, camera: str = "front") -> EmbeddingIndex:
-    return load_split(split).datasets["distractors"].index("thumbnail", camera)
+def units_index(buffer_set: Path, camera: str = "front") -> EmbeddingIndex:
+    return load_buffer_set(buffer_set).datasets["distractors"].index("thumbnail", camera)
 
 
 # --- what it holds -----------------------------------------------------------------------------
 
 
 def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
-    buffer = load_buffer(QUERIES[0], "k3", split=indexed)
+    buffer = load_buffer(QUERIES[0], "k3", buffer_set=indexed)
     found = buffer.embeddings("thumbnail")
     assert found.dtype == np.float32 and found.shape == (48 + 3 * 32, 528)
     assert np.linalg.norm(found, axis=1) == pytest.approx(1, abs=1e-6)
@@ -56,8 +56,10 @@ def test_a_buffers_embeddings_are_those_of_its_frames(indexed: Path) -> None:
 
 
 def test_embeddings_are_the_callers(indexed: Path) -> None:
-    assert load_buffer(QUERIES[0], "no-history", split=indexed).embeddings("thumbnail").size == 0
-    buffer = load_buffer(QUERIES[0], "k0", split=indexed)
+    assert (
+        load_buffer(QUERIES[0], "no-history", buffer_set=indexed).embeddings("thumbnail").size == 0
+    )
+    buffer = load_buffer(QUERIES[0], "k0", buffer_set=indexed)
     once = buffer.embeddings("thumbnail")
     kept = once.copy()
     once += 1
@@ -67,7 +69,7 @@ def test_embeddings_are_the_callers(indexed: Path) -> None:
 
 
 def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None:
-    datasets = load_split(indexed).datasets
+    datasets = load_buffer_set(indexed).datasets
     units, images = datasets["distractors"], np.empty((UNITS, 32, 32, 32, 3), np.uint8)
     for episode in range(UNITS):
         units.read_frames(episode, "front", 0, images[episode])
@@ -82,14 +84,14 @@ def test_centre_and_typical_cosine_are_of_the_units_alone(indexed: Path) -> None
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors"])
-def test_a_dataset_is_indexed_on_its_own(indexed: Path, own_split: Path, name: str) -> None:
-    build_index([own_split / name], Thumbnail(), QUIET)
+def test_a_dataset_is_indexed_on_its_own(indexed: Path, own_buffers: Path, name: str) -> None:
+    build_index([own_buffers / name], Thumbnail(), QUIET)
     both = files_of(indexed).items()
-    assert files_of(own_split) == {k: v for k, v in both if k.startswith(f"{name}/")}
+    assert files_of(own_buffers) == {k: v for k, v in both if k.startswith(f"{name}/")}
 
 
 def test_a_live_frame_has_the_embedding_of_the_stored_one(indexed: Path) -> None:
-    buffer = load_buffer(QUERIES[0], "k3", split=indexed)
+    buffer = load_buffer(QUERIES[0], "k3", buffer_set=indexed)
     index, stored = buffer.index("thumbnail"), buffer.embeddings("thumbnail")
     for place in (0, 47, 48, 100):
         live = index.embed(Thumbnail().prepare(buffer.frame(place)[None]))[0]
@@ -109,23 +111,23 @@ def test_normalising(features: np.ndarray, centred: bool) -> None:
 
 
 def test_datasets_that_a_buffer_does_not_need_may_lack_an_index(
-    indexed: Path, tiny_split: Path
+    indexed: Path, tiny_buffers: Path
 ) -> None:
-    split = load_split(indexed)
-    expected = split.load(QUERIES[0], "k1").embeddings("thumbnail")
-    other = load_split(tiny_split).datasets["demonstrations"]
-    split.datasets = {**split.datasets, "contradictions": other}  # type: ignore[misc]
-    assert np.array_equal(split.load(QUERIES[0], "k1").embeddings("thumbnail"), expected)
+    buffer_set = load_buffer_set(indexed)
+    expected = buffer_set.load(QUERIES[0], "k1").embeddings("thumbnail")
+    other = load_buffer_set(tiny_buffers).datasets["demonstrations"]
+    buffer_set.datasets = {**buffer_set.datasets, "contradictions": other}  # type: ignore[misc]
+    assert np.array_equal(buffer_set.load(QUERIES[0], "k1").embeddings("thumbnail"), expected)
 
 
-def test_each_camera_has_an_index_of_its_own(indexed: Path, own_split: Path) -> None:
-    shutil.copytree(indexed, own_split, dirs_exist_ok=True)
-    once = files_of(own_split)
-    assert make_index(own_split, camera="wrist") == FRAMES
-    both = files_of(own_split)
+def test_each_camera_has_an_index_of_its_own(indexed: Path, own_buffers: Path) -> None:
+    shutil.copytree(indexed, own_buffers, dirs_exist_ok=True)
+    once = files_of(own_buffers)
+    assert make_index(own_buffers, camera="wrist") == FRAMES
+    both = files_of(own_buffers)
     assert {name: both[name] for name in once} == once and len(both) == 2 * len(once)
-    buffer = load_buffer(QUERIES[0], "k1", split=own_split)
-    centre = units_index(own_split, "wrist").centre
+    buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
+    centre = units_index(own_buffers, "wrist").centre
     expected = normalised(Thumbnail().prepare(buffer.frames("wrist")), centre)
     found = buffer.embeddings("thumbnail", "observation.images.wrist")
     assert np.array_equal(found, expected)
@@ -137,22 +139,22 @@ def test_each_camera_has_an_index_of_its_own(indexed: Path, own_split: Path) -> 
 # --- how it is made ----------------------------------------------------------------------------
 
 
-def test_an_index_is_the_same_bytes_every_time(indexed: Path, own_split: Path) -> None:
-    assert make_index(own_split, threads=3) == FRAMES
-    assert files_of(own_split) == files_of(indexed)
-    assert make_index(own_split) == [0, 0]  # it is there and right
-    assert make_index(own_split, force=True) == FRAMES
-    assert files_of(own_split) == files_of(indexed)
+def test_an_index_is_the_same_bytes_every_time(indexed: Path, own_buffers: Path) -> None:
+    assert make_index(own_buffers, threads=3) == FRAMES
+    assert files_of(own_buffers) == files_of(indexed)
+    assert make_index(own_buffers) == [0, 0]  # it is there and right
+    assert make_index(own_buffers, force=True) == FRAMES
+    assert files_of(own_buffers) == files_of(indexed)
 
 
-def test_an_interrupted_run_goes_on(indexed: Path, own_split: Path) -> None:
+def test_an_interrupted_run_goes_on(indexed: Path, own_buffers: Path) -> None:
     # Three lessons of four batches each, then units of two: one is done, and half of the next.
     with pytest.raises(KeyboardInterrupt):
-        make_index(own_split, Interrupted(after=15))
+        make_index(own_buffers, Interrupted(after=15))
     with pytest.raises(MissingIndexError):
-        load_buffer(QUERIES[0], "k0", split=own_split).embeddings("thumbnail")
-    assert make_index(own_split) == [0, FRAMES[1] - 32]
-    assert files_of(own_split) == files_of(indexed)
+        load_buffer(QUERIES[0], "k0", buffer_set=own_buffers).embeddings("thumbnail")
+    assert make_index(own_buffers) == [0, FRAMES[1] - 32]
+    assert files_of(own_buffers) == files_of(indexed)
 
 
 @pytest.mark.parametrize(
@@ -168,22 +170,22 @@ def test_an_interrupted_run_goes_on(indexed: Path, own_split: Path) -> None:
     ],
 )
 def test_what_is_missing_or_damaged_is_made_again(
-    indexed: Path, own_split: Path, name: str, again: list[int]
+    indexed: Path, own_buffers: Path, name: str, again: list[int]
 ) -> None:
-    shutil.copytree(indexed, own_split, dirs_exist_ok=True)
-    path = own_split / name
+    shutil.copytree(indexed, own_buffers, dirs_exist_ok=True)
+    path = own_buffers / name
     if path.is_dir():
         shutil.rmtree(path / "index")
     else:
         path.write_bytes((path.read_bytes()[:-2] if path.exists() else b"") + b"xx")
-    assert make_index(own_split) == again
-    assert files_of(own_split) == files_of(indexed)
+    assert make_index(own_buffers) == again
+    assert files_of(own_buffers) == files_of(indexed)
 
 
 # --- refusals ----------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_embedded(own_split: Path) -> None:
+def test_what_cannot_be_embedded(own_buffers: Path) -> None:
     class Holed(Thumbnail):
         def features(self, prepared: Any) -> Any:
             prepared[-1, 5] = 1e6  # more than float16 holds
@@ -194,28 +196,28 @@ def test_what_cannot_be_embedded(own_split: Path) -> None:
             raise RuntimeError("out of memory")
 
     with pytest.raises(BuildError, match=r"not finite for \w+/test/\d"):
-        make_index(own_split, Holed())
+        make_index(own_buffers, Holed())
     with pytest.raises(BuildError, match=r"/test/\d cannot be embedded: .*out of memory"):
-        make_index(own_split, Broken())
-    assert not list(own_split.glob("*/index/thumbnail"))
+        make_index(own_buffers, Broken())
+    assert not list(own_buffers.glob("*/index/thumbnail"))
 
 
-def test_two_do_not_make_one_index(own_split: Path) -> None:
-    folder = staging_path(own_split / "demonstrations" / "index" / "thumbnail")
+def test_two_do_not_make_one_index(own_buffers: Path) -> None:
+    folder = staging_path(own_buffers / "demonstrations" / "index" / "thumbnail")
     folder.mkdir(parents=True)
     with file_lock(folder / "lock", BuildError("busy")), pytest.raises(BuildError, match="another"):
-        make_index(own_split)
+        make_index(own_buffers)
 
 
 # --- the files ---------------------------------------------------------------------------------
 
 
-def test_the_files_are_the_golden_ones(own_split: Path) -> None:
+def test_the_files_are_the_golden_ones(own_buffers: Path) -> None:
     """A change here is a change of the format: `docs/format.md`, and the format version."""
-    build_index([own_split / "distractors"], TwoSums(), QUIET)
-    written = own_split / "distractors" / "index"
+    build_index([own_buffers / "distractors"], TwoSums(), QUIET)
+    written = own_buffers / "distractors" / "index"
     if os.environ.get("UPDATE_GOLDEN"):
         shutil.rmtree(GOLDEN, ignore_errors=True)
         shutil.copytree(written, GOLDEN / "golden" / "index")
     golden = files_of(GOLDEN).items()
-    assert files_of(own_split) == {k.replace("golden/", "distractors/"): v for k, v in golden}
+    assert files_of(own_buffers) == {k.replace("golden/", "distractors/"): v for k, v in golden}

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.buffer_sets import QUERIES
 from support.damage import flipped_bits
 from support.retrieval import change_header, make_index
-from support.splits import QUERIES
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.embeddings import episode_file
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingIndexError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
@@ -24,28 +24,28 @@ FOLDER, OF_UNITS = (f"{name}/index/thumbnail" for name in ("demonstrations", "di
 
 @pytest.fixture
 def whole(indexed: Path, tmp_path: Path) -> Path:
-    """A copy of the split with its index."""
+    """A copy of the buffer set with its index."""
     return shutil.copytree(indexed, tmp_path / "whole")
 
 
-def look_up(split: Path, encoder: str = "thumbnail") -> None:
-    load_buffer(QUERIES[0], "k1", split=split).embeddings(encoder)
+def look_up(buffer_set: Path, encoder: str = "thumbnail") -> None:
+    load_buffer(QUERIES[0], "k1", buffer_set=buffer_set).embeddings(encoder)
 
 
-def check(split: Path) -> None:
+def check(buffer_set: Path) -> None:
     """Read all of both indexes."""
-    for dataset in load_split(split).datasets.values():
+    for dataset in load_buffer_set(buffer_set).datasets.values():
         lengths = {record.episode_index: record.length for record in dataset.records()}
         dataset.index("thumbnail").check(lengths, units=dataset.kind == "distractors")
 
 
-def test_without_an_index(tiny_split: Path) -> None:
+def test_without_an_index(tiny_buffers: Path) -> None:
     with pytest.raises(MissingIndexError, match="no embeddings of encoder 'thumbnail'") as caught:
-        look_up(tiny_split)
-    expected = f"index {tiny_split} --encoder thumbnail"
+        look_up(tiny_buffers)
+    expected = f"index {tiny_buffers} --encoder thumbnail"
     assert caught.value.command == expected
     with pytest.raises(MissingIndexError, match="camera 'wrist'") as caught:
-        load_buffer(QUERIES[0], "k0", split=tiny_split).embeddings("thumbnail", "wrist")
+        load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers).embeddings("thumbnail", "wrist")
     assert caught.value.command == f"{expected} --camera wrist"
 
 
@@ -110,13 +110,13 @@ def test_what_something_else_made(whole: Path, factor: float, columns: int, said
         look_up(whole)
 
 
-def test_two_models_of_one_name_are_told_apart(own_split: Path) -> None:
+def test_two_models_of_one_name_are_told_apart(own_buffers: Path) -> None:
     encoder = Thumbnail()
     encoder.name = "siglip:one/tiny"
-    make_index(own_split, encoder)
-    look_up(own_split, "siglip:one/tiny@v2")
+    make_index(own_buffers, encoder)
+    look_up(own_buffers, "siglip:one/tiny@v2")
     with pytest.raises(MissingIndexError, match="of encoder 'siglip:one/tiny'") as caught:
-        look_up(own_split, "siglip:two/tiny")
+        look_up(own_buffers, "siglip:two/tiny")
     assert str(caught.value.command).startswith("index ")
 
 
@@ -129,7 +129,7 @@ def test_an_index_of_another_version_of_the_encoder(whole: Path) -> None:
         header = json.loads(path.read_text())
         header["encoder"]["sha256"] = "0" * 64
         path.write_text(json.dumps(header))
-        buffer = load_buffer(QUERIES[0], "k0", split=whole)
+        buffer = load_buffer(QUERIES[0], "k0", buffer_set=whole)
         with pytest.raises(MissingIndexError, match=said) as caught:
             Selector("thumbnail").select(buffer, buffer.query.frame())
         assert caught.value.command == f"index {whole} --encoder thumbnail"
@@ -138,7 +138,7 @@ def test_an_index_of_another_version_of_the_encoder(whole: Path) -> None:
 def test_what_is_known_of_the_units_is_in_their_index_alone(whole: Path) -> None:
     """Hashes are right; what is told of all units is missing, wrong, or not where it belongs."""
     change_header(whole / OF_UNITS / "index.json", typical_cosine=None)
-    buffer = load_buffer(QUERIES[0], "k0", split=whole)
+    buffer = load_buffer(QUERIES[0], "k0", buffer_set=whole)
     with pytest.raises(FormatError, match="typical cosine"):
         measure(buffer, "thumbnail")
     with pytest.raises(FormatError, match="typical cosine"):
@@ -163,10 +163,10 @@ def test_what_is_known_of_the_units_is_in_their_index_alone(whole: Path) -> None
         check(whole)
 
 
-def test_a_split_without_units(whole: Path) -> None:
+def test_a_buffer_set_without_units(whole: Path) -> None:
     header = whole / "manifests/manifest.json"
     told = json.loads(header.read_text())
     del told["datasets"]["distractors"]
     header.write_text(json.dumps(told))
     with pytest.raises(MissingIndexError, match="distractors"):
-        load_buffer(QUERIES[0], "k0", split=whole).embeddings("thumbnail")
+        load_buffer(QUERIES[0], "k0", buffer_set=whole).embeddings("thumbnail")

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.splits import QUERIES
+from support.buffer_sets import QUERIES
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, MissingIndexError
 from robomme_interference_data.retrieval.select import choose, measure
 from robomme_interference_data.retrieval.selector import Selector
@@ -16,14 +16,14 @@ def test_it_chooses_what_stored_embeddings_choose(indexed: Path) -> None:
     selector = Selector("thumbnail")
     assert (selector.name, selector.camera) == ("thumbnail/max/adaptive", "front")
     assert Selector("thumbnail", rule="mean/0.9").name == "thumbnail/mean/0.9"
-    for buffer in load_split(indexed).buffers(condition="k3"):
+    for buffer in load_buffer_set(indexed).buffers(condition="k3"):
         stored = choose(measure(buffer, "thumbnail"), selector.rule)
         assert selector.select(buffer, buffer.query.frame()).tolist() == stored.frames.tolist()
 
 
 def test_what_identifies_a_selector(indexed: Path) -> None:
-    for condition in ("no-history", "k1"):  # any buffer of the split will do
-        buffer = load_buffer(QUERIES[0], condition, split=indexed)
+    for condition in ("no-history", "k1"):  # any buffer of the buffer set will do
+        buffer = load_buffer(QUERIES[0], condition, buffer_set=indexed)
         index = buffer.index("thumbnail")
         assert Selector("thumbnail").identity(buffer) == {
             "encoder": "thumbnail",
@@ -37,15 +37,15 @@ def test_what_identifies_a_selector(indexed: Path) -> None:
     assert (fixed["method"], fixed["boundary"], fixed["threshold"]) == ("mean", 0.5, 0.5)
 
 
-def test_what_it_cannot_choose_from(indexed: Path, tiny_split: Path) -> None:
+def test_what_it_cannot_choose_from(indexed: Path, tiny_buffers: Path) -> None:
     selector = Selector("thumbnail")
-    buffer = load_buffer(QUERIES[0], "k0", split=indexed)
+    buffer = load_buffer(QUERIES[0], "k0", buffer_set=indexed)
     for image in (np.zeros((3, 32, 32), np.uint8), np.zeros((32, 32, 3), np.float32)):
         with pytest.raises(InvalidOptionError, match=r"\(H, W, 3\) uint8"):
             selector.select(buffer, image)  # type: ignore[arg-type]
-    empty = load_buffer(QUERIES[0], "no-history", split=indexed)
+    empty = load_buffer(QUERIES[0], "no-history", buffer_set=indexed)
     with pytest.raises(InvalidOptionError, match="the history is empty"):
         selector.select(empty, empty.query.frame())
-    bare = load_buffer(QUERIES[0], "k0", split=tiny_split)
+    bare = load_buffer(QUERIES[0], "k0", buffer_set=tiny_buffers)
     with pytest.raises(MissingIndexError):
         selector.select(bare, bare.query.frame())

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.buffer_sets import GOLDEN, QUERIES, dataset
 from support.retrieval import make_index
 from support.shifted import add_shifted
-from support.splits import GOLDEN, QUERIES, dataset
 
-from robomme_interference_data import EpisodeId, load_split
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data import EpisodeId, load_buffer_set
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.constants import IDENTITY_PATH, SHIFTED
 from robomme_interference_data.errors import SourceError
 from robomme_interference_data.storage.files import write_json
@@ -22,25 +22,25 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden split with views under shifts beside it, indexed; read-only."""
-    folder = shutil.copytree(GOLDEN, tmp_path_factory.mktemp("seen") / "split")
+    """The golden buffer set with views under shifts beside it, indexed; read-only."""
+    folder = shutil.copytree(GOLDEN, tmp_path_factory.mktemp("seen") / "buffer_set")
     add_shifted(folder)
     make_index(folder, names=("demonstrations", "distractors", SHIFTED))
     return folder
 
 
 def test_views_are_frames_in_the_order_of_shifts(seen: Path) -> None:
-    views, split = dataset(seen, SHIFTED), load_split(seen)
+    views, buffer_set = dataset(seen, SHIFTED), load_buffer_set(seen)
     assert (views.kind, len(views), views.identity.counts.frames) == ("shifted", 3, 27)
     assert views.identity.unit is None
     for episode in QUERIES:
-        index, query = views.index_of(EpisodeId.parse(episode)), split.query(episode)
+        index, query = views.index_of(EpisodeId.parse(episode)), buffer_set.query(episode)
         record = views.record(index)
         assert (record.length, record.exec_start_idx, record.seed) == (9, None, query.seed)
         for place, image in enumerate(views.iter_frames(index, "front", 0, 9)):
             assert np.array_equal(image, query.frame() >> place)
-    assert split.revision != load_split(GOLDEN).revision
-    assert list(verify_split(split)) == []
+    assert buffer_set.revision != load_buffer_set(GOLDEN).revision
+    assert list(verify_buffer_set(buffer_set)) == []
 
 
 def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
@@ -57,11 +57,11 @@ def test_the_query_frame_is_that_of_the_shift(run: Run, seen: Path) -> None:
     assert title.endswith("encoder thumbnail, camera front, shift camera:2, rule max/adaptive")
 
 
-def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split: Path) -> None:
-    identity = own_split / "demonstrations" / IDENTITY_PATH
+def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_buffers: Path) -> None:
+    identity = own_buffers / "demonstrations" / IDENTITY_PATH
     write_json(identity, json.loads(identity.read_text()) | {"simulators": ["tabletop"]})
-    code, _, err = run("retrieval-score", own_split, "--shift", "light:2")
-    assert code == 1 and f"--source tabletop --split test --out {own_split}/shifted" in err
+    code, _, err = run("retrieval-score", own_buffers, "--shift", "light:2")
+    assert code == 1 and f"--source tabletop --split test --out {own_buffers}/shifted" in err
     assert "such as light:2" in run("retrieval-score", seen, "--shift", "dark")[2]
 
 
@@ -73,10 +73,10 @@ def test_what_is_missing_or_does_not_fit_is_told(run: Run, seen: Path, own_split
     ],
 )
 def test_views_of_other_scenes_are_refused(
-    own_split: Path, families: tuple[str, ...], kind: str, told: str
+    own_buffers: Path, families: tuple[str, ...], kind: str, told: str
 ) -> None:
     with pytest.raises(SourceError, match=told):
-        add_shifted(own_split, *families, kind=kind)
+        add_shifted(own_buffers, *families, kind=kind)
 
 
 def test_retrieve_shows_what_the_robot_sees_under_a_shift(
@@ -84,7 +84,7 @@ def test_retrieve_shows_what_the_robot_sees_under_a_shift(
 ) -> None:
     pictures = []
     for shift in ("none", "clutter:3"):
-        words = ("retrieve", QUERIES[0], "k1", "--split", seen, "--shift", shift)
+        words = ("retrieve", seen, QUERIES[0], "k1", "--shift", shift)
         out = tmp_path / f"{shift[:5]}.png"
         assert run(*words, "--out", out)[0] == 0
         pictures.append((out.read_bytes(), json.loads(run(*words, "--json")[1])["cosine"]))

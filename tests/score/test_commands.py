@@ -201,7 +201,7 @@ def test_exported_rows_are_the_same_bytes_whatever_they_come_from(tmp_path: Path
 
 def test_what_cannot_be_exported_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     rows = [*made.rows(), *made.changed(made.rows(), model_seed=3)]
-    rows[7] = replace(rows[7], episode_split="val", seed=7)
+    rows[7] = replace(rows[7], split="val", seed=7)
     rows[9] = replace(rows[9], family="X")
     path = made.write_csv(tmp_path / "a.csv", rows)
     given = ("score", path, "--lenient", "--out", tmp_path / "o", "--export", tmp_path / "e")

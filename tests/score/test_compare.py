@@ -49,13 +49,13 @@ def test_runs_over_other_histories_show_no_noise_floor(tmp_path: Path) -> None:
     other = made.changed(own(k0="sf"), revision="cd" * 32, model_seed=9)
     found = compared(tmp_path, own(k0="ss"), other)
     (note,) = found.notes
-    assert "are of different splits" in note
+    assert "are of different buffer sets" in note
     released = made.released(
         tmp_path / "c.csv", [f"{OWN},MoveCube,k0,{e},{e},easy,fail,0,9" for e in range(2)]
     )
     both = made.write_csv(tmp_path / "b.csv", made.changed(own(k0="ss"), simulator="robomme"))
     (note,) = compare(both, released).notes
-    assert "different splits (revisions abab" in note
+    assert "different buffer sets (revisions abab" in note
 
 
 def test_two_conditions_of_one_run_are_compared(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_what_a_shift_costs_is_measured(tmp_path: Path) -> None:
     [
         ({"simulator": "robomme"}, "the rows are of different simulators: tabletop and robomme"),
         ({"seed": 77}, "has the seed 0 in one run and 77 in the other"),
-        ({"episode_split": "val"}, "counts on both sides under a common condition"),
+        ({"split": "val"}, "counts on both sides under a common condition"),
         ({"condition": "k9"}, "counts on both sides under a common condition"),
         ({"system": "other"}, ""),
     ],

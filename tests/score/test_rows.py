@@ -190,7 +190,7 @@ def test_bad_rows_are_refused_with_file_line_and_reason(
 
 
 OF_RUNS = {
-    "another split": ({"revision": "cd" * 32}, "rows of different splits do not mix"),
+    "another buffer set": ({"revision": "cd" * 32}, "rows of different buffer sets do not mix"),
     "no revision": ({"revision": ""}, "revision (empty); expected"),
     "another scene": ({"seed": 5}, "seed 5 beside 1002: an episode has one"),
     "a path": ({"simulator": "../escaped"}, "simulator '../escaped'; expected up to 128 letters"),
@@ -314,8 +314,8 @@ def test_what_is_no_shift_is_a_bad_row(tmp_path: Path, column: str, value: str) 
         ("system,simulatr,family,condition,episode,status,success", "has the column 'simulatr'"),
         ("system,family,family,condition,episode,status,success", "two columns 'family'"),
         (
-            "system,simulator,split,family,condition,episode,status,success",
-            "lacks the columns revision, episode_split, shift, model_seed, protocol_version;",
+            "system,simulator,buffer_set,family,condition,episode,status,success",
+            "lacks the columns revision, split, shift, model_seed, protocol_version;",
         ),
         ("", "lacks the columns"),
     ],

@@ -1,4 +1,4 @@
-"""Questions of the golden `tabletop` split, put to whoever answers."""
+"""Questions of the golden `tabletop` buffer set, put to whoever answers."""
 
 from functools import cache
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 from support.chat_server import ChatServer, Seen
 from support.tabletop import QUERIES, TABLETOP
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.data.questions import Question, read_questions
 from robomme_interference_data.evaluate import RunResult
 from robomme_interference_data.evaluate.run.config import AskConfig
@@ -18,8 +18,8 @@ from robomme_interference_data.runtime.executor import Executor, Serial
 
 @cache
 def questions() -> dict[EpisodeId, Question]:
-    """All questions of the split."""
-    return read_questions(load_split(TABLETOP))
+    """All questions of the buffer set."""
+    return read_questions(load_buffer_set(TABLETOP))
 
 
 def right_letter(episode: EpisodeId) -> str:
@@ -32,7 +32,7 @@ def ask(
     out: Path, *, executor: Executor | None = None, progress: Any = None, **changes: Any
 ) -> RunResult:
     """Ask all questions under k0, unless told otherwise."""
-    usual: dict[str, Any] = {"model": "recall", "split": TABLETOP, "conditions": ("k0",)}
+    usual: dict[str, Any] = {"model": "recall", "buffer_set": TABLETOP, "conditions": ("k0",)}
     config = AskConfig(out=out, **usual | changes)
     return run_evaluation(config, executor=executor or Serial(), progress=progress)
 

@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.storage.video import MOST_PIXELS
 

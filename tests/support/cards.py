@@ -1,10 +1,10 @@
-"""Cards of the golden split and run, and the trees that are published of them."""
+"""Cards of the golden buffer set and run, and the trees that are published of them."""
 
 import shutil
 from importlib import metadata
 from pathlib import Path
 
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS, MANIFESTS
@@ -15,15 +15,15 @@ CARDS = GOLDEN.parent / "cards"
 RUN = GOLDEN.parent / "run"
 
 OF_DEMONSTRATIONS = Publication("robot-memory/tiny-demonstrations", "1.0.0")
-OF_SPLIT = Publication(
-    "robot-memory/tiny-split",
+OF_BUFFER_SET = Publication(
+    "robot-memory/tiny-buffer_set",
     "1.2.0",
     "cc-by-4.0",
     f"{OF_DEMONSTRATIONS.repo_id}@{'0123456789' * 4}",
-    "robomme-interference publish tiny --repo-id robot-memory/tiny-split",
+    "robomme-interference publish tiny --repo-id robot-memory/tiny-buffer_set",
 )
 OF_RESULTS = Publication(
-    "robot-memory/tiny-results", "1.0.1", base=f"{OF_SPLIT.repo_id}@{'abcdef0123' * 4}"
+    "robot-memory/tiny-results", "1.0.1", base=f"{OF_BUFFER_SET.repo_id}@{'abcdef0123' * 4}"
 )
 
 
@@ -33,8 +33,8 @@ def without_version(file: bytes) -> str:
     return file.decode().replace(own, "robomme-interference-data X.Y.Z")
 
 
-def published_split(root: Path, files: dict[str, bytes]) -> Path:
-    """Make the tree of a split's repository: the units at its root, manifests and a card."""
+def published_buffer_set(root: Path, files: dict[str, bytes]) -> Path:
+    """Make the tree of a buffer set's repository: the units at its root, manifests and a card."""
     shutil.copytree(GOLDEN / DISTRACTORS, root)
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS)
     return _with_card(root, files)

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from support.buffer_sets import GOLDEN
 from support.recordings import encode_image
-from support.splits import GOLDEN
 from support.tabletop import TABLETOP
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import EmbeddingIndex
@@ -72,8 +72,8 @@ class Target:
 
 def places(root: Path) -> Path:
     """Make a folder in which every target finds its file and what it reads beside it; all sound."""
-    shutil.copytree(GOLDEN, root / "split")
-    shutil.copytree(GOLDEN.parent / "index/golden/index", root / "split/distractors/index")
+    shutil.copytree(GOLDEN, root / "buffer_set")
+    shutil.copytree(GOLDEN.parent / "index/golden/index", root / "buffer_set/distractors/index")
     shutil.copytree(GOLDEN.parent / "run", root / "run")
     shutil.copytree(TABLETOP, root / "asked")
     (root / "single").mkdir()
@@ -85,17 +85,17 @@ def places(root: Path) -> Path:
 
 
 def _header(root: Path) -> None:
-    split = load_split(root / "split")
-    assert len(split.revision) == 64
-    assert split.datasets.keys() == split.header.datasets.keys()
+    buffer_set = load_buffer_set(root / "buffer_set")
+    assert len(buffer_set.revision) == 64
+    assert buffer_set.datasets.keys() == buffer_set.header.datasets.keys()
 
 
 def _buffers(root: Path) -> None:
-    split = load_split(root / "split")
-    split.datasets = _sound_datasets(root)
-    assert len(split.families) <= len(split.episode_ids)
-    for manifest in list(split.manifests())[-1:]:
-        buffer = split.load(manifest.episode_id, manifest.condition)
+    buffer_set = load_buffer_set(root / "buffer_set")
+    buffer_set.datasets = _sound_datasets(root)
+    assert len(buffer_set.families) <= len(buffer_set.episode_ids)
+    for manifest in list(buffer_set.manifests())[-1:]:
+        buffer = buffer_set.load(manifest.episode_id, manifest.condition)
         assert len(buffer) == len(buffer.session_index) == manifest.history_frames
 
 
@@ -103,11 +103,11 @@ def _buffers(root: Path) -> None:
 def _sound_datasets(root: Path) -> dict[str, Dataset]:
     """Return datasets of which no file but what is asked of them is read again."""
     names = ("demonstrations", "distractors")
-    return {name: Dataset(LocalFiles(root / "split" / name)) for name in names}
+    return {name: Dataset(LocalFiles(root / "buffer_set" / name)) for name in names}
 
 
 def _dataset(root: Path) -> None:
-    dataset = Dataset(LocalFiles(root / "split/demonstrations"))
+    dataset = Dataset(LocalFiles(root / "buffer_set/demonstrations"))
     for index, record in zip(range(_MOST_LISTED), dataset.records(), strict=False):
         assert dataset.index_of(record.episode_id) in range(len(dataset))
         assert dataset.lerobot.place(index).length == record.length
@@ -124,7 +124,7 @@ def _rows(root: Path) -> None:
 
 
 def _video(root: Path) -> None:
-    path = root / "split" / _VIDEO
+    path = root / "buffer_set" / _VIDEO
     count = 0
     for frame in iter_frames(path, 0, 49, 10, (32, 32, 3)):
         assert frame.shape == (32, 32, 3) and frame.dtype == np.uint8
@@ -163,9 +163,9 @@ def _image(root: Path) -> None:
 
 
 def _questions(root: Path) -> None:
-    split = load_split(root / "asked")
-    questions = read_questions(split)
-    assert tuple(sorted(questions)) == split.episode_ids
+    buffer_set = load_buffer_set(root / "asked")
+    questions = read_questions(buffer_set)
+    assert tuple(sorted(questions)) == buffer_set.episode_ids
     for one in questions.values():
         assert one.letters[one.right] in one.letters and one.chance <= 0.5
     assert len(digest_questions(questions.values())) == 64
@@ -189,18 +189,18 @@ def rewritten(data: bytes) -> list[bytes]:
 
 
 TARGETS = {
-    "manifest": Target("split/manifests/manifest.json", _header),
-    "buffers": Target("split/manifests/buffers.parquet", _buffers, rewritten),
-    "info": Target("split/demonstrations/meta/info.json", _dataset),
-    "identity": Target("split/demonstrations/meta/interference.json", _dataset),
-    "episodes": Target(f"split/{_EPISODES}", _dataset, rewritten),
-    "rows": Target(f"split/{_ROWS}", _rows, rewritten),
-    "video": Target(f"split/{_VIDEO}", _video),
+    "manifest": Target("buffer_set/manifests/manifest.json", _header),
+    "buffers": Target("buffer_set/manifests/buffers.parquet", _buffers, rewritten),
+    "info": Target("buffer_set/demonstrations/meta/info.json", _dataset),
+    "identity": Target("buffer_set/demonstrations/meta/interference.json", _dataset),
+    "episodes": Target(f"buffer_set/{_EPISODES}", _dataset, rewritten),
+    "rows": Target(f"buffer_set/{_ROWS}", _rows, rewritten),
+    "video": Target(f"buffer_set/{_VIDEO}", _video),
     "array": Target("single/a.npy", _array),
     "image": Target("single/a.png", _image),
     "questions": Target("asked/questions.parquet", _questions, rewritten),
     "sums": Target("single/SHA256SUMS", lambda root: read_sums(root / "single/SHA256SUMS")),
-    "index": Target("split/distractors/index/thumbnail/index.json", _index),
+    "index": Target("buffer_set/distractors/index/thumbnail/index.json", _index),
     "run": Target(f"run/{RUN_HEADER}", _run),
     "record": Target(f"run/{RUN_RECORD}", _record),
 }

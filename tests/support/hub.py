@@ -1,4 +1,4 @@
-"""A split on a Hub on the loopback interface, as `publish` lays it out, and others who use it."""
+"""A buffer set on a Hub on the loopback interface, as `publish` lays it out, and others who use it."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.storage.files import write_json
 from robomme_interference_data.storage.headers import read_header
 
-SPLIT, BASE = "someone/units", "someone/demonstrations"
+BUFFER_SET, BASE = "someone/units", "someone/demonstrations"
 
 
 @contextmanager
@@ -62,8 +62,10 @@ def kill_at(hub: HubServer, method: str, path: str, after: int, *arguments: str)
     assert came
 
 
-def push_split(hub: HubServer, root: Path, work: Path, name: str = SPLIT) -> tuple[str, str]:
-    """Put a split into two repositories; return the commits of split and demonstrations."""
+def push_buffer_set(
+    hub: HubServer, root: Path, work: Path, name: str = BUFFER_SET
+) -> tuple[str, str]:
+    """Put a buffer set into two repositories; return the commits of buffer set and demonstrations."""
     base = hub.push(f"datasets/{BASE}", root / DEMONSTRATIONS)
     shutil.copytree(root / DISTRACTORS, work)
     shutil.copytree(root / "manifests", work / "manifests")

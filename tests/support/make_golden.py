@@ -1,4 +1,4 @@
-"""Make the golden splits anew: `python tests/support/make_golden.py tests/golden`."""
+"""Make the golden buffer sets anew: `python tests/support/make_golden.py tests/golden`."""
 
 import shutil
 import sys
@@ -21,7 +21,7 @@ FAMILIES = ("VideoRepick", "MoveCube", "PatternLock")
 
 
 def make(root: Path) -> None:
-    """Build the split of the source `sample`."""
+    """Build the buffer set of the source `sample`."""
     source = (SampleSource(size=32),)
     queries = list_episodes(source, families=FAMILIES, split="test")
     units = list_episodes(source, split="train", numbers=(0, 1))
@@ -33,7 +33,7 @@ def make(root: Path) -> None:
 
 
 if __name__ == "__main__":
-    for name, build in (("split", make), ("tabletop", make_tabletop)):
+    for name, build in (("buffer_set", make), ("tabletop", make_tabletop)):
         golden = Path(sys.argv[1]) / name
         shutil.rmtree(golden, ignore_errors=True)  # a build goes on with what is there
         build(golden)

@@ -4,21 +4,21 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from support.cards import OF_DEMONSTRATIONS, OF_RESULTS, OF_SPLIT, RUN, without_version
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
+from support.cards import OF_BUFFER_SET, OF_DEMONSTRATIONS, OF_RESULTS, RUN, without_version
 
-from robomme_interference_data import load_split
-from robomme_interference_data.cards.facts import demonstrations_facts, split_facts
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.cards.facts import buffer_set_facts, demonstrations_facts
 from robomme_interference_data.cards.render import CROISSANT, README, card_files
 from robomme_interference_data.cards.results import results_facts
 
 
 def cards() -> Iterator[tuple[str, dict[str, bytes]]]:
     """Yield the cards by name."""
-    split = load_split(GOLDEN)
-    lessons = demonstrations_facts(split.datasets["demonstrations"])
+    buffer_set = load_buffer_set(GOLDEN)
+    lessons = demonstrations_facts(buffer_set.datasets["demonstrations"])
     yield "demonstrations", card_files(lessons, OF_DEMONSTRATIONS)
-    yield "split", card_files(split_facts(split), OF_SPLIT)
+    yield "buffer_set", card_files(buffer_set_facts(buffer_set), OF_BUFFER_SET)
     yield "results", card_files(results_facts(RUN), OF_RESULTS)
 
 

@@ -1,4 +1,4 @@
-"""Publish the golden split, or one like it, without the checks and with cards of a line."""
+"""Publish the golden buffer set, or one like it, without the checks and with cards of a line."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from support.hub_server import HubServer
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.manifests import (
     in_folder,
     plan_manifests,
@@ -16,7 +16,11 @@ from robomme_interference_data.build_dataset.manifests import (
 from robomme_interference_data.cards import publish as publish_module
 from robomme_interference_data.cards.facts import Facts
 from robomme_interference_data.cards.publication import Publication, PublishConfig
-from robomme_interference_data.cards.publish import SplitContent, plan_split, publish_split
+from robomme_interference_data.cards.publish import (
+    BufferSetContent,
+    plan_buffer_set,
+    publish_buffer_set,
+)
 from robomme_interference_data.cards.publisher import Publisher, RepoPlan
 
 UNITS, LESSONS = "someone/tiny", "someone/tiny-demonstrations"
@@ -37,9 +41,9 @@ def plain_cards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publish_module, "card_files", card)
 
 
-def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> SplitContent:
-    """Return what the repositories of a split are to hold."""
-    return SplitContent(load_split(root), PublishConfig(repo_id, **options))
+def content_of(root: Path, repo_id: str = UNITS, **options: Any) -> BufferSetContent:
+    """Return what the repositories of a buffer set are to hold."""
+    return BufferSetContent(load_buffer_set(root), PublishConfig(repo_id, **options))
 
 
 def plan(
@@ -48,23 +52,23 @@ def plan(
     waits: list[float] | None = None,
     private: bool = False,
     **options: Any,
-) -> tuple[SplitContent, Publisher, list[RepoPlan]]:
-    """Plan to publish a split; instead of waiting, seconds are added to `waits`."""
+) -> tuple[BufferSetContent, Publisher, list[RepoPlan]]:
+    """Plan to publish a buffer set; instead of waiting, seconds are added to `waits`."""
     content = content_of(root, repo_id, **options)
     wait = [] if waits is None else waits
     publisher = Publisher(content.config, private=private, wait=wait.append)
-    return content, publisher, plan_split(content, publisher)
+    return content, publisher, plan_buffer_set(content, publisher)
 
 
 def publish(root: Path, repo_id: str = UNITS, **options: Any) -> list[RepoPlan]:
-    """Publish a split; return what became of its repositories."""
+    """Publish a buffer set; return what became of its repositories."""
     content, publisher, plans = plan(root, repo_id, **options)
     publisher.check_rights(plans)
-    return publish_split(content, publisher, plans)
+    return publish_buffer_set(content, publisher, plans)
 
 
 def plan_again(root: Path, conditions: Iterable[str], seed: int = 0) -> None:
-    """Plan the buffers of a split anew."""
+    """Plan the buffers of a buffer set anew."""
     for _ in write_manifests(plan_manifests(in_folder(root), tuple(conditions), seed), root):
         pass
 

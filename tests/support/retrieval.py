@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from support.splits import QUERIES, with_sessions
+from support.buffer_sets import QUERIES, with_sessions
 
-from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_split
+from robomme_interference_data import Buffer, EpisodeId, Session, SessionEntry, load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.data.embeddings import IndexHeader
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
@@ -30,7 +30,7 @@ from robomme_interference_data.storage.headers import read_header
 
 QUIET = WorkProgress(quiet=True)
 FRAMES = [3 * 49, 17 * 32]
-"""Stored frames of the golden split: demonstrations and units."""
+"""Stored frames of the golden buffer set: demonstrations and units."""
 
 
 def change_header(path: Path, **fields: Any) -> None:
@@ -71,26 +71,26 @@ class Interrupted(Thumbnail):
 
 
 def make_index(
-    split: Path,
+    buffer_set: Path,
     encoder: Any = None,
     names: Sequence[str] = (DEMONSTRATIONS, DISTRACTORS),
     **options: Any,
 ) -> list[int]:
     """Make the index; returns how many frames of each dataset were embedded now."""
-    roots = [split / name for name in names]
+    roots = [buffer_set / name for name in names]
     reports = build_index(roots, encoder or Thumbnail(), QUIET, **options)
     return [report.embedded for report in reports]
 
 
-def files_of(split: Path) -> dict[str, bytes]:
-    """All files of the indexes of a split, those of unfinished ones too."""
-    found = (path for path in split.glob("*/index/**/*") if path.is_file())
-    return {path.relative_to(split).as_posix(): path.read_bytes() for path in found}
+def files_of(buffer_set: Path) -> dict[str, bytes]:
+    """All files of the indexes of a buffer set, those of unfinished ones too."""
+    found = (path for path in buffer_set.glob("*/index/**/*") if path.is_file())
+    return {path.relative_to(buffer_set).as_posix(): path.read_bytes() for path in found}
 
 
-def remade(split: Path, entries: Iterable[SessionEntry], **changes: Any) -> Buffer:
+def remade(buffer_set: Path, entries: Iterable[SessionEntry], **changes: Any) -> Buffer:
     """The k3 buffer of the first query with other sessions."""
-    opened = load_split(split)
+    opened = load_buffer_set(buffer_set)
     manifest = with_sessions(opened.manifest(QUERIES[0], "k3"), *entries)
     return Buffer(replace(manifest, **changes), opened.query(QUERIES[0]), opened.datasets)
 

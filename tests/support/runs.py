@@ -1,4 +1,4 @@
-"""Runs over the tiny split, on the simulator and with the cheat of `worlds`."""
+"""Runs over the tiny buffer set, on the simulator and with the cheat of `worlds`."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def config(**changes: Any) -> RunConfig:
     """A run of two episodes under two conditions."""
     usual: dict[str, Any] = {
         "policy": CHEAT,
-        "split": Path(os.environ[worlds.SPLIT]),
+        "buffer_set": Path(os.environ[worlds.BUFFER_SET]),
         "out": Path("nowhere"),
         "simulator": WORLD,
         "system": "mine",
@@ -58,13 +58,13 @@ def roll(condition: str, policy: Any, *, simulator: Any = None, **changes: Any) 
     """One rollout, outside of a run."""
     parts = {name: changes.pop(name) for name in ("selector", "clip", "writer") if name in changes}
     system = changes.pop("system", "mine")
-    split = worlds.split_here()
+    buffer_set = worlds.buffer_set_here()
     return run_rollout(
-        Run(config(**changes), system, split.name, split.revision),
+        Run(config(**changes), system, buffer_set.name, buffer_set.revision),
         WorkItem(condition, EPISODE),
         simulator=simulator or worlds.World(),
         policy=policy,
-        split=split,
+        buffer_set=buffer_set,
         **parts,
     )
 

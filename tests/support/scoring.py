@@ -84,11 +84,11 @@ def row(system: str, condition: str, family: str, episode: int, letter: str) -> 
     return Rollout(
         system=system,
         simulator="tabletop",
-        split="made-up",
+        buffer_set="made-up",
         revision=REVISION,
         family=family,
         condition=condition,
-        episode_split="test",
+        split="test",
         episode=episode,
         shift="none",
         model_seed=0,

@@ -1,4 +1,4 @@
-"""First live views under shifts beside the golden split, made up."""
+"""First live views under shifts beside the golden buffer set, made up."""
 
 from collections.abc import Generator
 from dataclasses import replace
@@ -34,13 +34,13 @@ class ShiftedSample(SampleSource):
             yield Frame(images, seen.state, None, False)
 
 
-def add_shifted(split: Path, *families: str, kind: str = "sample") -> None:
-    """Build the views of the golden split's queries, or of some families, and plan it again."""
+def add_shifted(buffer_set: Path, *families: str, kind: str = "sample") -> None:
+    """Build the views of the golden buffer set's queries, or of some families, and plan it again."""
     source = ShiftedSample(size=32)
     source.provenance["kind"] = kind
     families = families or ("VideoRepick", "MoveCube", "PatternLock")
     tasks = list_episodes((source,), families=families, split="test")
     plan = BuildPlan(SHIFTED, (source,), tasks)
-    build_dataset(plan, split / SHIFTED, Serial(), WorkProgress(quiet=True))
-    for _ in write_manifests(plan_manifests(in_folder(split)), split):
+    build_dataset(plan, buffer_set / SHIFTED, Serial(), WorkProgress(quiet=True))
+    for _ in write_manifests(plan_manifests(in_folder(buffer_set)), buffer_set):
         pass

@@ -1,4 +1,4 @@
-"""A split as of `tabletop`, made without it: its scenes, answers and evidence, other frames.
+"""A buffer set as of `tabletop`, made without it: its scenes, answers and evidence, other frames.
 
 Every pixel of a frame tells what it shows: red the frame's number in the lesson, green the number
 of the query, blue the part of the answer that the frame shows, from 1, or 0.
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import (
@@ -51,7 +51,7 @@ LIVE, NOBODY = 255, 254
 
 
 def copy_tabletop(folder: Path) -> Path:
-    """Copy the split, to be changed."""
+    """Copy the buffer set, to be changed."""
     return Path(shutil.copytree(TABLETOP, folder))
 
 
@@ -101,11 +101,11 @@ class Drawn(Source):
 
 
 def make_tabletop(root: Path) -> None:
-    """Build the split, and its questions."""
+    """Build the buffer set, and its questions."""
     source, quiet = (Drawn(),), WorkProgress(quiet=True)
     for kind, split in (("demonstrations", "test"), ("distractors", "train")):
         plan = BuildPlan(kind, source, list_episodes(source, split=split))
         build_dataset(plan, root / kind, Serial(), quiet)
     for _ in write_manifests(plan_manifests(in_folder(root), CONDITIONS), root):
         pass
-    write_questions([*make_questions(load_split(root))], root)
+    write_questions([*make_questions(load_buffer_set(root))], root)

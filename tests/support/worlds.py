@@ -1,4 +1,4 @@
-"""A simulator without physics over a split's episodes, and a policy that would cheat."""
+"""A simulator without physics over a buffer set's episodes, and a policy that would cheat."""
 
 import os
 import re
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data import Query, Split, load_split
+from robomme_interference_data import BufferSet, Query, load_buffer_set
 from robomme_interference_data.constants import STATE
 from robomme_interference_data.errors import SimulatorCrashError
 from robomme_interference_data.evaluate.policies.policy import Frames, RolloutInfo
@@ -21,7 +21,7 @@ from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Demonstration, EpisodeInfo, Observation
 
-SPLIT = "WORLDS_SPLIT"
+BUFFER_SET = "WORLDS_DATA"
 TROUBLE = "WORLDS_TROUBLE"
 PAUSE = "WORLDS_PAUSE"
 ANSWER_FRAME = 3
@@ -29,22 +29,22 @@ STEPS = 40
 
 
 @cache
-def split_at(path: str) -> Split:
-    return load_split(path, threads=1)
+def buffer_set_at(path: str) -> BufferSet:
+    return load_buffer_set(path, threads=1)
 
 
-def split_here() -> Split:
-    return split_at(str(Path(os.environ[SPLIT]).resolve()))
+def buffer_set_here() -> BufferSet:
+    return buffer_set_at(str(Path(os.environ[BUFFER_SET]).resolve()))
 
 
 def query_of(episode: str) -> tuple[Query, NDArray[np.float32], Observation]:
-    """A query of the split, the states of its lesson, and its first live observation."""
-    return query_at(str(Path(os.environ[SPLIT]).resolve()), episode)
+    """A query of the buffer set, the states of its lesson, and its first live observation."""
+    return query_at(str(Path(os.environ[BUFFER_SET]).resolve()), episode)
 
 
 @cache
 def query_at(path: str, episode: str) -> tuple[Query, NDArray[np.float32], Observation]:
-    query = split_at(path).query(episode)
+    query = buffer_set_at(path).query(episode)
     dataset, index = query.dataset, query.record.episode_index
     states = dataset.read_vectors(index, STATE, 0, query.lesson_frames)
     views = {camera: query.frame(camera) for camera in dataset.cameras}
@@ -62,7 +62,7 @@ def lesson_images(query: Query) -> dict[str, NDArray[np.uint8]]:
 
 
 class World:
-    """Episodes of the split that `WORLDS_SPLIT` names, as a simulator.
+    """Episodes of the buffer set that `WORLDS_DATA` names, as a simulator.
 
     The answer is the lesson's state at frame 3. An action that equals it succeeds; after 40 steps
     without it the episode fails. `WORLDS_TROUBLE` names a folder: a file `<Family>-<index>` there
@@ -135,7 +135,7 @@ def trouble_of(episode: EpisodeId) -> str:
 class Cheat:
     """Does what the lesson shows if it can get hold of any of it, by whatever way; else it holds.
 
-    It knows the split's demonstrations by heart, so that one frame or state of them tells it the
+    It knows the buffer set's demonstrations by heart, so that one frame or state of them tells it the
     answer. It looks for one in all that it is given: everything that can be reached from the info
     and the goal, the history, and the live observations.
     """
@@ -186,7 +186,7 @@ class Cheat:
 
 @cache
 def known() -> dict[bytes, NDArray[np.float32]]:
-    """Every frame and joint state of the split's lessons, as bytes, and the answer that it tells.
+    """Every frame and joint state of the buffer set's lessons, as bytes, and the answer that it tells.
 
     What `World` shows of an episode anyway is left out: its only view and state.
     """

@@ -6,21 +6,21 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
 from support.tabletop import TABLETOP
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-HELPERS = {"loopback_hub", "made_split", "nothing", "common"}
-SPLIT = ("--split", GOLDEN)
+HELPERS = {"loopback_hub", "made_buffer_set", "nothing", "common"}
+BUFFER_SET = ("--buffer-set", GOLDEN)
 SMALLEST: dict[str, tuple[object, ...]] = {
     "build": ("--source", "sample:MoveCube", "--workers", 1),
-    "cluster": ("--rollouts", 30, "--workers", 1, "--split", TABLETOP, "--replayed", 2),
+    "cluster": ("--rollouts", 30, "--workers", 1, "--buffer-set", TABLETOP, "--replayed", 2),
     "evaluate": ("--help",),  # needs a renderer
-    "files": (*SPLIT, "--items", 3),
-    "hub": (*SPLIT, "--queries", 9, "--units", 9, "--latency", 1),
-    "load": (*SPLIT, "--lerobot-frames", 3, "--chunk", 8),
+    "files": (*BUFFER_SET, "--items", 3),
+    "hub": (*BUFFER_SET, "--queries", 9, "--units", 9, "--latency", 1),
+    "load": (*BUFFER_SET, "--lerobot-frames", 3, "--chunk", 8),
     "manifests": ("--units", 90, "--queries", 9),
-    "policies": ("--lesson", 10, *SPLIT, "--episode", "MoveCube/test/0"),
+    "policies": ("--lesson", 10, *BUFFER_SET, "--episode", "MoveCube/test/0"),
     "retrieval": ("--help",),  # needs weights
     "robomme": ("--families", "MoveCube", "--steps", 20),
     "score": ("--draws", 50),
@@ -52,7 +52,7 @@ def test_none_is_left_out() -> None:
     assert {path.stem for path in FOLDER.glob("*.py")} == {*SMALLEST} | HELPERS
 
 
-def test_what_is_no_split_is_one_error(tmp_path: Path) -> None:
-    refused = run("load", "--split", tmp_path)
+def test_what_is_no_buffer_set_is_one_error(tmp_path: Path) -> None:
+    refused = run("load", "--buffer-set", tmp_path)
     assert refused.returncode == 1
-    assert "is not a split" in refused.stderr and "Traceback" not in refused.stderr
+    assert "is not a buffer set" in refused.stderr and "Traceback" not in refused.stderr

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from support.buffer_sets import contents
 from support.build_server import BuildServer
 from support.few import few
-from support.splits import contents
 
 from robomme_interference_data.build_dataset.stage import read_staged
 from robomme_interference_data.storage.staging import staging_path
@@ -31,8 +31,15 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BuildServer]:
 
 def command(out: Path, workers: int = 2) -> list[str]:
     """Build six units and one that is too short, of small cameras."""
-    options = ["--cameras", "front", "--workers", str(workers), "--out", str(out)]
-    return ["build", "distractors", "--source", "sample:MoveCube,PatternLock", *options]
+    options = ["--cameras", "front", "--workers", str(workers)]
+    return [
+        "build",
+        "distractors",
+        str(out.parent),
+        "--source",
+        "sample:MoveCube,PatternLock",
+        *options,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +47,7 @@ def undisturbed(
     server: BuildServer, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[dict[str, bytes], float]:
     """The files of a build that nothing disturbed, and the seconds that it took."""
-    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    out = tmp_path_factory.mktemp("undisturbed") / "distractors"
     begin = time.monotonic()
     finished = server.run(*command(out, workers=1))
     assert finished.code == 0, finished.stderr
@@ -70,7 +77,7 @@ def test_stopped_at_random_moments(
     times: int,
 ) -> None:
     """Stop builds of one output at random moments, then let one complete."""
-    out = tmp_path / "out"
+    out = tmp_path / "distractors"
     expected, duration = undisturbed
     moments = random.Random(sent)
     for _ in range(times):
@@ -97,27 +104,29 @@ def test_stopped_at_random_moments(
     finished = server.run(*command(out))
     assert finished.code == 0, finished.stderr
     assert contents(out) == expected
-    assert [path.name for path in out.parent.iterdir()] == ["out"]
+    assert [path.name for path in out.parent.iterdir()] == ["distractors"]
 
 
 def test_a_build_that_is_terminated_tells_how_to_go_on(server: BuildServer, tmp_path: Path) -> None:
-    pid = server.start(*command(tmp_path / "out", workers=1))
+    pid = server.start(*command(tmp_path / "distractors", workers=1))
     end = time.monotonic() + 60
-    while not staged(tmp_path / "out") and time.monotonic() < end:
+    while not staged(tmp_path / "distractors") and time.monotonic() < end:
         time.sleep(0.01)
     os.kill(pid, signal.SIGTERM)
     finished = server.wait(pid)
     assert finished.code == 143, finished.stderr
     told = finished.stderr.split("go on with:\n")[1]
-    assert told.startswith("robomme-interference build distractors --source sample:MoveCube")
+    assert told.startswith(
+        f"robomme-interference build distractors {tmp_path} --source sample:MoveCube"
+    )
 
 
 def test_a_worker_that_is_killed_is_replaced(
     server: BuildServer, undisturbed: tuple[dict[str, bytes], float], tmp_path: Path
 ) -> None:
-    pid = server.start(*command(tmp_path / "out", workers=1))
+    pid = server.start(*command(tmp_path / "distractors", workers=1))
     end = time.monotonic() + 60
-    while not staged(tmp_path / "out") and time.monotonic() < end:
+    while not staged(tmp_path / "distractors") and time.monotonic() < end:
         time.sleep(0.01)
     workers = [p for p, text in server.survivors(0).items() if "multiprocessing-fork" in text]
     for worker in workers:
@@ -125,5 +134,5 @@ def test_a_worker_that_is_killed_is_replaced(
     finished = server.wait(pid)
     assert len(workers) == 1
     assert finished.code == 0, finished.stderr
-    assert contents(tmp_path / "out") == undisturbed[0]
+    assert contents(tmp_path / "distractors") == undisturbed[0]
     assert server.survivors(30) == {}

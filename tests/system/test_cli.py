@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 import typer
-from support.splits import QUERIES, contents
+from support.buffer_sets import QUERIES, contents
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cli.main import app
 from robomme_interference_data.schema.codec import to_dict
 
@@ -39,9 +39,9 @@ def commands(
 ALL = dict(commands())
 
 
-def in_split(arguments: str, split: Path) -> list[str]:
-    """Words of a command line, in which S stands for the split."""
-    return [re.sub(r"(^|:)S(?=/|$)", rf"\g<1>{split}", word) for word in arguments.split()]
+def in_buffer_set(arguments: str, buffer_set: Path) -> list[str]:
+    """Words of a command line, in which S stands for the buffer set."""
+    return [re.sub(r"(^|:)S(?=/|$)", rf"\g<1>{buffer_set}", word) for word in arguments.split()]
 
 
 # --- help ------------------------------------------------------------------------------------
@@ -53,7 +53,7 @@ def test_commands_stand_in_groups_in_the_order_in_which_one_uses_them(run: Run) 
     words = [line.strip().split("  ")[0].removesuffix(":") for line in out.splitlines()]
     listed = [word for word in words if (word,) in ALL or word in GROUPS]
     assert listed == [
-        *("Data", "doctor", "build", "new-split", "verify", "audit", "fetch"),
+        *("Data", "doctor", "build", "new-buffer-set", "verify", "audit", "fetch"),
         *("Look", "conditions", "list", "show", "question", "simulate"),
         *("Retrieval", "index", "retrieve", "retrieval-score", "calibrate"),
         *("Rollouts", "ceiling", "evaluate", "ask", "merge"),
@@ -106,7 +106,7 @@ def test_help_imports_nothing_heavy() -> None:
         (["list", ".", "--bad"], "No such option: --bad"),
         (["show", EPISODE], "Missing argument"),
         (["list", ".", "--difficulty", "easy", "hard"], "unexpected extra argument"),
-        (["build", "demonstrations", "--source", "frames:."], "Missing option '--out'"),
+        (["build", "demonstrations", "--source", "frames:."], "Missing argument"),
     ],
 )
 def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
@@ -126,16 +126,16 @@ def test_usage_errors(arguments: list[str], message: str, run: Run) -> None:
         ("list S --families MoveCub", ("'MoveCub'", "Did you mean 'MoveCube'?")),
         ("list S --conditions k9", ("'k9'", "--conditions no-history,k0,k1,k3,k7,k9")),
         ("list S --conditions seven", ("'seven'", "k0")),
-        ("show MoveCube/test/9 k3 --split S", ("MoveCube/test/9", EPISODE)),
-        ("show MoveCube k3 --split S", ("'MoveCube'", "<Family>/<split>/<index>")),
-        (f"show {EPISODE} k3 --split S --camera nope", ("camera 'nope'", "wrist")),
-        ("build distractors --source frmes:S --out S/x", ("frmes", "Did you mean 'frames'?")),
-        ("build all --source hdf5:x --out S/x", ("robomme-h5", "lerobot", "tabletop", "sample")),
-        ("build distractors --source sample --out S/x --codec h264", ("h264",)),
+        ("show S MoveCube/test/9 k3", ("MoveCube/test/9", EPISODE)),
+        ("show S MoveCube k3", ("'MoveCube'", "<Family>/<split>/<index>")),
+        (f"show S {EPISODE} k3 --camera nope", ("camera 'nope'", "wrist")),
+        ("build distractors S/x --source frmes:S", ("frmes", "Did you mean 'frames'?")),
+        ("build all S/x --source hdf5:x", ("robomme-h5", "lerobot", "tabletop", "sample")),
+        ("build distractors S/x --source sample --codec h264", ("h264",)),
     ],
 )
-def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_split: Path) -> None:
-    code, out, err = run(*in_split(arguments, tiny_split))
+def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_buffers: Path) -> None:
+    code, out, err = run(*in_buffer_set(arguments, tiny_buffers))
     assert (code, out) == (1, "")
     assert err.startswith("Error: ") and "Traceback" not in err
     assert all(text in err for text in words), err
@@ -144,23 +144,23 @@ def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_spl
 @pytest.mark.parametrize(
     "arguments",
     [
-        f"show {EPISODE} k3 --split S --out S/demonstrations/meta/strip.png",
+        f"show S {EPISODE} k3 --out S/demonstrations/meta/strip.png",
         "simulate --family MoveCube --video S/distractors/meta/look.mp4",
-        f"retrieve {EPISODE} k3 --split S --out S/manifests/why.png",
+        f"retrieve S {EPISODE} k3 --out S/manifests/why.png",
         "retrieval-score S --out S/distractors",
-        "evaluate --policy hold --split S --out S/demonstrations/run",
+        "evaluate S --policy hold --out S/demonstrations/run",
         "merge a b --out S/manifests/run",
         "score a --out S/distractors/score",
         "score a --out score --export S/demonstrations",
     ],
 )
-def test_nothing_is_written_among_the_hashed_files_of_a_split(
-    arguments: str, run: Run, own_split: Path
+def test_nothing_is_written_among_the_hashed_files_of_a_buffer_set(
+    arguments: str, run: Run, own_buffers: Path
 ) -> None:
-    before = contents(own_split)
-    code, _, err = run(*in_split(arguments, own_split))
-    assert code == 1 and f"lies inside {own_split}" in err
-    assert contents(own_split) == before
+    before = contents(own_buffers)
+    code, _, err = run(*in_buffer_set(arguments, own_buffers))
+    assert code == 1 and f"lies inside {own_buffers}" in err
+    assert contents(own_buffers) == before
 
 
 # --- list, show, verify, audit -------------------------------------------------------------------
@@ -172,9 +172,9 @@ def table_rows(out: str) -> list[list[str]]:
     return [re.split(r"  +", line.strip()) for line in takewhile(str.strip, lines)]
 
 
-def test_list(run: Run, tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list(run: Run, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")  # a table is not cut in a narrow terminal
-    code, out, err = run("list", tiny_split)
+    code, out, err = run("list", tiny_buffers)
     assert (code, err) == (0, "")
     rows = table_rows(out)
     assert len(rows) == 15
@@ -185,30 +185,32 @@ def test_list(run: Run, tiny_split: Path, monkeypatch: pytest.MonkeyPatch) -> No
     ("arguments", "count"),
     [
         ("S", 15),
-        ("--conditions k3 S", 3),  # the split is no condition
+        ("--conditions k3 S", 3),  # the buffer set is no condition
         ("S --families MoveCube --difficulty easy", 5),
         ("S --families MoveCube,PatternLock --conditions k7 --conditions k0", 4),
     ],
 )
-def test_list_as_json_is_one_value(arguments: str, count: int, run: Run, tiny_split: Path) -> None:
-    code, out, err = run("list", "--json", *in_split(arguments, tiny_split))
+def test_list_as_json_is_one_value(
+    arguments: str, count: int, run: Run, tiny_buffers: Path
+) -> None:
+    code, out, err = run("list", "--json", *in_buffer_set(arguments, tiny_buffers))
     assert (code, err) == (0, "")
     rows = json.loads(out)
     assert len(rows) == count
-    known = [to_dict(manifest) for manifest in load_split(tiny_split).manifests()]
+    known = [to_dict(manifest) for manifest in load_buffer_set(tiny_buffers).manifests()]
     assert all(row in json.loads(json.dumps(known)) for row in rows)
 
 
-def test_names_of_folders_that_are_not_utf8(own_split: Path) -> None:
-    renamed = os.fsencode(own_split.parent) + b"/\xff\xfe"
-    os.rename(own_split, renamed)  # noqa: PTH104
+def test_names_of_folders_that_are_not_utf8(own_buffers: Path) -> None:
+    renamed = os.fsencode(own_buffers.parent) + b"/\xff\xfe"
+    os.rename(own_buffers, renamed)  # noqa: PTH104
     done = subprocess.run([SCRIPT, "list", renamed], capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"VideoRepick/test/0" in done.stdout
 
 
-def test_show(run: Run, tiny_split: Path) -> None:
-    code, out, err = run("show", EPISODE, "k3", "--split", tiny_split)
+def test_show(run: Run, tiny_buffers: Path) -> None:
+    code, out, err = run("show", tiny_buffers, EPISODE, "k3")
     assert (code, err) == (0, "")
     assert "watch the video carefully" in out
     rows = table_rows(out)
@@ -218,11 +220,11 @@ def test_show(run: Run, tiny_split: Path) -> None:
     assert "34% lesson" in " ".join(out.split())  # 11 of an even 32-frame sample
 
 
-def test_show_as_json_and_as_a_picture(run: Run, tiny_split: Path, tmp_path: Path) -> None:
+def test_show_as_json_and_as_a_picture(run: Run, tiny_buffers: Path, tmp_path: Path) -> None:
     picture = tmp_path / "strip.png"
-    code, out, err = run("show", EPISODE, "k1", "--split", tiny_split, "--out", picture, "--json")
+    code, out, err = run("show", tiny_buffers, EPISODE, "k1", "--out", picture, "--json")
     assert code == 0
-    manifest = to_dict(load_split(tiny_split).manifest(EPISODE, "k1"))
+    manifest = to_dict(load_buffer_set(tiny_buffers).manifest(EPISODE, "k1"))
     shown = json.loads(out)
     leaves, turns = shown.pop("evidence")
     assert shown == json.loads(json.dumps(manifest))
@@ -232,12 +234,12 @@ def test_show_as_json_and_as_a_picture(run: Run, tiny_split: Path, tmp_path: Pat
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_verify(run: Run, own_split: Path) -> None:
-    code, out, _ = run("verify", own_split, "--json", "--no-decode")
+def test_verify(run: Run, own_buffers: Path) -> None:
+    code, out, _ = run("verify", own_buffers, "--json", "--no-decode")
     assert (code, json.loads(out)) == (0, [])
-    (video, *_) = sorted(own_split.glob("demonstrations/videos/*front/*/*.mp4"))
+    (video, *_) = sorted(own_buffers.glob("demonstrations/videos/*front/*/*.mp4"))
     video.unlink()
-    code, out, err = run("verify", own_split, "--no-decode")
+    code, out, err = run("verify", own_buffers, "--no-decode")
     assert code == 1
     assert video.name in out and "Traceback" not in err
 
@@ -248,24 +250,16 @@ def test_verify(run: Run, own_split: Path) -> None:
 def test_a_folder_that_cannot_be_made_is_one_error(run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     out = tmp_path / "file" / "S"
-    code, told, err = run("build", "demonstrations", "--source", "sample", "--out", out)
+    code, told, err = run("build", "demonstrations", out, "--source", "sample")
     assert (code, told) == (1, "")
     assert f"Error: {out.parent}" in err and "Not a directory" in err
     assert "Traceback" not in err
 
 
-def test_console_script_takes_the_split_from_the_environment(tiny_split: Path) -> None:
-    environment = {**os.environ, "ROBOMME_INTERFERENCE_SPLIT": str(tiny_split)}
-    command = [SCRIPT, "show", EPISODE, "k3", "--json"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert json.loads(done.stdout)["episode_id"] == EPISODE
-
-
-def test_the_reader_of_stdout_may_go_away(tiny_split: Path) -> None:
+def test_the_reader_of_stdout_may_go_away(tiny_buffers: Path) -> None:
     """As with `robomme-interference list … | head`."""
     with subprocess.Popen(
-        [SCRIPT, "list", tiny_split, "--json"],
+        [SCRIPT, "list", tiny_buffers, "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -13,10 +13,10 @@ from typing import Any
 import psutil
 import pytest
 from support import runs, worlds
+from support.buffer_sets import GOLDEN, contents
 from support.made_up import MadeUpSource
 from support.ray_cluster import add_node, running_cluster
 from support.serve_policy import command
-from support.splits import GOLDEN, contents
 from support.worker_calls import Marked, behave, wait_until_gone
 
 from robomme_interference_data.build_dataset.build import build_dataset
@@ -38,7 +38,7 @@ ROLLOUTS = 2 * len(CONDITIONS)
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """A cluster of one's own, for nodes are taken away; its workers know the tests' world."""
-    own = {worlds.SPLIT: str(GOLDEN), worlds.PAUSE: "0.03"}
+    own = {worlds.BUFFER_SET: str(GOLDEN), worlds.PAUSE: "0.03"}
     with pytest.MonkeyPatch.context() as patch:
         for name, value in own.items():
             patch.setenv(name, value)
@@ -56,11 +56,11 @@ def ended(out: Path) -> list[dict[str, Any]]:
 
 def driver(out: Path, address: str) -> subprocess.Popen[str]:
     """The command, as a user runs it."""
-    words = f"evaluate --policy {runs.CHEAT} --simulator {runs.WORLD} --system mine --workers 3"
+    words = f"evaluate {GOLDEN} --policy {runs.CHEAT} --simulator {runs.WORLD} --system mine --workers 3"
     words += f" --families VideoRepick,MoveCube --executor ray --ray-address {address} --json"
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", *words.split()]
     return subprocess.Popen(
-        [*command, "--split", str(GOLDEN), "--out", str(out)],
+        [*command, "--out", str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

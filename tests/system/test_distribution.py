@@ -11,12 +11,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from support.hub import SPLIT, push_split
+from support.buffer_sets import GOLDEN, expected_frames, expected_states
+from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
 from support.package import CONFIG, HEAVY, PACKAGE, ROOT, committable, module_files
-from support.splits import GOLDEN, expected_frames, expected_states
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 
 pytestmark = pytest.mark.slow  # test_packaging.py compares the lists of files
 
@@ -107,7 +107,7 @@ import hashlib, json
 from importlib.util import find_spec
 from robomme_interference_data import load_buffer
 
-buffer = load_buffer("MoveCube/test/0", "k3", split="{split}", revision="data-1.0.0", verify=True)
+buffer = load_buffer("MoveCube/test/0", "k3", buffer_set="{buffer_set}", revision="data-1.0.0", verify=True)
 arrays = [buffer.frames("front"), buffer.frames("wrist"), buffer.states]
 print(json.dumps({{
     "arrays": [[a.shape, str(a.dtype), hashlib.sha256(a.tobytes()).hexdigest()] for a in arrays],
@@ -119,16 +119,16 @@ print(json.dumps({{
 def test_the_wheel_alone_loads_a_buffer_from_the_hub(
     empty_python: Path, hub: HubServer, tmp_path: Path
 ) -> None:
-    push_split(hub, GOLDEN, tmp_path / "work")
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
     own = {"HF_ENDPOINT": hub.endpoint, "HF_HUB_CACHE": str(tmp_path / "fresh")}
     own |= {"HF_HUB_DISABLE_XET": "1", "HF_HUB_OFFLINE": "0"}
-    code = LOAD.format(split=SPLIT, heavy=HEAVY)
+    code = LOAD.format(buffer_set=BUFFER_SET, heavy=HEAVY)
     command = [empty_python, "-I", "-c", code]
     done = subprocess.run(
         command, env=os.environ | own, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    sessions = load_split(GOLDEN).manifest("MoveCube/test/0", "k3").sessions
+    sessions = load_buffer_set(GOLDEN).manifest("MoveCube/test/0", "k3").sessions
     arrays = [*(expected_frames(sessions, name) for name in ("front", "wrist"))]
     arrays.append(expected_states(sessions))
     assert json.loads(done.stdout) == {

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.buffer_sets import GOLDEN, QUERIES
 from support.chat_server import ChatServer
 from support.command_lines import parse
-from support.hub import push_split, running_hub
-from support.splits import GOLDEN, QUERIES
+from support.hub import push_buffer_set, running_hub
 from support.tabletop import copy_tabletop
 
 from robomme_interference_data.evaluate.run import evaluation as run_module
@@ -47,12 +47,12 @@ def test_command_lines_are_understood(page: str, line: str) -> None:
 def test_the_readmes_commands_run(
     tmp_path: Path, run: Any, hub: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a folder with the split of `make demo`, on made-up recordings, without a renderer."""
-    push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
+    """In a folder with the buffer set of `make demo`, on made-up recordings, without a renderer."""
+    push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
     demo = copy_tabletop(tmp_path / "demo" / "tabletop")
-    (tmp_path / "demo" / "split").symlink_to(demo)
+    (tmp_path / "demo" / "buffers").symlink_to(demo)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WORLDS_SPLIT", "S")
+    monkeypatch.setenv("WORLDS_DATA", "S")
     monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
     for line in command_lines(ROOT / "README.md"):
         given = line.replace("robomme-h5:recordings/", "sample")
@@ -70,7 +70,7 @@ ELSEWHERE = (
     "simulate ",  # a renderer
     "--source ",  # recordings, or a renderer
     "--shift ",  # a renderer
-    "k31",  # more units than the golden split has
+    "k31",  # more units than the golden buffer set has
     "stale-k7",  # contradicting lessons, which a renderer plays
     "retrieval_rollouts.csv",  # the released rows
     "my-units",  # recordings, of which it is made
@@ -80,16 +80,16 @@ ELSEWHERE = (
 """What marks command lines of the pages that need what is not at hand: they are parsed alone."""
 
 BEFORE = {
-    "evaluate.md": ["evaluate --policy replay --split my-split --out runs/shard-1 --shard 1/8"],
-    "cluster.md": ["evaluate --policy replay --split my-split --out runs/part-2 --shard 2/8"],
+    "evaluate.md": ["evaluate my-buffers --policy replay --out runs/shard-1 --shard 1/8"],
+    "cluster.md": ["evaluate my-buffers --policy replay --out runs/part-2 --shard 2/8"],
     "score.md": [
-        f"evaluate --policy replay:{memory} --split my-split --out runs/{name}"
+        f"evaluate my-buffers --policy replay:{memory} --out runs/{name}"
         for name, memory in (
             *(("window", "window"), ("framesamp", "framesamp")),
             *(("retrieval", "framesamp"), ("window-light-2", "window")),
         )
     ],
-    "publish.md": ["evaluate --policy replay --split my-split --out my-run --episodes 0"],
+    "publish.md": ["evaluate my-buffers --policy replay --out my-run --episodes 0"],
 }
 """Runs that pages speak of without making them."""
 
@@ -98,27 +98,27 @@ BEFORE = {
 @pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.name)
 def test_the_commands_of_the_pages_run(
     page: Path,
-    own_split: Path,
-    tiny_split: Path,
+    own_buffers: Path,
+    tiny_buffers: Path,
     tmp_path: Path,
     run: Any,
     login: Any,
     hub: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """On a golden split, in a world without a renderer, in this process, logged in to a Hub.
+    """On a golden buffer set, in a world without a renderer, in this process, logged in to a Hub.
 
     Where pages name a chat endpoint, one answers that knows one letter; prompts are the page's own.
     """
     login("my-name")
-    push_split(hub, GOLDEN, tmp_path / "work", "namespace/name")
+    push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
     asked = page.name == "questions.md"
-    split = copy_tabletop(tmp_path / "tabletop") if asked else own_split
+    buffer_set = copy_tabletop(tmp_path / "tabletop") if asked else own_buffers
     (tmp_path / "docs").symlink_to(ROOT / "docs")  # rows that a page scores
-    for name in ("my-split", "S"):
-        (tmp_path / name).symlink_to(split)
+    for name in ("my-buffers", "S"):
+        (tmp_path / name).symlink_to(buffer_set)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WORLDS_SPLIT", str(tiny_split))
+    monkeypatch.setenv("WORLDS_DATA", str(tiny_buffers))
     monkeypatch.setattr(run_module, "make_executor", lambda config: Serial())
     for name, prompt in re.findall(
         r"```toml\n# (\S+)\n(.*?)```", page.read_text("utf-8"), flags=re.S
@@ -141,17 +141,17 @@ def test_the_commands_of_the_pages_run(
 
 @pytest.mark.parametrize("example", ["hub", "load"])
 def test_the_readmes_python_examples(
-    example: str, tmp_path: Path, tiny_split: Path, monkeypatch: pytest.MonkeyPatch
+    example: str, tmp_path: Path, tiny_buffers: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     found = re.search(rf"<!-- example: {example} -->\n```python\n(.*?)```", text, flags=re.S)
     assert found is not None
     (tmp_path / "demo").mkdir()
-    (tmp_path / "demo" / "split").symlink_to(tiny_split)
+    (tmp_path / "demo" / "buffers").symlink_to(tiny_buffers)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     with running_hub(tmp_path / "cache", monkeypatch) as hub:
-        push_split(hub, tiny_split, tmp_path / "work", "namespace/name")
+        push_buffer_set(hub, tiny_buffers, tmp_path / "work", "namespace/name")
         exec(found[1], names)
     buffer = names["buffer"]
     assert len(buffer) == 48 + 3 * 32  # type: ignore[arg-type]

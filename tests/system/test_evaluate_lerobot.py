@@ -26,7 +26,7 @@ def test_a_policy_trained_on_built_demonstrations_acts(tmp_path: Path) -> None:
     from robomme_interference_data.runtime.progress import WorkProgress
 
     out = tmp_path / "demonstrations"
-    config = BuildConfig(source=("sample:MoveCube,PatternLock",), out=out, split="test")
+    config = BuildConfig(source=("sample:MoveCube,PatternLock",), buffer_set=out, split="test")
     plan = plan_build("demonstrations", config)
     build_dataset(plan, out, Serial(), WorkProgress(quiet=True))
     given = {"device": "cpu", "push_to_hub": False, "pretrained_backbone_weights": None}

@@ -31,7 +31,7 @@ GUARD = 'if __name__ == "__main__":'
 
 @pytest.fixture(autouse=True)
 def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(worlds.SPLIT, str(TESTS / "golden" / "split"))
+    monkeypatch.setenv(worlds.BUFFER_SET, str(TESTS / "golden" / "buffer_set"))
     monkeypatch.setenv(worlds.TROUBLE, str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
 
@@ -39,11 +39,11 @@ def _world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def start(
     out: Path, pause: float = 0.0, policy: str = runs.CHEAT, words: Sequence[str] = ()
 ) -> subprocess.Popen[str]:
-    usual = f"evaluate --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
+    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --policy {policy} --simulator {runs.WORLD} --system mine --workers 2"
     usual += " --families VideoRepick,MoveCube --json"
     called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split(), *words]
     return subprocess.Popen(
-        [*called, "--split", os.environ[worlds.SPLIT], "--out", str(out)],
+        [*called, "--out", str(out)],
         env=os.environ | {worlds.PAUSE: str(pause)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -233,8 +233,8 @@ from pathlib import Path
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 
 options = {{"simulator": {runs.WORLD!r}, "conditions": ("k0",), "families": ("MoveCube",)}}
-split, out = Path({os.environ[worlds.SPLIT]!r}), Path("run")
-config = RunConfig({runs.CHEAT!r}, split, out, system="mine", **options)
+buffer_set, out = Path({os.environ[worlds.BUFFER_SET]!r}), Path("run")
+config = RunConfig({runs.CHEAT!r}, buffer_set, out, system="mine", **options)
 {call}
 """)
     return subprocess.run(

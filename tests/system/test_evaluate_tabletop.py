@@ -29,7 +29,7 @@ def test_a_machine_that_cannot_draw_is_told_so_once(
 
 
 @pytest.fixture(scope="module")
-def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def buffer_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two query episodes, a distractor unit."""
     from robomme_interference_data.simulators.registry import make_simulator
 
@@ -40,9 +40,8 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tabletop")
     played = "--source tabletop --episodes 0 --cameras front --workers 2"
     for words in (
-        f"demonstrations {played} --split test --families MoveCube,RouteStick "
-        f"--out {out}/demonstrations",
-        f"distractors {played} --families PatternLock --out {out}/distractors",
+        f"demonstrations {out} {played} --split test --families MoveCube,RouteStick",
+        f"distractors {out} {played} --families PatternLock",
         f"manifests {out} --conditions no-history,k0,k1",
     ):
         command = [COMMAND, "build", *words.split()]
@@ -52,14 +51,14 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_replay_retraces_the_lesson_with_one_worker_as_with_two(
-    split: Path, tmp_path: Path
+    buffer_set: Path, tmp_path: Path
 ) -> None:
-    # The split was built from the same simulator: the same bits. All that MoveCube and RouteStick
+    # The buffer set was built from the same simulator: the same bits. All that MoveCube and RouteStick
     # ask for is in the arm's motion.
     runs = [
         run_evaluation(
             RunConfig(
-                *("replay", split, tmp_path / str(workers)),
+                *("replay", buffer_set, tmp_path / str(workers)),
                 conditions=("k0", "k1"),
                 workers=workers,
                 check_lesson=True,
@@ -72,17 +71,17 @@ def test_replay_retraces_the_lesson_with_one_worker_as_with_two(
     assert [row["status"] for row in one] == ["success"] * 4
 
 
-def test_the_oracle_always_succeeds_and_nothing_is_drawn(split: Path, tmp_path: Path) -> None:
-    config = RunConfig("oracle", split, tmp_path / "run", conditions=("no-history",))
+def test_the_oracle_always_succeeds_and_nothing_is_drawn(buffer_set: Path, tmp_path: Path) -> None:
+    config = RunConfig("oracle", buffer_set, tmp_path / "run", conditions=("no-history",))
     assert [row.status for row in run_evaluation(config).rows] == ["success"] * 2
 
 
 def test_who_obeys_reaches_the_oracle_with_its_subgoals_and_the_guess_without(
-    split: Path, tmp_path: Path
+    buffer_set: Path, tmp_path: Path
 ) -> None:
     def ended(policy: str, subgoals: str | None = None) -> dict[tuple[str, str], tuple[str, int]]:
         out = tmp_path / f"{policy}-{subgoals}"
-        rows = run_evaluation(RunConfig(policy, split, out, subgoals=subgoals, workers=2)).rows
+        rows = run_evaluation(RunConfig(policy, buffer_set, out, subgoals=subgoals, workers=2)).rows
         return {(row.family, row.condition): (row.status, row.steps) for row in rows}
 
     obeyed, guessed = ended("obey", "oracle"), ended("guess")

@@ -1,4 +1,4 @@
-"""Fetch after a kill: what has come is not asked for again, and the split is the one on disk."""
+"""Fetch after a kill: what has come is not asked for again, and the buffer set is the one on disk."""
 
 import json
 import re
@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 from huggingface_hub import constants
-from support.hub import SPLIT, kill_at, push_split
+from support.buffer_sets import GOLDEN, QUERIES
+from support.hub import BUFFER_SET, kill_at, push_buffer_set
 from support.hub_http import Request
 from support.hub_server import HubServer
-from support.splits import GOLDEN, QUERIES
 
-from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 
 Run = Callable[..., tuple[int, str, str]]
 FETCH = "from robomme_interference_data.cli.main import main; main()"
-SPLIT_AT = f"{SPLIT}@data-1.0.0"
+SPLIT_AT = f"{BUFFER_SET}@data-1.0.0"
 FILE = re.compile(r"/(?:store/)?datasets/([^/]+/[^/]+)/(?:resolve/)?[0-9a-f]{40,64}/(.+)")
 AT_ONCE = 8
 """Files that are on their way at the same time."""
@@ -40,7 +40,7 @@ def asked_for(requests: Iterable[Request]) -> list[tuple[str, ...]]:
 
 
 def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path) -> None:
-    push_split(hub, GOLDEN, tmp_path / "work")
+    push_buffer_set(hub, GOLDEN, tmp_path / "work")
     out = tmp_path / "out"
     words = ["fetch", SPLIT_AT, "--to", str(out)]
     kill_at(hub, "GET", r"/store/.*\.mp4", 24, FETCH, *words)
@@ -59,10 +59,10 @@ def test_fetch_after_a_kill(hub: HubServer, run: Run, tmp_path: Path) -> None:
     # Of those that were under way, some may be whole without having their names.
     assert len(downloads) == len({*downloads}) >= missing - AT_ONCE and {*downloads} <= about
     hub.down = True
-    split, here = load_split(out), load_split(GOLDEN)
+    buffer_set, here = load_buffer_set(out), load_buffer_set(GOLDEN)
     for query in QUERIES:
-        found, expected = (one.load(query, "k7", verify=True) for one in (split, here))
+        found, expected = (one.load(query, "k7", verify=True) for one in (buffer_set, here))
         for camera in expected.cameras:
             assert np.array_equal(found.frames(camera), expected.frames(camera))
         assert np.array_equal(found.states, expected.states)
-    assert list(verify_split(split)) == []
+    assert list(verify_buffer_set(buffer_set)) == []

@@ -13,7 +13,7 @@ from robomme_interference_data.cli.console import echo, log_to_stderr, print_jso
 from robomme_interference_data.cli.hints import error_lines, option_names
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError, NoRendererError
 
-EVALUATE = option_names(typer.main.get_command(main.app), ["evaluate", "my-split", "--json"])
+EVALUATE = option_names(typer.main.get_command(main.app), ["evaluate", "my-buffers", "--json"])
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.buffer_sets import GOLDEN, dataset, stored_frames, stored_states
 from support.recordings import check_recording, make_episode
-from support.splits import GOLDEN, dataset, stored_frames, stored_states
 
 from robomme_interference_data.build_dataset.sources.lerobot import LeRobotSource
 from robomme_interference_data.storage.encode import CODECS, Codec

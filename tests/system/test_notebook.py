@@ -1,4 +1,4 @@
-"""The example notebook, run cell by cell; what buffers and splits show in one."""
+"""The example notebook, run cell by cell; what buffers and buffer sets show in one."""
 
 import json
 import sys
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from IPython.core.interactiveshell import InteractiveShell
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "buffers.ipynb"
 
@@ -19,7 +19,7 @@ def shell() -> InteractiveShell:
 
 
 def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPLIT", str(GOLDEN))
+    monkeypatch.setenv("BUFFER_SET", str(GOLDEN))
     shown = []
     for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
         if cell["cell_type"] == "code":
@@ -31,8 +31,8 @@ def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPat
     assert ["text/html", "text/plain"] in shown and ["image/png", "text/plain"] in shown
 
 
-def test_a_split_is_a_table(shell: InteractiveShell) -> None:
-    formats, _ = shell.display_formatter.format(load_split(GOLDEN))
+def test_a_buffer_set_is_a_table(shell: InteractiveShell) -> None:
+    formats, _ = shell.display_formatter.format(load_buffer_set(GOLDEN))
     assert "<td" in formats["text/html"] and "MoveCube" in formats["text/html"]
 
 
@@ -42,6 +42,6 @@ def test_without_matplotlib_a_buffer_is_text(
     for name in [one for one in sys.modules if one.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    buffer = load_buffer("MoveCube/test/0", "k1", split=GOLDEN)
+    buffer = load_buffer("MoveCube/test/0", "k1", buffer_set=GOLDEN)
     formats, _ = shell.display_formatter.format(buffer)
     assert [*formats] == ["text/plain"] and "MoveCube/test/0" in formats["text/plain"]

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.buffer_sets import GOLDEN, contents, stored_frames
 from support.hub import elsewhere, kill_at
 from support.hub_server import HubServer
 from support.publishing import LESSONS, UNITS, files, publish, tags
-from support.splits import GOLDEN, contents, stored_frames
 
-from robomme_interference_data import load_split
+from robomme_interference_data import load_buffer_set
 from robomme_interference_data.cards.checks import open_with_lerobot
 from robomme_interference_data.errors import PublishError
 
 PUBLISH = """
 from support.publishing import publish
-from support.splits import GOLDEN
+from support.buffer_sets import GOLDEN
 
 publish(GOLDEN)
 """
@@ -28,8 +28,8 @@ import json, sys
 from datasets import load_dataset
 
 for name in ("buffers", "episodes"):
-    [(split, rows)] = load_dataset(sys.argv[1], name).items()
-    print(json.dumps([name, split, rows["episode_id"][:2], len(rows)]))
+    [(buffer set, rows)] = load_dataset(sys.argv[1], name).items()
+    print(json.dumps([name, buffer set, rows["episode_id"][:2], len(rows)]))
 """
 
 
@@ -49,7 +49,7 @@ def test_what_was_published_is_opened_by_lerobot(
 
     for repo_id, name in ((LESSONS, "demonstrations"), (UNITS, "distractors")):
         opened = LeRobotDataset(repo_id, root=tmp_path / name, video_backend="pyav")
-        record = next(iter(load_split(GOLDEN).datasets[name].records()))
+        record = next(iter(load_buffer_set(GOLDEN).datasets[name].records()))
         frame = opened[3]["observation.images.front"].numpy().transpose(1, 2, 0)
         stored = stored_frames(name, record.episode_id, "front")[3]
         assert np.array_equal(np.round(frame * 255).astype(np.uint8), stored)
@@ -68,7 +68,9 @@ def test_publish_after_a_kill(hub: HubServer) -> None:
         held = contents(GOLDEN / name)
         found = files(hub, repo_id, "data-1.0.0")
         assert {path: found[path] for path in held} == held
-    assert load_split(UNITS, revision="data-1.0.0").revision == load_split(GOLDEN).revision
+    assert (
+        load_buffer_set(UNITS, revision="data-1.0.0").revision == load_buffer_set(GOLDEN).revision
+    )
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.build import build_dataset
 from robomme_interference_data.build_dataset.config import BuildPlan, list_episodes
 from robomme_interference_data.build_dataset.manifests import (
@@ -21,7 +21,7 @@ from robomme_interference_data.build_dataset.manifests import (
     write_manifests,
 )
 from robomme_interference_data.build_dataset.sources import open_source
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.runtime.progress import WorkProgress
 
@@ -92,27 +92,29 @@ def video_frames(path: Path) -> NDArray[np.uint8]:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
-def test_a_split_of_real_frames(shared_data: Path, recordings: Path, tmp_path: Path) -> None:
+def test_a_buffer_set_of_real_frames(shared_data: Path, recordings: Path, tmp_path: Path) -> None:
     """Test lessons of two families, and one unit of a third."""
-    split, starts = tmp_path / "split", {"PatternLock": 86, "VideoUnmask": 66}
+    buffer_set, starts = tmp_path / "buffer_set", {"PatternLock": 86, "VideoUnmask": 66}
     lessons = shared_data / "lessons"
     write_lessons(lessons, tmp_path / "lessons", starts)
     sources = {"demonstrations": f"frames:{tmp_path / 'lessons'}"}
     for kind, name in (sources | {"distractors": f"robomme-h5:{recordings}"}).items():
         source = open_source(name)
         plan = BuildPlan(kind, (source,), list_episodes([source]), ("front",))
-        result = build_dataset(plan, split / kind, Serial(), WorkProgress(unit="episodes"))
+        result = build_dataset(plan, buffer_set / kind, Serial(), WorkProgress(unit="episodes"))
     assert result.skipped == {"PatternLock/train/0": "96 raw frames; a unit needs 249"}
-    for _ in write_manifests(plan_manifests(in_folder(split), ("k0", "k1"), 0, None), split):
+    for _ in write_manifests(
+        plan_manifests(in_folder(buffer_set), ("k0", "k1"), 0, None), buffer_set
+    ):
         pass
-    assert list(verify_split(load_split(split))) == []
+    assert list(verify_buffer_set(load_buffer_set(buffer_set))) == []
     with h5py.File(recordings / "record_dataset_VideoUnmaskSwap.h5", "r") as file:
         groups = [file[f"episode_0/timestep_{step}"] for step in range(0, 256, 8)]
         unit = np.stack([group["obs/front_rgb"][()] for group in groups])
     for family, start in starts.items():
         lesson = video_frames(lessons / f"{family}_test_0_front.mkv")
         states = np.load(lessons / f"{family}_test_0.npz")["state"]
-        buffer = load_buffer(f"{family}/test/0", k=1, split=split, verify=True)
+        buffer = load_buffer(f"{family}/test/0", k=1, buffer_set=buffer_set, verify=True)
         assert (len(lesson), len(buffer)) == (start + 1, start + 32)
         assert np.array_equal(buffer.frames("front"), [*lesson[:start], *unit])
         assert np.array_equal(buffer.states[:start], states[:start])

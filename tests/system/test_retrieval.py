@@ -19,9 +19,9 @@ from robomme_interference_data.runtime.executor import Processes, Serial
 Features = dict[str, NDArray[np.float32]]
 
 
-def test_worker_processes_give_the_same_bytes(tiny_split: Path, tmp_path: Path) -> None:
+def test_worker_processes_give_the_same_bytes(tiny_buffers: Path, tmp_path: Path) -> None:
     for name, executor in (("a", Serial()), ("b", Processes(2))):
-        units = shutil.copytree(tiny_split / "distractors", tmp_path / name / "distractors")
+        units = shutil.copytree(tiny_buffers / "distractors", tmp_path / name / "distractors")
         build_index([units], Thumbnail(), QUIET, executor=executor)
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 

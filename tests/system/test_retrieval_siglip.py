@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.buffer_sets import QUERIES
 from support.retrieval import make_index
-from support.splits import QUERIES
 
-from robomme_interference_data import load_buffer, load_split
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.buffer_set_index import normalised
 from robomme_interference_data.errors import FormatError, HubError, InvalidOptionError
 from robomme_interference_data.retrieval.encoders import make_encoder
@@ -69,17 +69,17 @@ def test_siglip_is_transformers_own_pipeline(model: str) -> None:
     assert encoder.fingerprint["transformers"] == transformers.__version__
 
 
-def test_siglip_makes_an_index(own_split: Path, model: str) -> None:
+def test_siglip_makes_an_index(own_buffers: Path, model: str) -> None:
     encoder = make_encoder(model, device="cpu")
-    make_index(own_split, encoder)
-    datasets = load_split(own_split).datasets
+    make_index(own_buffers, encoder)
+    datasets = load_buffer_set(own_buffers).datasets
     demonstrations, length = datasets["demonstrations"], datasets["demonstrations"].record(0).length
     images = np.empty((length, *demonstrations.shape("front")), np.uint8)
     demonstrations.read_frames(0, "front", 0, images)
     found, expected = demonstrations.index(model).span(0, 0, length), encoder.prepare(images)
     assert found == pytest.approx(encoder.features(expected), rel=2e-3, abs=2e-3)
     assert datasets["distractors"].index(model).centre is None
-    buffer = load_buffer(QUERIES[0], "k1", split=own_split)
+    buffer = load_buffer(QUERIES[0], "k1", buffer_set=own_buffers)
     selector = Selector(model, device="cpu")
     assert selector.name == "siglip-tiny/max/adaptive"
     live = encoder.features(encoder.prepare(buffer.query.frame()[None]))

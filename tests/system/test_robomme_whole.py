@@ -26,13 +26,13 @@ from robomme_interference_data.storage.files import LocalFiles
 def build(kind: str, config: BuildConfig) -> int:
     """Build a dataset in this process; return how many episodes were added."""
     plan = plan_build(kind, config)
-    return build_dataset(plan, config.out, Serial(), WorkProgress(quiet=True)).added
+    return build_dataset(plan, config.buffer_set / kind, Serial(), WorkProgress(quiet=True)).added
 
 
 def config_of(out: Path, python: Path, episodes: str) -> BuildConfig:
     return BuildConfig(
         source=("robomme",),
-        out=out,
+        buffer_set=out,
         families=("MoveCube",),
         split="test",
         episodes=episodes,
@@ -42,7 +42,7 @@ def config_of(out: Path, python: Path, episodes: str) -> BuildConfig:
 
 def test_demonstrations_are_built_from_it(tmp_path: Path, robomme_python: Path) -> None:
     out = tmp_path / "demonstrations"
-    config = config_of(out, robomme_python, "0-1")
+    config = config_of(tmp_path, robomme_python, "0-1")
     assert build(DEMONSTRATIONS, config) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
     dataset = Dataset(LocalFiles(out))
@@ -59,7 +59,7 @@ def test_demonstrations_are_built_from_it(tmp_path: Path, robomme_python: Path) 
         assert [np.unique(frame).tolist() for frame in frames] == [[offset + t] for t in range(4)]
     assert build(DEMONSTRATIONS, config) == 0
     with pytest.raises(InvalidOptionError, match="demonstrations only"):
-        build(DISTRACTORS, replace(config, out=tmp_path / "units"))
+        build(DISTRACTORS, replace(config, buffer_set=tmp_path / "units"))
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
 
 
@@ -69,7 +69,7 @@ def test_an_interpreter_that_will_not_do_leaves_nothing(tmp_path: Path, executor
         config = config_of(tmp_path / "new", Path(python), "0-9")
         plan = plan_build(DEMONSTRATIONS, config)
         with pytest.raises(error):
-            build_dataset(plan, config.out, executor, WorkProgress(quiet=True))
+            build_dataset(plan, config.buffer_set, executor, WorkProgress(quiet=True))
         assert list(tmp_path.iterdir()) == []
 
 
@@ -77,11 +77,9 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
     from robomme_interference_data.evaluate import run_evaluation
     from robomme_interference_data.evaluate.run.config import RunConfig
 
-    queries = config_of(tmp_path / DEMONSTRATIONS, robomme_python, "45-47")
+    queries = config_of(tmp_path, robomme_python, "45-47")
     build(DEMONSTRATIONS, replace(queries, cameras=("front",)))
-    units = BuildConfig(
-        ("sample:VideoRepick",), tmp_path / DISTRACTORS, split="train", cameras=("front",)
-    )
+    units = BuildConfig(("sample:VideoRepick",), tmp_path, split="train", cameras=("front",))
     build(DISTRACTORS, units)
     for _ in write_manifests(
         plan_manifests(in_folder(tmp_path), ("no-history", "k0", "k1")), tmp_path
@@ -89,7 +87,7 @@ def test_an_evaluation_on_it(tmp_path: Path, robomme_python: Path) -> None:
         pass
     config = RunConfig(
         policy="replay",
-        split=tmp_path,
+        buffer_set=tmp_path,
         out=tmp_path / "run",
         simulator="robomme",
         robomme_python=str(robomme_python),

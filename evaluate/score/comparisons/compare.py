@@ -182,7 +182,7 @@ def _check_scenes(one: Rows, other: Rows) -> None:
     """Check that the two runs' scenes are the same: an episode's seed is one."""
     known, found = (
         {
-            (unshifted(row.simulator), row.family, row.episode_split, row.episode): row.seed
+            (unshifted(row.simulator), row.family, row.split, row.episode): row.seed
             for row in rows
             if row.seed is not None
         }
@@ -225,7 +225,7 @@ def _differing(one: Rows, other: Rows, matched: Iterable[tuple[_Side, _Side]]) -
         revisions = [rows.revisions.get(name) for rows, name in zip((one, other), two, strict=True)]
         if revisions[0] != revisions[1]:
             yield (
-                f"The rows of {two[0]} are of different splits (revisions "
+                f"The rows of {two[0]} are of different buffer sets (revisions "
                 f"{' and '.join(one or 'not known' for one in revisions)}): the histories may "
                 "differ."
             )

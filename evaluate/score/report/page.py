@@ -180,7 +180,7 @@ def _videos(rows: Rows) -> dict[tuple[str, ...], Path]:
     """
     found: dict[tuple[str, ...], Path] = {}
     for row in sorted((one for one in rows if one.video), key=lambda one: one.model_seed):
-        episode = f"{row.family}/{row.episode_split}/{row.episode}"
+        episode = f"{row.family}/{row.split}/{row.episode}"
         key = (row.simulator, row.system, row.condition, episode)
         if key not in found and row.video.is_file():
             found[key] = row.video
@@ -217,7 +217,10 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         "episodes of a complete cell": _GRIDS[settings.grid],
         "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
         "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
-        **{f"revision of the split, {name}": rev for name, rev in sorted(rows.revisions.items())},
+        **{
+            f"revision of the buffer set, {name}": rev
+            for name, rev in sorted(rows.revisions.items())
+        },
         "note": " ".join(score.notes),
         "bad rows left out": f"{rows.refused:,}: {'; '.join(rows.refusals)}" * bool(rows.refused),
     }

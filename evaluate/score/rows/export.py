@@ -24,13 +24,13 @@ RELEASED_COLUMNS = (
 def export(rows: Rows, folder: Path) -> list[Path]:
     """Write rows as `<system>-<simulator>_rollouts.csv`, a file each.
 
-    The columns are those of the released retrieval rows, which name no system, split or revision;
+    The columns are those of the released retrieval rows, which name no system, buffer set or revision;
     rows of another simulator than RoboMME have its name in one more, the last. A timeout is
     `ongoing`, as there. The rows keep the order of their files, and are the same bytes whatever
     files they come from.
     """
     seeds = len(rows.names("model_seed"))
-    other = sum(row.episode_split != "test" for row in rows)
+    other = sum(row.split != "test" for row in rows)
     wrong = [f"{seeds} model seeds"] * (seeds > 1)
     wrong += [f"{other:,} rows of train or val episodes"] * (other > 0)
     wrong += [f"{rows.refused:,} bad rows"] * (rows.refused > 0)

@@ -23,7 +23,7 @@ from robomme_interference_data.storage.parquet import open_parquet, read_table, 
 
 _SCHEMA = arrow_schema(Rollout)
 _REQUIRED = ("family", "condition", "episode", "status", "success")
-_RUN_ONLY = {"split", "revision", "episode_split", "shift", "model_seed", "protocol_version"}
+_RUN_ONLY = {"buffer_set", "revision", "split", "shift", "model_seed", "protocol_version"}
 """Key columns of a run's rows. The released layout is without them, and without `simulator`,
 which exported rows of other simulators have as one column more."""
 _MOST_ROWS = 1 << 20

@@ -20,7 +20,7 @@ from .values import DEFAULTS, Row, parse, shifted
 _SHOWN = 10  # so many bad rows are named; the others are counted
 
 _SUCCESS = {str(one): one == Status.SUCCESS for one in FINAL} | {str(Status.ERROR): None}
-_EPISODE = ("simulator", "family", "episode_split", "episode")
+_EPISODE = ("simulator", "family", "split", "episode")
 _ROLLOUT = ("system", "condition", "model_seed", *_EPISODE)
 
 
@@ -31,7 +31,7 @@ class Rows:
     Attributes:
         rows: The rows.
         sources: The files that were read (see `files.find_sources`).
-        revisions: Simulator to the revision of its split, where rows name one.
+        revisions: Simulator to the revision of its buffer set, where rows name one.
         unpinned: Simulator and system of rows that name no revision, as released ones.
         retrieval: Simulator and system to the retrieval steps in front of it, if there are any.
         refusals: The first bad rows that were left out: place and reason.
@@ -96,7 +96,7 @@ def read_rows(paths: Sequence[Path], system: str | None = None, lenient: bool = 
     revisions = {simulator: revision for simulator, _, revision in cells if revision is not None}
     for simulator, one in sorted(pinned & unpinned):  # protocol, rule 5
         raise InvalidOptionError(
-            f"some rows of {one} in {simulator} are of the split with revision "
+            f"some rows of {one} in {simulator} are of the buffer set with revision "
             f"{revisions[simulator]}, others name no revision, as released rows do",
             "Their histories may differ: score the files apart, or compare them.",
         )
@@ -148,7 +148,7 @@ class _Checks:
 
     def check_together(self) -> None:
         """Check rows against others."""
-        self._check_alike("revision", ("simulator",), "rows of different splits do not mix")
+        self._check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
         for name in ("difficulty", "seed", "chance"):
             self._check_alike(name, _EPISODE, "an episode has one")
         self._check_repeats()

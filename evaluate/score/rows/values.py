@@ -35,7 +35,7 @@ class Row(NamedTuple):
     revision: str | None
     family: str
     condition: str
-    episode_split: str
+    split: str
     episode: int
     shift: str
     model_seed: int
@@ -55,7 +55,7 @@ class Row(NamedTuple):
 
 
 DEFAULTS = {
-    **{"simulator": RELEASED_SIMULATOR, "episode_split": "test"},
+    **{"simulator": RELEASED_SIMULATOR, "split": "test"},
     **{"shift": NO_SHIFT, "model_seed": 0, "protocol_version": PROTOCOL_VERSION},
 }
 """Values of columns that the released layout lacks; any other is None."""
@@ -125,7 +125,7 @@ def _fraction(text: str) -> float:
 
 def _revision(text: str) -> str:
     if not text:
-        raise ValueError("the revision of a split")
+        raise ValueError("the revision of a buffer set")
     return text
 
 
@@ -152,7 +152,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
     "revision": _revision,
     "family": _one_of("family", FAMILIES),
     "condition": _checked(parse_condition),
-    "episode_split": _one_of("episode_split", SPLITS),
+    "split": _one_of("split", SPLITS),
     "shift": _checked(parse_shift),
     "protocol_version": _whole(PROTOCOL_VERSION, PROTOCOL_VERSION),
     "difficulty": _one_of("difficulty", DIFFICULTIES),

@@ -1,4 +1,4 @@
-"""A split of one's own for demonstrations on a Hub: built, published layout aside, and loaded."""
+"""A buffer set of one's own for demonstrations on a Hub: built, published layout aside, and loaded."""
 
 import os
 import shutil
@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.hub import BASE, push_split, running_hub
+from support.buffer_sets import GOLDEN
+from support.hub import BASE, push_buffer_set, running_hub
 from support.hub_server import HubServer
 from support.recordings import make_episode, rows_of, write_images, write_table
-from support.splits import GOLDEN
 
-from robomme_interference_data import load_split
-from robomme_interference_data.build_dataset.verify import verify_split
+from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.verify import verify_buffer_set
 
 FAMILIES = ("MyDrawer", "MyCup")
 
@@ -24,7 +24,7 @@ FAMILIES = ("MyDrawer", "MyCup")
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
     with running_hub(tmp_path / "cache", monkeypatch) as server:
-        push_split(server, GOLDEN, tmp_path / "work")
+        push_buffer_set(server, GOLDEN, tmp_path / "work")
         yield server
 
 
@@ -41,21 +41,24 @@ def mine(tmp_path: Path) -> str:
     return f"frames:{tmp_path / 'mine'}"
 
 
-def test_a_split_for_published_demonstrations(
+def test_a_buffer_set_for_published_demonstrations(
     hub: HubServer, mine: str, tmp_path: Path, run: Any
 ) -> None:
     out = tmp_path / "own"
-    given = ("--demonstrations", BASE, "--source", mine, "--out", out, "--workers", 1)
-    code, _, err = run("new-split", *given, "--conditions", "k0,k1,k2")
+    given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
+    code, _, err = run("new-buffer-set", out, *given, "--conditions", "k0,k1,k2")
     assert code == 0, err
     assert "publish" in err
-    split = load_split(out)
-    assert split.header.datasets["demonstrations"].place == split.place("demonstrations").location
-    buffer = split.load("MoveCube/test/0", "k2", verify=True)
+    buffer_set = load_buffer_set(out)
+    assert (
+        buffer_set.header.datasets["demonstrations"].place
+        == buffer_set.place("demonstrations").location
+    )
+    buffer = buffer_set.load("MoveCube/test/0", "k2", verify=True)
     assert {one.family for one in buffer.sessions[1:]} == {*FAMILIES}
-    lesson = load_split(GOLDEN).load("MoveCube/test/0", "k0")
+    lesson = load_buffer_set(GOLDEN).load("MoveCube/test/0", "k0")
     assert np.array_equal(buffer.frames()[: len(lesson)], lesson.frames())
-    assert [*verify_split(split)] == []
+    assert [*verify_buffer_set(buffer_set)] == []
 
 
 def test_retrieval_on_published_demonstrations(
@@ -65,22 +68,24 @@ def test_retrieval_on_published_demonstrations(
     indexed = shutil.copytree(GOLDEN / "demonstrations", tmp_path / "base/demonstrations")
     assert run("index", indexed)[0] == 0
     commit, out = hub.push(f"datasets/{BASE}", indexed), tmp_path / "own"
-    given = ("--demonstrations", BASE, "--source", mine, "--out", out, "--workers", 1)
-    assert run("new-split", *given, "--conditions", "k0,k2")[0] == 0
+    given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
+    assert run("new-buffer-set", out, *given, "--conditions", "k0,k2")[0] == 0
     code, told, err = run("index", out)
     assert (code, told) == (0, f"{out}/distractors/index/thumbnail: 64 frames, 64 embedded now\n")
     assert f"{BASE}@{commit} has embeddings by the same encoder" in err
-    assert [*verify_split(load_split(out))] == []
+    assert [*verify_buffer_set(load_buffer_set(out))] == []
 
     local = shutil.copytree(out, tmp_path / "local", ignore=shutil.ignore_patterns("index"))
     shutil.copytree(GOLDEN / "demonstrations", local / "demonstrations")
     assert run("index", local)[0] == 0
     for condition in ("k0", "k2"):
-        far, near = (load_split(one).load("MoveCube/test/0", condition) for one in (out, local))
+        far, near = (
+            load_buffer_set(one).load("MoveCube/test/0", condition) for one in (out, local)
+        )
         assert np.array_equal(far.embeddings("thumbnail"), near.embeddings("thumbnail"))
     said = [
-        run("retrieve", "MoveCube/test/0", "k2", "--split", split, "--json")
-        for split in (out, local)
+        run("retrieve", buffer_set, "MoveCube/test/0", "k2", "--json")
+        for buffer_set in (out, local)
     ]
     assert said[0][:2] == said[1][:2] and said[0][0] == 0
 
@@ -89,11 +94,11 @@ def test_published_demonstrations_without_an_index(
     hub: HubServer, mine: str, tmp_path: Path, run: Any, offline: Any
 ) -> None:
     out = tmp_path / "own"
-    given = ("--demonstrations", BASE, "--source", mine, "--out", out, "--workers", 1)
-    assert run("new-split", *given, "--conditions", "k1")[0] == 0
+    given = ("--demonstrations", BASE, "--source", mine, "--workers", 1)
+    assert run("new-buffer-set", out, *given, "--conditions", "k1")[0] == 0
     code, _, err = run("index", out)
     assert code == 0 and "retrieval will not find the demonstrations" in err
-    assert run("retrieve", "MoveCube/test/0", "k1", "--split", out)[0] == 1
+    assert run("retrieve", out, "MoveCube/test/0", "k1")[0] == 1
     (download,) = (line.split() for line in err.splitlines() if line.startswith("  "))
     subprocess.run(
         [Path(sys.executable).parent / download[0], *download[1:]],
@@ -102,8 +107,8 @@ def test_published_demonstrations_without_an_index(
         capture_output=True,
     )
     assert run("index", out)[0] == 0
-    assert run("retrieve", "MoveCube/test/0", "k1", "--split", out)[0] == 0
-    assert [*verify_split(load_split(out))] == []
+    assert run("retrieve", out, "MoveCube/test/0", "k1")[0] == 0
+    assert [*verify_buffer_set(load_buffer_set(out))] == []
     shutil.rmtree(out / "demonstrations")
     offline()
     code, _, err = run("index", out)
@@ -121,11 +126,11 @@ def test_published_demonstrations_without_an_index(
         (["--demonstrations", BASE, "--cameras", "side"], "side"),
     ],
 )
-def test_what_makes_no_split(
+def test_what_makes_no_buffer_set(
     options: list[str], words: str, hub: HubServer, mine: str, tmp_path: Path, run: Any
 ) -> None:
     out = tmp_path / "own"
-    given = ("--source", mine, "--out", out, "--workers", 1)
-    code, _, err = run("new-split", *given, "--conditions", "k1", *options)
+    given = ("--source", mine, "--workers", 1)
+    code, _, err = run("new-buffer-set", out, *given, "--conditions", "k1", *options)
     assert code == 1 and words in err
     assert not (out / "distractors").exists()

@@ -1,4 +1,4 @@
-"""The tiny golden split, copies of it, and what its frames must be."""
+"""The tiny golden buffer set, copies of it, and what its frames must be."""
 
 import shutil
 from functools import cache
@@ -16,7 +16,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry
 from robomme_interference_data.storage.files import LocalFiles, format_sums, sha256_file
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "split"
+GOLDEN = Path(__file__).parents[1] / "golden" / "buffer_set"
 """Three test queries and the train units of nine families, 32 × 32 pixels, made by
 `support/make_golden.py` from the source `sample`."""
 
@@ -26,8 +26,8 @@ LESSON = 48
 UNITS = 17
 
 
-def copy_split(folder: Path) -> Path:
-    """Copy the golden split, to be damaged."""
+def copy_buffer_set(folder: Path) -> Path:
+    """Copy the golden buffer set, to be damaged."""
     return Path(shutil.copytree(GOLDEN, folder))
 
 
@@ -41,7 +41,7 @@ def contents(root: Path) -> dict[str, bytes]:
 
 
 def dataset(root: Path, name: str) -> Dataset:
-    """Open a dataset of a split."""
+    """Open a dataset of a buffer set."""
     return Dataset(LocalFiles(root / name))
 
 

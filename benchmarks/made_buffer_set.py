@@ -1,4 +1,4 @@
-"""A made-up split of any number of queries and units, with videos of a few hundred bytes.
+"""A made-up buffer set of any number of queries and units, with videos of a few hundred bytes.
 
 LeRobot's own writer makes the datasets, so their number of files and their metadata are those of
 real ones: only the videos are small.
@@ -39,8 +39,8 @@ FEATURES = {FRONT: (SIDE, SIDE, 3), WRIST: (SIDE, SIDE, 3), STATE: (8,)}
 CODEC = CODECS["av1-lossless"]
 
 
-def write_split(root: Path, queries: int, units: int, conditions: Sequence[str]) -> None:
-    """Write the split: a video and a data file of its own for each camera of each episode."""
+def write_buffer_set(root: Path, queries: int, units: int, conditions: Sequence[str]) -> None:
+    """Write the buffer set: a video and a data file of its own for each camera of each episode."""
     for kind, count in ((DEMONSTRATIONS, queries), (DISTRACTORS, units)):
         _write_dataset(root / kind, kind, count)
     for _ in write_manifests(plan_manifests(in_folder(root), conditions), root):

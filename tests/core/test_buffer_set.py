@@ -1,4 +1,4 @@
-"""Splits: list, filter and load; what is missing, damaged or of other types is told."""
+"""Buffer sets: list, filter and load; what is missing, damaged or of other types is told."""
 
 import json
 import pickle
@@ -13,15 +13,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.buffer_sets import CONDITIONS, GOLDEN, QUERIES
 from support.lerobot_layouts import edit_info
-from support.splits import CONDITIONS, GOLDEN, QUERIES
 
 from robomme_interference_data import (
     DecodedCache,
     EpisodeId,
     InterferenceError,
     load_buffer,
-    load_split,
+    load_buffer_set,
 )
 from robomme_interference_data.errors import (
     FormatError,
@@ -40,17 +40,17 @@ HEADER = "manifests/manifest.json"
 ROWS = "manifests/buffers.parquet"
 
 
-def test_what_a_split_lists() -> None:
-    split = load_split(GOLDEN)
-    assert tuple(map(str, split.episode_ids)) == QUERIES
-    assert split.families == ("VideoRepick", "MoveCube", "PatternLock")
-    assert split.conditions == CONDITIONS
-    assert split.cameras == ("front", "wrist")
-    assert (len(split), split.name) == (15, "split")
-    assert [str(manifest) for manifest in split.manifests()] == [
+def test_what_a_buffer_set_lists() -> None:
+    buffer_set = load_buffer_set(GOLDEN)
+    assert tuple(map(str, buffer_set.episode_ids)) == QUERIES
+    assert buffer_set.families == ("VideoRepick", "MoveCube", "PatternLock")
+    assert buffer_set.conditions == CONDITIONS
+    assert buffer_set.cameras == ("front", "wrist")
+    assert (len(buffer_set), buffer_set.name) == (15, "buffer_set")
+    assert [str(manifest) for manifest in buffer_set.manifests()] == [
         f"{episode} under {condition}" for episode in QUERIES for condition in CONDITIONS
     ]
-    assert repr(split) == f"Split(split, buffers=15, conditions={list(CONDITIONS)})"
+    assert repr(buffer_set) == f"BufferSet(buffer_set, buffers=15, conditions={list(CONDITIONS)})"
 
 
 @pytest.mark.parametrize(
@@ -67,10 +67,10 @@ def test_what_a_split_lists() -> None:
     ],
 )
 def test_filters(filters: dict[str, Any], count: int) -> None:
-    split = load_split(GOLDEN)
-    found = list(split.manifests(**filters))
+    buffer_set = load_buffer_set(GOLDEN)
+    found = list(buffer_set.manifests(**filters))
     assert len(found) == count
-    assert [buffer.manifest for buffer in split.buffers(**filters)] == found
+    assert [buffer.manifest for buffer in buffer_set.buffers(**filters)] == found
 
 
 @pytest.mark.parametrize(
@@ -83,19 +83,19 @@ def test_filters(filters: dict[str, Any], count: int) -> None:
 )
 def test_unknown_filters(filters: dict[str, Any], told: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        load_split(GOLDEN).manifests(**filters)
+        load_buffer_set(GOLDEN).manifests(**filters)
     assert told in str(caught.value)
 
 
 def test_a_buffer_by_its_key() -> None:
-    split = load_split(GOLDEN)
-    wanted = split.load("MoveCube/test/0", "k3").manifest
+    buffer_set = load_buffer_set(GOLDEN)
+    wanted = buffer_set.load("MoveCube/test/0", "k3").manifest
     name = EpisodeId("MoveCube", "test", 0)
     for found in (
-        load_buffer("MoveCube/test/0", "k3", split=GOLDEN),
-        load_buffer(name, parse_condition("k3"), split=split),
-        load_buffer("MoveCube/test/0", k=3, split=str(GOLDEN), verify=True),
-        split.load(name, k=3),
+        load_buffer("MoveCube/test/0", "k3", buffer_set=GOLDEN),
+        load_buffer(name, parse_condition("k3"), buffer_set=buffer_set),
+        load_buffer("MoveCube/test/0", k=3, buffer_set=str(GOLDEN), verify=True),
+        buffer_set.load(name, k=3),
     ):
         assert found.manifest == wanted
     assert to_dict(wanted)["episode_id"] == "MoveCube/test/0"
@@ -121,7 +121,7 @@ def test_conditions_that_cannot_be_loaded(
 ) -> None:
     given = dict(zip(("condition", "k"), arguments, strict=False))
     with pytest.raises(error) as caught:
-        load_buffer("MoveCube/test/0", split=GOLDEN, **given)
+        load_buffer("MoveCube/test/0", buffer_set=GOLDEN, **given)
     assert told in str(caught.value)
 
 
@@ -138,8 +138,8 @@ def test_conditions_that_cannot_be_loaded(
 def test_episodes_that_cannot_be_loaded(
     episode: Any, error: type[InterferenceError], told: str
 ) -> None:
-    split = load_split(GOLDEN)
-    for load in (lambda: split.load(episode, "k3"), lambda: split.query(episode)):
+    buffer_set = load_buffer_set(GOLDEN)
+    for load in (lambda: buffer_set.load(episode, "k3"), lambda: buffer_set.query(episode)):
         with pytest.raises(error) as caught:
             load()
         assert told in str(caught.value)
@@ -150,18 +150,18 @@ def test_episodes_that_cannot_be_loaded(
     [
         ("cache", (3, ["x"], b"x", "", "a\0b"), "expected True, False, a folder"),
         ("threads", (0, -3, True, "2", 1.5), "expected a number from 1"),
-        ("split", (None, 3, b"g", "", "a\0b"), "expected a folder"),
+        ("buffer_set", (None, 3, b"g", "", "a\0b"), "expected a folder"),
     ],
 )
 def test_no_such_option(option: str, values: tuple[Any, ...], told: str) -> None:
     for value in values:
         with pytest.raises(InvalidOptionError, match=told):
-            load_split(**{"split": GOLDEN, option: value})
+            load_buffer_set(**{"buffer_set": GOLDEN, option: value})
 
 
 def test_numbers_may_be_numpys() -> None:
-    split = load_split(GOLDEN, threads=np.int64(2))  # type: ignore[arg-type]
-    made = split.load("MoveCube/test/0", k=np.int64(1))  # type: ignore[arg-type]
+    buffer_set = load_buffer_set(GOLDEN, threads=np.int64(2))  # type: ignore[arg-type]
+    made = buffer_set.load("MoveCube/test/0", k=np.int64(1))  # type: ignore[arg-type]
     np.testing.assert_array_equal(made.frame(np.uint8(60)), made.frames()[60])
 
 
@@ -173,13 +173,13 @@ def test_caches_by_folder_or_as_they_are(tmp_path: Path, monkeypatch: pytest.Mon
         (DecodedCache(tmp_path / "c"), tmp_path / "c"),
         (True, tmp_path / "home" / "robomme-interference" / "decoded"),
     ):
-        load_split(GOLDEN, cache=cache).load("MoveCube/test/0", "k0").frames()
+        load_buffer_set(GOLDEN, cache=cache).load("MoveCube/test/0", "k0").frames()
         assert len(list(folder.iterdir())) == 1
 
 
-def test_a_split_travels_between_processes() -> None:
-    split = pickle.loads(pickle.dumps(load_split(GOLDEN)))
-    assert split.load("MoveCube/test/0", "k0").frames().shape == (48, 32, 32, 3)
+def test_a_buffer_set_travels_between_processes() -> None:
+    buffer_set = pickle.loads(pickle.dumps(load_buffer_set(GOLDEN)))
+    assert buffer_set.load("MoveCube/test/0", "k0").frames().shape == (48, 32, 32, 3)
 
 
 def test_names_are_imported_one_by_one() -> None:
@@ -195,29 +195,29 @@ def test_names_are_imported_one_by_one() -> None:
     assert done.stdout == "[]\n"
 
 
-def test_datasets_are_opened_on_first_use(own_split: Path) -> None:
-    header = json.loads((own_split / HEADER).read_text())
+def test_datasets_are_opened_on_first_use(own_buffers: Path) -> None:
+    header = json.loads((own_buffers / HEADER).read_text())
     for name in ("shifted", "contradictions"):
         header["datasets"][name] = header["datasets"]["distractors"] | {"kind": name}
-    (own_split / HEADER).write_text(json.dumps(header))
-    split = load_split(own_split)
-    assert split.load("MoveCube/test/0", "k3").frames().any()
-    assert "shifted" in split.datasets
+    (own_buffers / HEADER).write_text(json.dumps(header))
+    buffer_set = load_buffer_set(own_buffers)
+    assert buffer_set.load("MoveCube/test/0", "k3").frames().any()
+    assert "shifted" in buffer_set.datasets
     with pytest.raises(MissingFileError):
-        split.datasets["shifted"]
+        buffer_set.datasets["shifted"]
 
 
 def test_episodes_are_listed_once() -> None:
-    split = load_split(GOLDEN)
-    assert split.families is split.families
-    assert split.episode_ids is split.episode_ids
+    buffer_set = load_buffer_set(GOLDEN)
+    assert buffer_set.families is buffer_set.families
+    assert buffer_set.episode_ids is buffer_set.episode_ids
 
 
 def test_loading_needs_light_libraries_only() -> None:
     code = (
         "import sys\n"
         "from robomme_interference_data import load_buffer\n"
-        f"buffer = load_buffer('MoveCube/test/0', 'k3', split={str(GOLDEN)!r}, verify=True)\n"
+        f"buffer = load_buffer('MoveCube/test/0', 'k3', buffer_set={str(GOLDEN)!r}, verify=True)\n"
         "print(len(buffer.frames()), sorted({'torch', 'lerobot', 'datasets', 'typer',"
         " 'rich', 'scipy', 'matplotlib', 'sapien', 'h5py'} & sys.modules.keys()))"
     )
@@ -230,32 +230,32 @@ def test_loading_needs_light_libraries_only() -> None:
 # --- what is not as it should be ----------------------------------------------------------------
 
 
-def test_what_is_no_split(tmp_path: Path) -> None:
+def test_what_is_no_buffer_set(tmp_path: Path) -> None:
     for folder in (tmp_path, GOLDEN / "demonstrations"):
-        with pytest.raises(MissingFileError, match="is not a split") as caught:
-            load_split(folder)
+        with pytest.raises(MissingFileError, match="is not a buffer set") as caught:
+            load_buffer_set(folder)
         assert "build all" in str(caught.value.command)
     with pytest.raises(InvalidOptionError, match="neither a folder nor"):
-        load_split(tmp_path / "nowhere")
+        load_buffer_set(tmp_path / "nowhere")
     with pytest.raises(InvalidOptionError, match="only a repository has revisions"):
-        load_split(GOLDEN, revision="data-1.0.0")
+        load_buffer_set(GOLDEN, revision="data-1.0.0")
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "distractors", ROWS])
-def test_missing_parts(own_split: Path, name: str) -> None:
-    part = own_split / name
+def test_missing_parts(own_buffers: Path, name: str) -> None:
+    part = own_buffers / name
     shutil.rmtree(part) if part.is_dir() else part.unlink()
     with pytest.raises(MissingFileError):
-        load_split(own_split).load("MoveCube/test/0", "k3")
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
-def test_another_dataset_than_the_manifests_name(own_split: Path) -> None:
-    identity = own_split / "distractors" / "meta" / "interference.json"
-    revision = load_split(own_split).header.datasets["distractors"].revision
+def test_another_dataset_than_the_manifests_name(own_buffers: Path) -> None:
+    identity = own_buffers / "distractors" / "meta" / "interference.json"
+    revision = load_buffer_set(own_buffers).header.datasets["distractors"].revision
     identity.write_text(identity.read_text().replace(revision, "0" * 64))
     with pytest.raises(HashMismatchError, match="the manifests were made for") as caught:
-        load_split(own_split).load("MoveCube/test/0", "k3")
-    assert caught.value.command == f"build manifests {own_split}"
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
+    assert caught.value.command == f"build manifests {own_buffers}"
 
 
 @pytest.mark.parametrize(
@@ -276,13 +276,13 @@ def test_another_dataset_than_the_manifests_name(own_split: Path) -> None:
         ("{", "{" * 5000),
     ],
 )
-def test_damaged_headers(own_split: Path, before: str, after: str) -> None:
-    header = own_split / HEADER
+def test_damaged_headers(own_buffers: Path, before: str, after: str) -> None:
+    header = own_buffers / HEADER
     text = header.read_text()
     assert before in text
     header.write_text(text.replace(before, after))
     with pytest.raises(FormatError, match=r"manifest\.json"):
-        load_split(own_split).load("MoveCube/test/0", "k3")
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
 def rewritten(path: Path, change: Any) -> None:
@@ -312,16 +312,16 @@ def truncated(keep: int) -> Callable[[Path], object]:
         *map(truncated, (0, 3, 100, 2000)),
     ],
 )
-def test_damaged_rows(own_split: Path, damage: Callable[[Path], object]) -> None:
-    damage(own_split / ROWS)
+def test_damaged_rows(own_buffers: Path, damage: Callable[[Path], object]) -> None:
+    damage(own_buffers / ROWS)
     with pytest.raises(FormatError, match=r"buffers\.parquet"):
-        load_split(own_split).load("MoveCube/test/0", "k3")
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
-def test_a_key_that_occurs_twice(own_split: Path) -> None:
-    rewritten(own_split / ROWS, lambda table: pa.concat_tables([table, table.slice(8, 1)]))
+def test_a_key_that_occurs_twice(own_buffers: Path) -> None:
+    rewritten(own_buffers / ROWS, lambda table: pa.concat_tables([table, table.slice(8, 1)]))
     with pytest.raises(FormatError, match="2 rows of MoveCube/test/0 under k3"):
-        load_split(own_split).load("MoveCube/test/0", "k3")
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
 def renew_rows(root: Path) -> None:
@@ -347,7 +347,7 @@ def shorter_lesson(root: Path) -> None:
 
 
 def other_first_view(root: Path) -> None:
-    dataset = load_split(root).datasets["demonstrations"]
+    dataset = load_buffer_set(root).datasets["demonstrations"]
     index = dataset.index_of(EpisodeId.parse("MoveCube/test/0"))
     frames = list(dataset.iter_frames(index, "front", 0, 49))
     path = dataset.files.path(dataset.files_of(index, ["front"])[1])
@@ -367,12 +367,12 @@ def other_first_view(root: Path) -> None:
     ],
 )
 def test_a_verified_load_checks_the_query(
-    own_split: Path, change: Callable[[Path], object], told: str
+    own_buffers: Path, change: Callable[[Path], object], told: str
 ) -> None:
-    change(own_split)
-    load_split(own_split).load("MoveCube/test/0", "k3")
+    change(own_buffers)
+    load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
     with pytest.raises(HashMismatchError, match=told):
-        load_split(own_split).load("MoveCube/test/0", "k3", verify=True)
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3", verify=True)
 
 
 def put(table: Any, name: str, values: Any) -> Any:
@@ -380,14 +380,14 @@ def put(table: Any, name: str, values: Any) -> Any:
     return table.set_column(place, name, pa.array(values, table.schema.field(name).type))
 
 
-def test_a_session_of_no_dataset(own_split: Path) -> None:
-    header = own_split / HEADER
+def test_a_session_of_no_dataset(own_buffers: Path) -> None:
+    header = own_buffers / HEADER
     told = json.loads(header.read_text())
     del told["datasets"]["distractors"]
     header.write_text(json.dumps(told))
-    assert load_split(own_split).load("MoveCube/test/0", "k0").frames().any()
+    assert load_buffer_set(own_buffers).load("MoveCube/test/0", "k0").frames().any()
     with pytest.raises(FormatError, match=r"buffers\.parquet: .* 'distractors', no dataset"):
-        load_split(own_split).load("MoveCube/test/0", "k3")
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
 
 
 @pytest.mark.parametrize(
@@ -396,26 +396,26 @@ def test_a_session_of_no_dataset(own_split: Path) -> None:
 )
 @pytest.mark.parametrize("condition", ["no-history", "k1"])
 def test_features_that_are_not_as_they_must_be(
-    own_split: Path, feature: str, shape: list[int] | None, condition: str
+    own_buffers: Path, feature: str, shape: list[int] | None, condition: str
 ) -> None:
     def change(info: dict[str, Any]) -> None:
         told = info["features"].pop(feature)
         if shape is not None:
             info["features"][feature] = told | {"shape": shape}
 
-    edit_info(own_split / "demonstrations", change)
+    edit_info(own_buffers / "demonstrations", change)
     for use in (
         lambda made: made.frames(),
         lambda made: made.states,
         lambda made: made.query.frame(),
     ):
         with pytest.raises(FormatError, match=feature):
-            use(load_split(own_split).load("MoveCube/test/0", condition))
+            use(load_buffer_set(own_buffers).load("MoveCube/test/0", condition))
 
 
-def test_a_row_that_is_missing(own_split: Path) -> None:
-    rewritten(own_split / ROWS, lambda table: table.slice(0, 3))
+def test_a_row_that_is_missing(own_buffers: Path) -> None:
+    rewritten(own_buffers / ROWS, lambda table: table.slice(0, 3))
     with pytest.raises(UnknownNameError):
-        load_split(own_split).load("MoveCube/test/0", "k3")
+        load_buffer_set(own_buffers).load("MoveCube/test/0", "k3")
     with pytest.raises(FormatError, match="no row of VideoRepick/test/0 under k7"):
-        load_split(own_split).load("VideoRepick/test/0", "k7")
+        load_buffer_set(own_buffers).load("VideoRepick/test/0", "k7")
