@@ -56,7 +56,7 @@ def items(count: int) -> list[WorkItem]:
 
 def drive(rollouts: int, workers: int) -> list[str]:
     """Write the rows of rollouts that do nothing; return a row of the table."""
-    config = RunConfig(policy="hold", buffer_set=Path(), out=Path())
+    config = RunConfig(policy="noop", buffer_set=Path(), out=Path())
     this, todo = psutil.Process(), items(rollouts)
     with (
         TemporaryDirectory() as folder,
@@ -64,7 +64,7 @@ def drive(rollouts: int, workers: int) -> list[str]:
         RunProgress() as shown,
     ):
         shown.start(todo, [])
-        task = Nothing(Run(config, "hold", "none", "none"))
+        task = Nothing(Run(config, "noop", "none", "none"))
         memory: list[int] = []
         with closing(RayWorkers(workers, "local").run(task, todo)) as outcomes:
             next(outcomes)

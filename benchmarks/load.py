@@ -180,7 +180,7 @@ def spans_of(buffer: Buffer, buffer_set: BufferSet, camera: str = FRONT) -> list
     spans = []
     for session in buffer.sessions:
         entry, lerobot = session.entry, buffer_set.datasets[session.entry.dataset].lerobot
-        path, first = lerobot.place(entry.episode_index).videos[camera]
+        path, first = lerobot.locate(entry.episode_index).videos[camera]
         start, stop = first + entry.start, first + entry.stop
         spans.append(Span(lerobot.files.path(path), start, stop, lerobot.fps))
     return spans

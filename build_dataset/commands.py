@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import Group, echo, print_json, say, stoppable
+from robomme_interference_data.cli.console import (
+    Group,
+    echo,
+    graceful_interrupt,
+    print_json,
+    print_status,
+)
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
@@ -122,7 +128,7 @@ _DATASETS = {
 def _add_command(kind: str, text: str) -> None:
     @with_settings
     def build(config: BuildConfig, as_json: AsJson = False) -> None:
-        with stoppable(_KEPT):
+        with graceful_interrupt(_KEPT):
             _build(plan_build(kind, config), config.buffer_set / kind, config, as_json=as_json)
 
     app.command(name=kind, help=text)(build)
@@ -146,7 +152,7 @@ def manifests(
     robomme-interference build manifests my-buffers --conditions no-history,k0,k1,k3,k7 --seed 0
     ```
     """
-    with stoppable("The datasets are kept"):
+    with graceful_interrupt("The datasets are kept"):
         _plan(buffer_set, config, as_json=as_json)
 
 
@@ -175,7 +181,10 @@ def questions(
             f"there is no folder {buffer_set}",
             "A buffer set on the Hub is fetched first: robomme-interference fetch NAME --to FOLDER",
         )
-    with stoppable("The buffer set is as it was"), WorkProgress(unit="questions") as progress:
+    with (
+        graceful_interrupt("The buffer set is as it was"),
+        WorkProgress(unit="questions") as progress,
+    ):
         opened = load_buffer_set(buffer_set)
         progress.start("Making questions", len(opened.episode_ids))
         made = []
@@ -186,7 +195,7 @@ def questions(
     if as_json:
         print_json({"out": str(out), "questions": len(made)})
     else:
-        say(f"{out}: {len(made):,} questions")
+        print_status(f"{out}: {len(made):,} questions")
 
 
 @app.command(name="all")
@@ -206,14 +215,14 @@ def build_all(config: AllConfig, plan: PlanConfig, as_json: AsJson = False) -> N
         --conditions no-history,k0,k7,before-k7,held-k7,stale-k0
     ```
     """
-    with stoppable(_KEPT):
+    with graceful_interrupt(_KEPT):
         steps = plan_all(config, plan)
         taken = " and ".join(f"{kind} of {len(step.tasks):,}" for kind, step in steps.items())
-        say(f"Recorded episodes to take: {taken}")
+        print_status(f"Recorded episodes to take: {taken}")
         for kind, step in steps.items():
             _build(step, config.buffer_set / kind, config, as_json=False)
         _plan(config.buffer_set, plan, as_json=as_json)
-    say(f"Next: robomme-interference verify {config.buffer_set}")
+    print_status(f"Next: robomme-interference verify {config.buffer_set}")
 
 
 @with_settings
@@ -230,13 +239,15 @@ def new_buffer_set(config: NewConfig, plan: PlanConfig, as_json: AsJson = False)
     robomme-interference publish my-buffers --repo-id my-name/my-buffers
     ```
     """
-    with stoppable(_KEPT):
+    with graceful_interrupt(_KEPT):
         base, units = plan_new(config, plan)
-        say(f"Demonstrations: {base.files.describe()}; episodes to take: {len(units.tasks):,}")
+        print_status(
+            f"Demonstrations: {base.files.describe()}; episodes to take: {len(units.tasks):,}"
+        )
         _build(units, config.buffer_set / DISTRACTORS, config, as_json=False)
         _plan(config.buffer_set, plan, as_json=as_json, base=base.files)
         audit(config.buffer_set)
-    say(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
+    print_status(f"Next: robomme-interference publish {config.buffer_set} --repo-id NAMESPACE/NAME")
 
 
 def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool) -> None:
@@ -247,11 +258,11 @@ def _build(plan: BuildPlan, out: Path, workers: WorkersConfig, *, as_json: bool)
     with WorkProgress(unit="episodes") as progress:
         result = build_dataset(plan, out, make_executor(workers), progress)
     done = f"{result.added} added" if result.added else "was built before"
-    say(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
+    print_status(f"{out}: {done}; {result.episodes} episodes, {result.frames:,} frames")
     for name, why in sorted(result.skipped.items())[:_TOLD]:
-        say(f"  left out {name}: {why}")
+        print_status(f"  left out {name}: {why}")
     if len(result.skipped) > _TOLD:
-        say(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
+        print_status(f"  … {len(result.skipped)} left out in all: {out}/{REPORT_PATH}")
     if as_json:
         print_json({**vars(result), "out": str(result.out)})
 
@@ -276,7 +287,7 @@ def _plan(
     if as_json:
         print_json({"out": str(buffer_set / MANIFESTS), **counts})
     else:
-        say(
+        print_status(
             f"{buffer_set / MANIFESTS}: {counts['buffers']:,} buffers of {counts['queries']:,} queries"
         )
 
@@ -310,7 +321,7 @@ def verify(
         for violation in violations:
             echo(f"{violation.where}: {violation.what}")
         what = "hashes and rules" if decode else "files, tables and rules (frames not decoded)"
-        say(
+        print_status(
             f"{len(violations)} violation{'s' * (len(violations) > 1)}"
             if violations
             else f"All {what} of {buffer_set} hold."
@@ -342,7 +353,7 @@ def audit(
             echo(table.text() + "\n")
         for leak in report.leaks:
             echo(f"LEAK, {leak.kind}: {leak.where}")
-        say(
+        print_status(
             f"{len(report.leaks)} leak{'s' * (len(report.leaks) > 1)}"
             if report.leaks
             else "No leaks."

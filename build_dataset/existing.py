@@ -68,7 +68,7 @@ def open_existing(out: Path, plan: BuildPlan) -> ExistingDataset | None:
 
 
 def _stored(dataset: Dataset, record: EpisodeRecord, statistics: Statistics) -> StoredEpisode:
-    place = dataset.lerobot.place(record.episode_index)
+    place = dataset.lerobot.locate(record.episode_index)
     stats = {
         feature: {name: before_scaling(name, one) for name, one in statistics[feature].items()}
         for feature in place.videos

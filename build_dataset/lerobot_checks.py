@@ -63,7 +63,7 @@ def lerobot_violations(dataset: Dataset) -> Iterator[tuple[str, str]]:
             if not _equal(row.get(name), value):
                 what = f"{name} of {record.episode_id} is {row.get(name)}; expected {value}"
                 yield EPISODES_DIR, what
-        place = dataset.lerobot.place(record.episode_index)
+        place = dataset.lerobot.locate(record.episode_index)
         for path in (place.data, *(path for path, _ in place.videos.values())):
             other = places.setdefault(path, record.episode_index)
             if other != record.episode_index:
@@ -193,7 +193,7 @@ def _rows(
 ) -> Iterator[tuple[str, str]]:
     """Check the columns that LeRobot adds to every frame, and the statistics of all."""
     rows = dataset.lerobot.rows(index)
-    path = dataset.lerobot.place(index).data
+    path = dataset.lerobot.locate(index).data
     frames = np.arange(len(rows))
     vectors = [name for name in dataset.features if not name.startswith(CAMERA_PREFIX)]
     yield from _differing(path, rows.names, {*vectors, *_FRAME_COLUMNS})

@@ -120,7 +120,7 @@ def _buffer_set(buffer_set: BufferSet, decode: bool, progress: WorkProgress) -> 
     datasets: dict[str, Dataset] = {}
     for name in header.datasets:
         try:
-            datasets[name] = Dataset(LocalFiles(buffer_set.place(name).snapshot("*")))
+            datasets[name] = Dataset(LocalFiles(buffer_set.dataset_files(name).snapshot("*")))
         except InterferenceError as error:
             yield Violation(name, error.message)
     frames = sum(dataset.identity.counts.frames for dataset in datasets.values())

@@ -34,7 +34,7 @@ def check_buffer_set(buffer_set: BufferSet, progress: WorkProgress | None = None
             f"audit {buffer_set.location}",
         )
     for name in buffer_set.header.datasets:
-        place = buffer_set.place(name)
+        place = buffer_set.dataset_files(name)
         if isinstance(place, LocalFiles):  # one on the Hub was checked when it was published
             open_with_lerobot(name, place.root)
 

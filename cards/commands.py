@@ -7,10 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, echo, print_json, say, stoppable
+from robomme_interference_data.cli.console import (
+    check_output,
+    echo,
+    graceful_interrupt,
+    print_json,
+    print_status,
+)
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
-from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.config import Expected
 
 from .publication import Publication, PublishConfig, VersionConfig
 
@@ -134,9 +140,9 @@ def publish(
     from .repo import HubRepository
 
     opened = load_buffer_set(buffer_set)
-    unpublished = opened.header.datasets[DEMONSTRATIONS].place is None
-    if unpublished and not opened.place(DEMONSTRATIONS).list(INDEX_DIR):
-        say(
+    unpublished = opened.header.datasets[DEMONSTRATIONS].location is None
+    if unpublished and not opened.dataset_files(DEMONSTRATIONS).list(INDEX_DIR):
+        print_status(
             "The demonstrations are published without embeddings. To add some first: "
             f"robomme-interference index {buffer_set}"
         )
@@ -162,16 +168,16 @@ def publish(
     )
     if done and not as_json:
         last = done[-1]
-        say(f'load_buffer_set("{last.repository.repo_id}", revision="{last.version.tag}")')
+        print_status(f'load_buffer_set("{last.repository.repo_id}", revision="{last.version.tag}")')
 
 
 @with_settings
 def publish_results(
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
     config: VersionConfig,
-    grid: Annotated[
-        Grid, typer.Option(help="Episodes of a complete cell, as for score.")
-    ] = Grid.BENCHMARK,
+    expected: Annotated[
+        Expected, typer.Option(help="Episodes of a complete cell, as for score.")
+    ] = Expected.BENCHMARK,
     private: Private = False,
     to: To = None,
     dry_run: DryRun = False,
@@ -191,7 +197,7 @@ def publish_results(
     from .publisher import Publisher
     from .results import results_content, score_run
 
-    content = results_content(score_run(run, grid), run, config)
+    content = results_content(score_run(run, expected), run, config)
     if to is not None:
         _export(content.files(config.wanted or content.first), to, dry_run=dry_run, as_json=as_json)
         return
@@ -212,7 +218,7 @@ def _export(files: "RepoFiles", to: Path, *, dry_run: bool, as_json: bool) -> No
         print_json({"to": str(to), "files": len(files), "bytes": size, "written": written})
     else:
         done = "would be written" if dry_run else "written" if written else "already there"
-        say(f"{to}: {len(files):,} files, {total_size(files):,} bytes; {done}")
+        print_status(f"{to}: {len(files):,} files, {total_size(files):,} bytes; {done}")
 
 
 def _carry_out(
@@ -227,16 +233,18 @@ def _carry_out(
     """Show what is to be done, ask, do it, and report; return what was done."""
     from .publisher import plan_table
 
-    say(plan_table(plans).text())
+    print_status(plan_table(plans).text())
     if not dry_run and any(plan.published is None for plan in plans):
         publisher.check_rights(plans)
         _ask(yes)
-        with stoppable("What was sent is kept; nothing is a version before its tag is there"):
+        with graceful_interrupt(
+            "What was sent is kept; nothing is a version before its tag is there"
+        ):
             plans = run()
     if as_json:
         print_json([plan.to_dict() for plan in plans])
     elif not dry_run:
-        say(f"{plans[-1].repository.page}/tree/{plans[-1].version.tag}")
+        print_status(f"{plans[-1].repository.page}/tree/{plans[-1].version.tag}")
     return [] if dry_run else plans
 
 

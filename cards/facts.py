@@ -224,7 +224,7 @@ def buffer_set_facts(buffer_set: BufferSet) -> Facts:
             "skipped": sum(_skipped(datasets[name]) for name in units),
             "inexact": sum(not one.exact for one in manifests),
         },
-        base=header.datasets[DEMONSTRATIONS].place,
+        base=header.datasets[DEMONSTRATIONS].location,
         repositories={k: v for one in datasets.values() for k, v in repositories_of(one).items()},
         source_kinds=source_kinds_of(datasets.values()),
         details=source_details(datasets),

@@ -54,16 +54,16 @@ class BufferSetContent:
     def base(self) -> str | None:
         """The published demonstrations that the buffer set is for, `namespace/name@commit`, or None."""
         recorded = self.buffer_set.header.datasets[DEMONSTRATIONS]
-        repo_id, _, commit = (recorded.place or "").partition("@")
+        repo_id, _, commit = (recorded.location or "").partition("@")
         if not commit or self.config.demonstrations_id not in (None, repo_id):
             return None
         if Dataset(HubFiles(repo_id, commit)).revision != recorded.revision:
             raise PublishError(
-                f"{recorded.place} holds other demonstrations than those that "
+                f"{recorded.location} holds other demonstrations than those that "
                 f"{self.buffer_set.location} is for",
-                self.buffer_set.mend,
+                self.buffer_set.fix,
             )
-        return recorded.place
+        return recorded.location
 
     @cached_property
     def demonstrations(self) -> RepoContent:
@@ -104,10 +104,10 @@ class BufferSetContent:
 
         Demonstrations that are only on the Hub stay there.
         """
-        base = self.buffer_set.header.datasets[DEMONSTRATIONS].place
+        base = self.buffer_set.header.datasets[DEMONSTRATIONS].location
         own = self.units(base if base and "@" in base else None)
         files = own.files(self.config.wanted or own.first)
-        if isinstance(self.buffer_set.place(DEMONSTRATIONS), LocalFiles):
+        if isinstance(self.buffer_set.dataset_files(DEMONSTRATIONS), LocalFiles):
             other = self.demonstrations
             lessons = other.files(self.config.wanted or other.first)
             files |= {f"{DEMONSTRATIONS}/{path}": file for path, file in lessons.items()}
@@ -162,7 +162,7 @@ def with_locations(header: ManifestHeader, base: str | None) -> ManifestHeader:
     """Return a header that says where the datasets of a published buffer set lie."""
     places = {DEMONSTRATIONS: base, DISTRACTORS: "."}
     datasets = {
-        name: replace(one, place=places.get(name, one.place))
+        name: replace(one, location=places.get(name, one.location))
         for name, one in header.datasets.items()
     }
     return replace(header, datasets=datasets)

@@ -15,7 +15,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.errors import InvalidOptionError, PublishError
 from robomme_interference_data.evaluate.run.log import RunHeader, read_record
-from robomme_interference_data.evaluate.score.config import Grid, Settings
+from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.plots.data import Data
 from robomme_interference_data.evaluate.score.plots.figures import draw_figure
 from robomme_interference_data.evaluate.score.report.headline import headline
@@ -36,9 +36,9 @@ from .render import card_files
 from .repo import LocalFile, RepoFiles
 from .sources import Rows, origin_limit
 
-_GRIDS = {
-    Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
-    Grid.GIVEN: "the episodes that any of the rows is of",
+_EXPECTED = {
+    Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
+    Expected.OBSERVED: "the episodes that any of the rows is of",
 }
 
 
@@ -102,7 +102,7 @@ def results_facts(results: Score | Path) -> Facts:
             ],
             "effects": {"table": effects, "note": Raw(effects.note)} if effects.rows else None,
             "standing": _standing(found, run),
-            "grid": _GRIDS[found.settings.grid],
+            "grid": _EXPECTED[found.settings.expected],
             "cells": _cells(found),
             "rows": len(found.rows),
             "rows_file": rows.path,
@@ -198,7 +198,7 @@ def _cells(found: Score) -> Table:
 # --- the repository ------------------------------------------------------------------------------
 
 
-def score_run(run: Path, grid: Grid = Grid.BENCHMARK) -> Score:
+def score_run(run: Path, expected: Expected = Expected.BENCHMARK) -> Score:
     """Score the run that is to be published, which has ended."""
     needed = (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
     if missing := [name for name in needed if not (run / name).is_file()]:
@@ -206,7 +206,7 @@ def score_run(run: Path, grid: Grid = Grid.BENCHMARK) -> Score:
             f"{run} holds no run that has ended: {missing[0]} is missing",
             "Run it to its end with the same evaluate command, or give the folder of a run.",
         )
-    return score(Settings(rows=(run,), grid=grid))
+    return score(Settings(rows=(run,), expected=expected))
 
 
 def results_content(found: Score, run: Path, config: VersionConfig) -> RepoContent:

@@ -9,9 +9,9 @@ from robomme_interference_data.cli.console import (
     check_output,
     command_line,
     echo,
+    graceful_interrupt,
     print_json,
-    say,
-    stoppable,
+    print_status,
 )
 from robomme_interference_data.cli.options import AsJson, BufferSetFolder, with_settings
 from robomme_interference_data.schema.shifts import NO_SHIFT
@@ -122,7 +122,7 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
 
     check_output(config.out)
     with (
-        stoppable(f"{kept} are in {config.out}", config.out),
+        graceful_interrupt(f"{kept} are in {config.out}", config.out),
         RunProgress(quiet=as_json, unit=unit) as shown,
     ):
         result = run_evaluation(config, progress=shown, command=[command_line()])
@@ -134,9 +134,9 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
         chance = f"; chance is {sum(chances) / len(chances):.1%}" if chances else ""
         echo(f"{len(result.rows)} of {result.planned} {unit} in {result.folder}{chance}")
     if result.stopped is not None:
-        say(f"Stopped: {result.stopped}", fg="red")
+        print_status(f"Stopped: {result.stopped}", fg="red")
     if broken := result.counts["error"]:
-        say(
+        print_status(
             f"{broken} {unit} broke (see {result.folder}/errors.log); the same command runs them "
             f"again:\n{command_line()}"
         )
@@ -176,7 +176,7 @@ def merge(
         if items:
             more = f" and {len(items) - 5:,} more" if len(items) > 5 else ""
             shown = ", ".join(map(str, items[:5]))
-            say(f"{len(items):,} {_LISTS[name]}: {shown}{more}")
+            print_status(f"{len(items):,} {_LISTS[name]}: {shown}{more}")
     echo(f"{len(merged.rows):,} of {merged.planned:,} rollouts in {out}")
 
 

@@ -126,7 +126,7 @@ def _control(kind: str, *, retrieval: bool, bound: bool = False) -> tuple[System
 _CONTROLS = (
     *(
         System(name.lower(), name, "none", bound=True)
-        for name in ("Oracle", "Guess", "Hold", "Obey", "Obey-Oracle")
+        for name in ("Oracle", "Guess", "Noop", "Follow-Subgoals", "Follow-Subgoals-Oracle")
     ),
     *_control("Replay", retrieval=False),
     *_control("Replay", retrieval=True),

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, echo, print_json, say, stoppable
+from robomme_interference_data.cli.console import (
+    check_output,
+    echo,
+    graceful_interrupt,
+    print_json,
+    print_status,
+)
 from robomme_interference_data.cli.options import (
     AsJson,
     BufferSetFolder,
@@ -86,7 +92,7 @@ def index(
         )
     planned = load_buffer_set(buffer_set) if (buffer_set / MANIFEST_PATH).is_file() else None
     made = make_encoder(encoder, device=device, batch=batch)
-    with stoppable("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
+    with graceful_interrupt("Finished episodes are kept"), WorkProgress(quiet=as_json) as progress:
         reports = build_index(
             roots,
             made,
@@ -97,7 +103,7 @@ def index(
             executor=Serial() if workers == WorkersConfig() else make_executor(workers),
         )
     for told in look_on_hub(planned, made, camera) if planned else ():
-        say(told)
+        print_status(told)
     if as_json:
         print_json([to_dict(report) for report in reports])
         return
@@ -106,7 +112,7 @@ def index(
         frames, found = report.header.frames, report.header.computed
         echo(f"{report.folder}: {frames} frames, {report.embedded} embedded now")
         if found != wanted:
-            say(
+            print_status(
                 f"{report.folder} is kept, computed with {found['in']}, {found['batch']} images at "
                 f"a time; --force makes it again with {wanted['in']}, {wanted['batch']} at a time"
             )
@@ -152,7 +158,7 @@ def retrieve(
     if out is not None:
         live = live_frame(opened, buffer, under, camera)
         drawing.draw_retrieval(buffer, measured, choice, found, live, out)
-        say(f"{out} written")
+        print_status(f"{out} written")
     if as_json:
         print_json(to_dict(found))
     else:
@@ -210,7 +216,7 @@ def retrieval_score(
         write_text(out / "cells.csv", Table.of(grade.Cell, cells, "cells", title).csv())
         write_text(out / "rows.csv", Table.of(grade.Grade, grades, "rows", title).csv())
         charts.draw_cells(cells, title, out / "retrieval.png")
-        say(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
+        print_status(f"{out / 'cells.csv'}, rows.csv and retrieval.png written")
     if as_json:
         about |= {"rules": list(map(str, wanted)), "pass_mark": grade.PASS_MARK}
         print_json(about | {"cells": [to_dict(cell) for cell in cells]})
@@ -256,7 +262,7 @@ def calibrate(
     title = f"Threshold of {name}, camera {camera}, on {about['buffer_set']}"
     if out is not None:
         charts.draw_calibration(found, title, out)
-        say(f"{out} written")
+        print_status(f"{out} written")
     if as_json:
         print_json(about | to_dict(found))
     else:
@@ -297,7 +303,7 @@ def _measured(
             command=opened.planning("k0", "k3"),
         )
     if left_out and not quiet:
-        say(f"{left_out} of {total} buffers hold no lesson and are left out")
+        print_status(f"{left_out} of {total} buffers hold no lesson and are left out")
     about = {"buffer_set": opened.name, "revision": opened.revision, "encoder": encoder}
     about |= {"camera": camera, "shift": shift}
     return about | {"buffers": len(measured), "left_out": left_out}, measured

@@ -133,7 +133,7 @@ def look_on_hub(buffer_set: BufferSet, encoder: Encoder, camera: str = "front") 
         camera: Camera, with or without `observation.images.`.
     """
     for name, recorded in buffer_set.header.datasets.items():
-        files = buffer_set.place(name)
+        files = buffer_set.dataset_files(name)
         if not isinstance(files, HubFiles):
             continue
         try:

@@ -36,7 +36,7 @@ STEPS = {
         "--out demo/runs/retrieval"
     ),
     "Compare the two": (
-        "score demo/runs/framesamp demo/runs/retrieval --grid given --out demo/score"
+        "score demo/runs/framesamp demo/runs/retrieval --expected observed --out demo/score"
     ),
 }
 

@@ -213,7 +213,7 @@ class LeRobotSource(Source):
         """Return what changes when the episode's files do; of the Hub's, the commit is known."""
         if isinstance(self._files, HubFiles):
             return ()
-        place = self._lerobot.place(index)
+        place = self._lerobot.locate(index)
         videos = [path for name, (path, _) in place.videos.items() if name in columns]
         # A part of a dataset may be here only: what is not is missed when it is read.
         return tuple(file_state(self._files.root / path) for path in (place.data, *videos))

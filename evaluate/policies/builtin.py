@@ -36,7 +36,7 @@ class ReplayPolicy(Policy):
 
     Args:
         memory: `full`, `framesamp` or `window`.
-        go_on: Where the last frames that it was given are not among those that it keeps, go on for
+        extrapolate: Where the last frames that it was given are not among those that it keeps, go on for
             as many steps as they were, as it moved last. Off by default: its rows are another
             system's.
     """
@@ -44,9 +44,9 @@ class ReplayPolicy(Policy):
     cameras = ("front",)
     history_cameras = ("front",)
 
-    def __init__(self, memory: str = "full", *, go_on: bool = False):
+    def __init__(self, memory: str = "full", *, extrapolate: bool = False):
         check_memory(memory, "replay")
-        self.memory, self._go_on = memory, go_on
+        self.memory, self._extrapolate = memory, extrapolate
 
     def reset(self, info: RolloutInfo) -> None:
         """Forget everything."""
@@ -83,7 +83,7 @@ class ReplayPolicy(Policy):
         nearest_view = int(np.argmin(((views - view) ** 2).mean(axis=(1, 2, 3))))
         kept = kept[nearest_view:]
         states = np.concatenate(self._states)[kept]
-        if self._go_on:
+        if self._extrapolate:
             kept, states = extrapolate(kept, states, live - 1)
         return follow(observation.state, kept, states)
 
@@ -160,7 +160,7 @@ def follow(
 class Privileged(Policy):
     """`oracle` or `guess`: the simulator's own scripts, with the hidden answer or a drawn one.
 
-    These and `Hold` are the benchmark's ends.
+    These and `Noop` are the benchmark's ends.
     """
 
     privileged = True
@@ -187,19 +187,19 @@ class Privileged(Policy):
         return self._simulator
 
 
-class Obey(Privileged):
-    """`obey`: does what subgoals say, by the simulator's own script.
+class FollowSubgoals(Privileged):
+    """`follow-subgoals`: does what subgoals say, by the simulator's own script.
 
     It finds what their words and points name among all that the scene allows, and knows no answer.
     Without subgoals it does what `guess` does.
     """
 
     def __init__(self) -> None:
-        super().__init__("obey")
+        super().__init__("follow-subgoals")
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""
-        return self._asked().obey(observation.subgoal)[None]
+        return self._asked().follow_subgoal(observation.subgoal)[None]
 
 
 class Recall(Privileged):
@@ -238,7 +238,7 @@ class Recall(Privileged):
         return {"policy": self.name, "memory": self.memory}
 
 
-class Hold(Policy):
+class Noop(Policy):
     """Holds the pose that the arm has, so that nothing happens."""
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
@@ -248,4 +248,4 @@ class Hold(Policy):
 
     def metadata(self) -> dict[str, Any]:
         """Return its name."""
-        return {"policy": "hold"}
+        return {"policy": "noop"}

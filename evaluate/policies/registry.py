@@ -19,7 +19,7 @@ from robomme_interference_data.simulators.base import CAMERAS
 
 from .policy import Policy
 
-BUILTINS = ("replay", "recall", "oracle", "guess", "obey", "hold")
+BUILTINS = ("replay", "recall", "oracle", "guess", "follow-subgoals", "noop")
 """Policies without learned weights."""
 
 _SERVER = r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
@@ -46,8 +46,8 @@ POLICIES = Registry(
             name: _kind(name, "builtin:Privileged", given={"name": name})
             for name in ("oracle", "guess")
         },
-        "obey": _kind("obey", "builtin:Obey"),
-        "hold": _kind("hold", "builtin:Hold"),
+        "follow-subgoals": _kind("follow-subgoals", "builtin:FollowSubgoals"),
+        "noop": _kind("noop", "builtin:Noop"),
         "websocket": _kind(
             "websocket://host:port, with commas between several servers, each once, or websocket "
             'with serve="COMMAND with {port}"',

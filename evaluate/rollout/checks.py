@@ -41,7 +41,7 @@ from robomme_interference_data.simulators.registry import (
 
 from .clips import check_drawing
 
-READS_SUBGOALS = ("websocket", "python", "obey")
+READS_SUBGOALS = ("websocket", "python", "follow-subgoals")
 """Kinds of policies that may read subgoals."""
 
 
@@ -50,7 +50,7 @@ def default_system(config: RunConfig) -> str:
 
     That is the policy's own, `retrieval-…` with a retrieval step, and what is not usual of the
     step behind it, such as `retrieval-replay-window-oracle`; with the simulator's subgoals
-    `…-oracle`, and of `replay` that goes on `…-go-on`.
+    `…-oracle`, and of `replay` that goes on `…-extrapolate`.
     """
     spec = parse_policy(config.policy)
     # Folders are called alike, and so are revisions; and served models.
@@ -62,8 +62,11 @@ def default_system(config: RunConfig) -> str:
             "docs/systems.md.",
         )
     name = "-".join(filter(None, (spec.kind, spec.target, config.subgoals)))
-    if spec.kind == "replay" and policy_options(config.policy, config.policy_options)["go_on"]:
-        name += "-go-on"
+    if (
+        spec.kind == "replay"
+        and policy_options(config.policy, config.policy_options)["extrapolate"]
+    ):
+        name += "-extrapolate"
     if spec.kind == "python":
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", name.partition("-")[2]).strip("-")
     if config.retrieval is None:

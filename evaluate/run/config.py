@@ -49,7 +49,7 @@ class RunConfig(WorkConfig):
     """What to roll out, and how."""
 
     policy: str = setting(
-        help="replay, recall (both also with :framesamp or :window), oracle, guess, obey, hold, "
+        help="replay, recall (both also with :framesamp or :window), oracle, guess, follow-subgoals, noop, "
         "websocket://HOST:PORT (several with commas), websocket with --serve, "
         "lerobot:REPO[@REVISION], lerobot:FOLDER or python:module:factory."
     )

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from robomme_interference_data.cli.console import check_output, command_line, echo, print_json, say
+from robomme_interference_data.cli.console import (
+    check_output,
+    command_line,
+    echo,
+    print_json,
+    print_status,
+)
 from robomme_interference_data.cli.options import AsJson, split_commas, with_settings
 
 from .config import Settings
@@ -50,7 +56,7 @@ def score(
     with WorkProgress() as progress, progress.status("Drawing the figures"):
         exported = write_score(found, out, export_to, command_line(), png=png)
     for path in exported:
-        say(f"{path} written")
+        print_status(f"{path} written")
     if as_json:
         print_json(
             {
@@ -60,14 +66,14 @@ def score(
                 "rows": len(found.rows),
                 "bad_rows": found.rows.refused,
                 "notes": list(found.notes),
-                "grid": settings.grid,
+                "expected": settings.expected,
                 "tables": {name: table.records() for name, table in found.tables.items()},
             }
         )
     else:
         for grid in found.grids:
             echo(f"{grid.text()}\n")
-    say(f"Report: {out / 'report.html'}")
+    print_status(f"Report: {out / 'report.html'}")
 
 
 def compare(
@@ -159,8 +165,8 @@ def power(
 def _tell(found: "Sequence[Rows]", notes: Sequence[str]) -> None:
     for rows in found:
         for refusal in rows.refusals:
-            say(f"left out: {refusal}")
+            print_status(f"left out: {refusal}")
         if rows.refused:
-            say(f"{rows.refused:,} bad rows left out")
+            print_status(f"{rows.refused:,} bad rows left out")
     for note in notes:
-        say(note)
+        print_status(note)

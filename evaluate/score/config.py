@@ -14,7 +14,7 @@ class Against(StrEnum):
     PAPER = "paper"
 
 
-class Grid(StrEnum):
+class Expected(StrEnum):
     """Which cells are expected, and which episodes a complete one has.
 
     `benchmark`: the paper's five conditions, each with its nine families × test episodes 0 to 49;
@@ -23,7 +23,7 @@ class Grid(StrEnum):
     """
 
     BENCHMARK = "benchmark"
-    GIVEN = "given"
+    OBSERVED = "observed"
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Settings:
     )
     system: str | None = setting(None, help="Name of the system of rows that name none.")
     against: Against | None = setting(None, help="Put the published rates beside these.")
-    grid: Grid = setting(
-        Grid.BENCHMARK,
+    expected: Expected = setting(
+        Expected.BENCHMARK,
         help="Episodes of a complete cell: the benchmark's (nine families, test episodes 0 to 49 "
         "each), or those that any of the given rows is of.",
     )

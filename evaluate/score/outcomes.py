@@ -17,7 +17,7 @@ from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_o
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.intervals import effective_n, wilson
 
-from .config import Grid
+from .config import Expected
 from .rows.reading import Rows
 from .rows.values import Row
 
@@ -171,25 +171,25 @@ def rate_of(status: Statuses) -> Rate:
     return Rate(n, value, effective_n(float(rates.mean()), spread, n, int(of.sum())))
 
 
-def outcomes_of(rows: Rows, grid: Grid) -> dict[str, Outcomes]:
+def outcomes_of(rows: Rows, expected: Expected) -> dict[str, Outcomes]:
     """Return simulator to the outcomes in it, by name, with the cells that are expected."""
     return {
-        name: _outcomes(part, name, grid, rows.unpinned)
+        name: _outcomes(part, name, expected, rows.unpinned)
         for name, part in rows.by("simulator").items()
     }
 
 
 def _outcomes(
-    rows: Sequence[Row], simulator: str, grid: Grid, unpinned: frozenset[tuple[str, str]]
+    rows: Sequence[Row], simulator: str, which: Expected, unpinned: frozenset[tuple[str, str]]
 ) -> Outcomes:
     systems = tuple(sorted({row.system for row in rows}, key=_table_order))
     given = {row.condition for row in rows}
-    due = given if grid is Grid.GIVEN else {*DEFAULT_CONDITIONS}
+    due = given if which is Expected.OBSERVED else {*DEFAULT_CONDITIONS}
     conditions = tuple(one.name for one in in_order(given | due))
     model_seeds = tuple(sorted({row.model_seed for row in rows}))
     ids = {(row.family, row.split, row.episode) for row in rows}
     expected = ids
-    if grid is Grid.BENCHMARK:
+    if which is Expected.BENCHMARK:
         expected = {
             (family, "test", index) for family in FAMILIES for index in range(TEST_EPISODES)
         }

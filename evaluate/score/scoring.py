@@ -12,14 +12,22 @@ from robomme_interference_data.viz.tables import Table
 from .comparisons import effects, families, interaction, ranks
 from .comparisons.contrast import Contrast
 from .comparisons.tables import comparison_table
-from .config import Against, Grid, Settings
+from .config import Against, Expected, Settings
 from .outcomes import Outcomes, outcomes_of
 from .rows.reading import Rows, read_rows
 from .tables import cells, chance, equivalence, evidence_kept, paper
 
 TABLES = (
     *("main", "chance", "systems", "ranks", "family", "difficulty", "lift", "effects"),
-    *("interaction", "equivalence", "interference", "access", "ceiling", "decay", "noise"),
+    *(
+        "interaction",
+        "equivalence",
+        "interference",
+        "by_evidence_kept",
+        "ceiling",
+        "decay",
+        "noise",
+    ),
     *("families", "family_effects", "matrix", "coverage", "paper", "paper_family"),
 )
 """Every table that a score may have, in order."""
@@ -69,7 +77,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
             else f"there are no rows {where}",
             "Without any sound row there is nothing to score.",
         )
-    outcomes = outcomes_of(rows, settings.grid)
+    outcomes = outcomes_of(rows, settings.expected)
     every = tuple(outcomes.values())
     compared, decays, notes = _compared(rows, every, draws)
     by_family = [one for own in every for one in families.family_effects(own, compared)]
@@ -94,7 +102,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
         tables.append(equivalence.equivalence_table(compared, found, published, margin))
     if published:
         # The paper's rates are over the benchmark's grid, whatever the grid of this scoring.
-        whole = cells.cells_of(outcomes_of(rows, Grid.BENCHMARK).values())
+        whole = cells.cells_of(outcomes_of(rows, Expected.BENCHMARK).values())
         tables += [paper.paper_table(whole), paper.paper_family_table(whole)]
         notes += paper.not_compared(whole)
     tables = [one for one in tables if one.rows or one.name in _ALWAYS]

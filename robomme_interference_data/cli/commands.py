@@ -11,7 +11,7 @@ from robomme_interference_data.data.fetch import FetchConfig
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_shift
 
-from .console import check_output, echo, print_json, say, stoppable
+from .console import check_output, echo, graceful_interrupt, print_json, print_status
 from .options import (
     AsJson,
     BufferSetFolder,
@@ -126,7 +126,7 @@ def show(
 
         live = live_frame(opened, buffer, under, camera)
         draw_strip(buffer, out, camera=camera, live=live)
-        say(f"{out} written")
+        print_status(f"{out} written")
     manifest, evidence = buffer.manifest, buffer.evidence
     if as_json:
         told = None if evidence is None else [one.told() for one in evidence]
@@ -184,7 +184,7 @@ def show_question(
     if out is not None:
         with atomic_path(out) as partial:
             partial.write_bytes(question.picture)
-        say(f"{out} written")
+        print_status(f"{out} written")
     told = {
         "goal": query.goal,
         "question": question.text,
@@ -225,7 +225,7 @@ def fetch(
     from robomme_interference_data.data.loading import load_buffer_set
 
     check_output(to)
-    with stoppable("What was fetched is kept"):
+    with graceful_interrupt("What was fetched is kept"):
         opened = load_buffer_set(buffer_set)
         parts = plan_fetch(opened, config)
         told = [
@@ -239,7 +239,7 @@ def fetch(
             for part in parts
         ]
         for one in told:
-            say(
+            print_status(
                 "{repository}: {files:,} files, {bytes:,} bytes; to fetch: {missing_files:,} "
                 "files, {missing_bytes:,} bytes".format(**one)
             )
@@ -248,7 +248,7 @@ def fetch(
     if as_json:
         print_json({"to": None if to is None else str(to), "repositories": told})
     elif not dry_run:
-        say(f"Next: robomme-interference list {to or opened.location}")
+        print_status(f"Next: robomme-interference list {to or opened.location}")
 
 
 def doctor(as_json: AsJson = False) -> None:

@@ -38,7 +38,7 @@ def echo(text: str, *, nl: bool = True) -> None:
     typer.echo(visible(text), nl=nl)
 
 
-def say(text: str, **style: Any) -> None:
+def print_status(text: str, **style: Any) -> None:
     """Print a message to stderr; styles are those of `typer.secho`."""
     typer.secho(visible(text), err=True, **style)
 
@@ -47,7 +47,7 @@ class _Messages(logging.Handler):
     """Prints log records as plain messages, above a progress bar if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        say(self.format(record))
+        print_status(self.format(record))
 
 
 def log_to_stderr() -> None:
@@ -85,7 +85,7 @@ class _Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def stoppable(kept: str, place: Path | None = None) -> Iterator[None]:
+def graceful_interrupt(kept: str, place: Path | None = None) -> Iterator[None]:
     """Let Ctrl-C, and SIGTERM as schedulers send it, end a command in peace; tell how to go on.
 
     Args:
@@ -104,11 +104,11 @@ def stoppable(kept: str, place: Path | None = None) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        say(f"\nStopped. {told()}; go on with:\n{command_line()}")
+        print_status(f"\nStopped. {told()}; go on with:\n{command_line()}")
         raise typer.Exit(143 if isinstance(interrupt, _Terminated) else 130) from None
     except OSError as error:
         if error.errno is not None:  # the system's word on a file, such as that the disk is full
-            say(f"Stopped. {told()}; once mended, go on with:\n{command_line()}")
+            print_status(f"Stopped. {told()}; once mended, go on with:\n{command_line()}")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -22,7 +22,7 @@ from robomme_interference_data.simulators import commands as simulating
 from robomme_interference_data.storage.hub_errors import check_endpoint
 
 from . import commands
-from .console import Group, echo, log_to_stderr, say
+from .console import Group, echo, log_to_stderr, print_status
 from .hints import PROGRAM, error_lines, option_names
 
 
@@ -136,14 +136,14 @@ def main() -> None:
         command(prog_name=PROGRAM)
     except InterferenceError as error:
         _fail(*error_lines(error, option_names(command, sys.argv[1:])))
-    except KeyboardInterrupt:  # before the command itself has begun, see `stoppable`
+    except KeyboardInterrupt:  # before the command itself has begun, see `graceful_interrupt`
         sys.exit(128 + signal.SIGINT)
     except BrokenPipeError:  # the reader of stdout (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
         if not isinstance(error, OSError) or error.errno is None:  # a fault of ours
-            say(traceback.format_exc())
+            print_status(traceback.format_exc())
             sys.exit(1)
         names = [name for name in (error.filename, error.filename2) if name is not None]
         where = f"{' -> '.join(map(str, names))}: " if names else ""
@@ -154,9 +154,9 @@ def main() -> None:
 
 
 def _fail(message: str, *further: str) -> None:
-    say(f"Error: {message}", fg=typer.colors.RED)
+    print_status(f"Error: {message}", fg=typer.colors.RED)
     for line in further:
-        say(line)
+        print_status(line)
     sys.exit(1)
 
 

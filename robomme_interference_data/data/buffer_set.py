@@ -38,7 +38,7 @@ from .manifest_table import ManifestTable
 from .query import Query
 
 _FOLDER = re.compile(r"\w[\w.-]*")
-_PLACE = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
+_LOCATION = re.compile(r"\.|[\w.-]+/[\w.-]+@[0-9a-f]{40}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -65,8 +65,8 @@ class BufferSet:
         for name, dataset in self.header.datasets.items():
             if not _FOLDER.fullmatch(name):
                 raise FormatError.damaged(path, f"dataset {name!r} is not the name of a folder")
-            if not _PLACE.fullmatch(dataset.place or "."):
-                raise FormatError.damaged(path, f"{name} has the place {dataset.place!r}")
+            if not _LOCATION.fullmatch(dataset.location or "."):
+                raise FormatError.damaged(path, f"{name} has the location {dataset.location!r}")
 
     def __repr__(self) -> str:
         return f"BufferSet({self.name}, buffers={len(self)}, conditions={list(self.conditions)})"
@@ -105,7 +105,7 @@ class BufferSet:
 
         It is the same wherever the datasets lie.
         """
-        bare = {name: replace(one, place=None) for name, one in self.header.datasets.items()}
+        bare = {name: replace(one, location=None) for name, one in self.header.datasets.items()}
         text = canonical_json(to_dict(replace(self.header, datasets=bare)))
         return sha256(text.encode(errors="backslashreplace")).hexdigest()  # as files are written
 
@@ -123,23 +123,23 @@ class BufferSet:
         """
         return _Datasets(self)
 
-    def place(self, name: str) -> LocalFiles | HubFiles:
+    def dataset_files(self, name: str) -> LocalFiles | HubFiles:
         """Return where a dataset of the buffer set lies.
 
-        That is the folder of its name, if there is one or the manifests name no other place.
+        That is the folder of its name, if there is one or the manifests name no other location.
         """
-        place, own = self.header.datasets[name].place, self.files
-        if isinstance(own, LocalFiles) and (place is None or (own.root / name).is_dir()):
+        location, own = self.header.datasets[name].location, self.files
+        if isinstance(own, LocalFiles) and (location is None or (own.root / name).is_dir()):
             return LocalFiles(own.root / name)
-        if place is None and isinstance(own, HubFiles) and name in OPTIONAL_DATASETS:
+        if location is None and isinstance(own, HubFiles) and name in OPTIONAL_DATASETS:
             return own.inside(name)
-        if place is None:
+        if location is None:
             raise MissingFileError(
                 f"the manifests of {self.location} do not say where its {name} are",
                 "Those of a published buffer set do.",
                 "publish BUFFER_SET --repo-id NAMESPACE/NAME",
             )
-        return own if place == "." else HubFiles.parse(place)
+        return own if location == "." else HubFiles.parse(location)
 
     @cached_property
     def episode_ids(self) -> tuple[EpisodeId, ...]:
@@ -178,16 +178,16 @@ class BufferSet:
         """Return the command that plans buffers under these conditions."""
         command = f"build manifests {self.location}"
         if isinstance(self.files, HubFiles):  # what is published stays as it is
-            place = self.header.datasets[DEMONSTRATIONS].place
-            command = f"new-buffer-set BUFFER_SET --demonstrations {place} --source KIND:PATH"
+            location = self.header.datasets[DEMONSTRATIONS].location
+            command = f"new-buffer-set BUFFER_SET --demonstrations {location} --source KIND:PATH"
         return f"{command} --conditions {','.join(conditions)}"
 
     @property
-    def mend(self) -> str:
+    def fix(self) -> str:
         """What to do where manifests and data are not of each other."""
         if isinstance(self.files, HubFiles):
-            places = [one.place or "." for one in self.header.datasets.values()]
-            others = {place.split("@")[0] for place in places} - {"."}
+            locations = [one.location or "." for one in self.header.datasets.values()]
+            others = {location.split("@")[0] for location in locations} - {"."}
             cached = " ".join(f"dataset/{name}" for name in sorted({self.files.repo_id, *others}))
             return (
                 f"Fetch it again: type hf cache rm {cached}, and the same command. If that does "
@@ -273,7 +273,7 @@ class BufferSet:
         buffer = self._buffer(self.manifest(episode_id, condition, k=k))
         buffer.fetch(cameras)
         if verify:
-            self._table.check(self.mend)
+            self._table.check(self.fix)
             buffer.verify()
         return buffer
 
@@ -322,13 +322,13 @@ class _Datasets(Mapping[str, Dataset]):
     def __getitem__(self, name: str) -> Dataset:
         if name not in self._opened:
             recorded = self._buffer_set.header.datasets[name]
-            dataset = Dataset(self._buffer_set.place(name))
+            dataset = Dataset(self._buffer_set.dataset_files(name))
             if dataset.revision != recorded.revision:
                 local = isinstance(self._buffer_set.files, LocalFiles)
                 raise HashMismatchError(
                     f"{dataset.files.describe()} has revision {dataset.revision[:12]}…; the "
                     f"manifests were made for {recorded.revision[:12]}…",
-                    self._buffer_set.mend,
+                    self._buffer_set.fix,
                     f"build manifests {self._buffer_set.location}" if local else None,
                 )
             self._opened[name] = dataset

@@ -202,7 +202,7 @@ class Dataset:
 
     def files_of(self, episode_index: int, cameras: Iterable[str]) -> list[str]:
         """Return the paths of the files that hold an episode's vectors and the given cameras."""
-        place = self.lerobot.place(episode_index)
+        place = self.lerobot.locate(episode_index)
         return [place.data, *(place.videos[self._camera(camera)][0] for camera in cameras)]
 
     def index(self, encoder: str, camera: str = "front") -> EmbeddingIndex:

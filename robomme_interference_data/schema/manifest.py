@@ -164,7 +164,7 @@ class ManifestDataset:
     version: Annotated[str, "Its version."]
     revision: Annotated[str, "Its revision: sessions name it."]
     identity: Annotated[str, "SHA-256 of its `meta/interference.json`."]
-    place: Annotated[
+    location: Annotated[
         str | None,
         "Where it lies: None for the folder of its name in the buffer set, `.` for the buffer set's own"
         " root, `namespace/name@commit` for a repository on the Hub.",

@@ -239,7 +239,7 @@ class Simulator(ABC):
         """
         raise UnknownNameError(f"the simulator {type(self).__name__} has no subgoals of its own")
 
-    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+    def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
         """Return the next action, `(8,) float32`, of a script that does what a subgoal says.
 
         It finds what words and points name among all that the scene allows; where they leave it

@@ -19,7 +19,7 @@ from . import video
 from .files import Files, parse_json, read_bytes, read_json
 from .lerobot_layout import (
     VERSIONS,
-    EpisodePlace,
+    EpisodeLocation,
     check_info,
     place_episode,
 )
@@ -134,13 +134,13 @@ class LeRobotFiles:
             row = self._rows[index] = self.table.slice(index, 1).to_pylist()[0]
         return row
 
-    def place(self, index: int) -> EpisodePlace:
+    def locate(self, index: int) -> EpisodeLocation:
         """Return where an episode lies."""
         return place_episode(self.info, index, self.row(index), self.files.describe())
 
     def rows(self, index: int) -> RowSpan:
         """Return the rows of an episode in its data file."""
-        place = self.place(index)
+        place = self.locate(index)
         path = self.files.path(place.data)
         whole = RowSpan(path)
         found = np.flatnonzero(whole.scalars("episode_index") == index)
@@ -175,7 +175,7 @@ class LeRobotFiles:
         self, index: int, column: str, start: int, stop: int
     ) -> Iterator[NDArray[np.uint8]]:
         """Decode frames `start` to `stop` (excluded) of an episode, `(H, W, 3) uint8`, in order."""
-        relative, first = self.place(index).videos[column]
+        relative, first = self.locate(index).videos[column]
         self.check_span(index, start, stop)
         path, shape = self.files.path(relative), self.shape(column)
         return video.iter_frames(path, first + start, first + stop, self.fps, shape)

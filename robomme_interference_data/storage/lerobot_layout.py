@@ -32,7 +32,7 @@ _FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
 
 
 @dataclass(frozen=True)
-class EpisodePlace:
+class EpisodeLocation:
     """Where an episode lies in its dataset.
 
     Attributes:
@@ -95,7 +95,7 @@ def fill_template(template: str, where: object, **values: str | int) -> str:
 
 def place_episode(
     info: dict[str, Any], index: int, row: dict[str, Any], where: str
-) -> EpisodePlace:
+) -> EpisodeLocation:
     """Return where an episode lies.
 
     Args:
@@ -135,4 +135,4 @@ def place_episode(
             what = f"{key}/from_timestamp {start!r} lies between two frames"
             raise FormatError.damaged(where, what)
         videos[name] = (path(info["video_path"], key, video_key=name), first)
-    return EpisodePlace(whole("length"), path(info["data_path"], "data"), videos)
+    return EpisodeLocation(whole("length"), path(info["data_path"], "data"), videos)

@@ -92,7 +92,7 @@ def test_a_published_buffer_set_is_the_one_on_disk(hub: HubServer, tmp_path: Pat
         assert [one.title for one in own.commits.values()] == ["initial commit", "Version 1.0.0"]
     base = f"{LESSONS}@{lessons.published}"
     places = json.loads(files(hub, UNITS)["manifests/manifest.json"])["datasets"]
-    assert [one["place"] for one in places.values()] == [base, "."]
+    assert [one["location"] for one in places.values()] == [base, "."]
     assert base.encode() in files(hub, UNITS)["README.md"]
 
     # The tag comes last, and nothing is sent a second time.
@@ -185,7 +185,7 @@ def test_a_version_never_changes(hub: HubServer, tmp_path: Path, how: str, follo
         assert hub.uploads() == [rows]
     # The demonstrations are as they were; with another license, their card is not.
     assert (kept.published == lessons.published) == (how != "card")
-    assert load_buffer_set(UNITS).header.datasets["demonstrations"].place == (
+    assert load_buffer_set(UNITS).header.datasets["demonstrations"].location == (
         f"{LESSONS}@{lessons.published}"
     )
     assert tags(hub, UNITS) == {
@@ -232,7 +232,7 @@ def test_demonstrations_count_their_own_versions(
         assert tags(hub, LESSONS)["data-1.0.1"] == new.published != lessons.published
         publish(GOLDEN, "someone/other", demonstrations_id=LESSONS)
         header = load_buffer_set("someone/other").header.datasets["demonstrations"]
-        assert header.place == f"{LESSONS}@{lessons.published}"
+        assert header.location == f"{LESSONS}@{lessons.published}"
     # Their data: the buffer set has to be another version.
     root = copy_buffer_set(tmp_path / "buffer_set")
     (root / "demonstrations" / "index").mkdir()
@@ -242,7 +242,7 @@ def test_demonstrations_count_their_own_versions(
     new, units = publish(root, version="3.0.0")
     assert (str(new.version), str(units.version)) == ("1.0.2", "3.0.0")
     header = load_buffer_set(UNITS).header.datasets["demonstrations"]
-    assert header.place == f"{LESSONS}@{new.published}"
+    assert header.location == f"{LESSONS}@{new.published}"
 
 
 # --- published demonstrations --------------------------------------------------------------------
@@ -254,7 +254,7 @@ def placed(hub: HubServer, tmp_path: Path, commit: str | None = None) -> Path:
     root = copy_buffer_set(tmp_path / "placed")
     path = root / "manifests" / "manifest.json"
     header = json.loads(path.read_text(encoding="utf-8"))
-    header["datasets"]["demonstrations"]["place"] = f"others/lessons@{commit}"
+    header["datasets"]["demonstrations"]["location"] = f"others/lessons@{commit}"
     path.write_text(json.dumps(header), encoding="utf-8")
     return root
 
@@ -266,7 +266,7 @@ def test_a_buffer_set_of_published_demonstrations(hub: HubServer, tmp_path: Path
     assert len(load_buffer(QUERY, "k1", buffer_set=UNITS, verify=True).sessions) == 2
     lessons, _ = publish(root, "someone/again", demonstrations_id="someone/mine")
     header = load_buffer_set("someone/again").header.datasets["demonstrations"]
-    assert header.place == f"someone/mine@{lessons.published}"
+    assert header.location == f"someone/mine@{lessons.published}"
 
 
 def test_published_demonstrations_that_cannot_be_used(hub: HubServer, tmp_path: Path) -> None:
@@ -418,7 +418,7 @@ def ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_results(hub: HubServer, ended: Path, run: Run, tmp_path: Path) -> None:
     repo = "someone/results"
-    asked = ("publish-results", ended, "--repo-id", repo, "--grid", "given")
+    asked = ("publish-results", ended, "--repo-id", repo, "--expected", "observed")
     code, out, err = run(*asked, "--dry-run", "--json")
     assert code == 0, err
     assert json.loads(out)[0]["sent_files"] > 0 and tags(hub, repo) == {}

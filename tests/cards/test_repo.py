@@ -80,7 +80,7 @@ def test_the_files_of_a_buffer_set(tmp_path: Path) -> None:
     }
     before = (GOLDEN / "manifests/manifest.json").read_text(encoding="utf-8")
     added = [line.strip() for line in header.splitlines() if line not in before.splitlines()]
-    assert added == [f'"place": "{BASE}",', '"place": ".",']
+    assert added == [f'"location": "{BASE}",', '"location": ".",']
 
 
 # --- in a folder ---------------------------------------------------------------------------------

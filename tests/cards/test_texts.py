@@ -190,7 +190,7 @@ def test_the_base_comes_from_the_manifests(tmp_path: Path) -> None:
     buffer_set = made_up(tmp_path)
     header = buffer_set.header
     place = f"people/demonstrations@{COMMIT}"
-    placed = replace(header.datasets["demonstrations"], place=place)
+    placed = replace(header.datasets["demonstrations"], location=place)
     buffer_set.header = replace(header, datasets={**header.datasets, "demonstrations": placed})
     assert f"| demonstrations | `{place}` |" in buffer_set_text(
         buffer_set, Publication("people/tiny")

@@ -128,9 +128,9 @@ def test_a_place_that_leads_elsewhere(tmp_path: Path) -> None:
     header = root / "manifests" / "manifest.json"
     value = json.loads(header.read_text(encoding="utf-8"))
     for place in ("..", "/etc", "a/b", "a/b@main", "https://somewhere/a/b"):
-        value["datasets"]["distractors"]["place"] = place
+        value["datasets"]["distractors"]["location"] = place
         header.write_text(json.dumps(value), encoding="utf-8")
-        with pytest.raises(FormatError, match="place"):
+        with pytest.raises(FormatError, match="location"):
             load_buffer_set(root)
 
 

@@ -43,7 +43,7 @@ def read_all(root: Path) -> None:
     for index in range(len(lerobot)):
         for name, feature in lerobot.features.items():
             if feature["dtype"] == "video":
-                list(lerobot.iter_frames(index, name, 0, lerobot.place(index).length))
+                list(lerobot.iter_frames(index, name, 0, lerobot.locate(index).length))
             elif feature["dtype"] == "float32":
                 lerobot.vectors(index, name)
 
@@ -71,7 +71,7 @@ def test_values_frames_and_places(root: Path) -> None:
         frames = episode.images["front"]
         found = np.stack(list(lerobot.iter_frames(index, front, 2, 6)))
         np.testing.assert_array_equal(found, frames[2:6])
-    place = lerobot.place(2)
+    place = lerobot.locate(2)
     assert (place.length, place.data, place.videos[front]) == PLACES[str(lerobot.version)]
     with pytest.raises(UnknownNameError, match="episode 3 is not in .* 3 episodes"):
         lerobot.row(3)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.errors import PolicyError, UnknownNameError
 from robomme_interference_data.evaluate.policies.builtin import (
-    Hold,
+    Noop,
     Privileged,
     Recall,
     ReplayPolicy,
@@ -55,14 +55,14 @@ def test_a_memory_keeps_frames_that_were_there(name: str, live: int) -> None:
 def test_replay_goes_on_for_the_frames_that_it_knows_to_be_missing() -> None:
     """Of frames 0 to 309 the last one kept is 300; from 290 to it the joints moved by 0.1."""
     ends = {}
-    for go_on in (False, True):
-        policy = ReplayPolicy("framesamp", go_on=go_on)
+    for goes_on in (False, True):
+        policy = ReplayPolicy("framesamp", extrapolate=goes_on)
         policy.reset(RolloutInfo("goal", 310, 0))
         joints = np.arange(310) * np.float32(0.01)
         states = np.stack([state(joint) for joint in joints])
         policy.add_history({"front": np.zeros((310, 32, 32, 3), np.uint8)}, states, 310)
         plan = [policy.act(seen(0, 0.0), "")[-1] for _ in range(40)]
-        ends[go_on] = plan[-1]
+        ends[goes_on] = plan[-1]
     np.testing.assert_allclose(ends[False][:7], 3.0, atol=1e-5)
     np.testing.assert_allclose(ends[True][:7], 3.09, atol=1e-5)
 
@@ -160,7 +160,7 @@ def test_it_goes_on_from_call_to_call_then_holds_and_a_reset_forgets() -> None:
 
 
 def test_hold_holds_and_a_script_needs_the_simulator() -> None:
-    held = Hold().act(seen(0, 0.2, 0.0), "goal")
+    held = Noop().act(seen(0, 0.2, 0.0), "goal")
     np.testing.assert_array_equal(held, np.tile([*[np.float32(0.2)] * 7, 1], (16, 1)))
     with pytest.raises(PolicyError, match="needs the simulator itself"):
         Privileged("oracle").act(seen(0, 0.0), "goal")

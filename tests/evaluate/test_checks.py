@@ -199,15 +199,15 @@ def test_recall_needs_evidence(tiny_buffers: Path, monkeypatch: pytest.MonkeyPat
 
 def check_name(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop"} | changes)
-    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("hold"))
+    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("noop"))
 
 
 def test_replay_that_goes_on_is_a_system_of_its_own(tiny_buffers: Path) -> None:
-    going = {"policy": "replay:framesamp", "policy_options": ("go_on=true",)}
-    assert default_system(config(**going)) == "replay-framesamp-go-on"
+    going = {"policy": "replay:framesamp", "policy_options": ("extrapolate=true",)}
+    assert default_system(config(**going)) == "replay-framesamp-extrapolate"
     step = going | {"retrieval": "thumbnail"}
-    assert default_system(config(**step)) == "retrieval-replay-framesamp-go-on"
-    check_name(tiny_buffers, "replay-framesamp-go-on", **going)
+    assert default_system(config(**step)) == "retrieval-replay-framesamp-extrapolate"
+    check_name(tiny_buffers, "replay-framesamp-extrapolate", **going)
     with pytest.raises(InvalidOptionError, match="is not the control replay-framesamp"):
         check_name(tiny_buffers, "replay-framesamp", **going)
 

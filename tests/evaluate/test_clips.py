@@ -39,7 +39,7 @@ def banner(picture: np.ndarray) -> list[float]:
 
 
 def test_a_rollout_leaves_a_clip(tmp_path: Path, buffer: Buffer) -> None:
-    [row] = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True).rows
+    [row] = run_one(tmp_path / "run", conditions=("k1",), policy="noop", videos=True).rows
     assert (row.status, row.steps, row.video) == ("fail", 40, "videos/MoveCube_test_0_k1.mp4")
     assert not (tmp_path / "run" / "errors.log").exists()
     shown = frames(tmp_path / "run" / row.video)
@@ -81,7 +81,7 @@ def test_a_rollout_that_breaks_leaves_its_clip_too_unless_it_had_not_begun(
     tmp_path: Path, trouble: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def roll() -> Rollout:
-        [row] = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True).rows
+        [row] = run_one(tmp_path / "run", conditions=("k1",), policy="noop", videos=True).rows
         return row
 
     (trouble / "MoveCube-0").write_text("raise")
@@ -101,9 +101,9 @@ def test_a_rollout_that_breaks_leaves_its_clip_too_unless_it_had_not_begun(
 
 
 def test_a_clip_that_cannot_be_written_leaves_the_row_as_it_is(tmp_path: Path) -> None:
-    run_one(tmp_path / "run", conditions=("k0",), policy="hold")
+    run_one(tmp_path / "run", conditions=("k0",), policy="noop")
     (tmp_path / "run" / "videos").symlink_to(tmp_path / "gone" / "videos")  # a disk taken out
-    result = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True)
+    result = run_one(tmp_path / "run", conditions=("k1",), policy="noop", videos=True)
     assert [(row.status, row.video) for row in result.rows] == [("fail", None)]
     told = (tmp_path / "run" / "errors.log").read_text()
     assert "videos/MoveCube_test_0_k1.mp4 could not be written" in told
@@ -122,7 +122,7 @@ def test_a_clip_that_fails_leaves_the_row_as_it_is(
         add(self, picture)
 
     monkeypatch.setattr(VideoEncoder, "add", fail)
-    [row] = run_one(tmp_path / "run", conditions=("k1",), policy="hold", videos=True).rows
+    [row] = run_one(tmp_path / "run", conditions=("k1",), policy="noop", videos=True).rows
     assert (row.status, row.steps, row.video) == ("fail", 40, None)
     told = (tmp_path / "run" / "errors.log").read_text()
     assert "the clip failed:\n" in told

@@ -52,7 +52,7 @@ def test_ceiling_prints_a_table_or_json(tiny_buffers: Path) -> None:
 def test_evaluate_writes_the_rows_as_json(
     tmp_path: Path, tiny_buffers: Path, families: str
 ) -> None:
-    line = f"evaluate {tiny_buffers} --policy hold {USUAL} --families {families} --conditions no-history,k1 --json"
+    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families {families} --conditions no-history,k1 --json"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 0, done.output
     assert [
@@ -80,7 +80,7 @@ def test_what_broke_is_told_with_the_command_to_go_on(
 ) -> None:
     (trouble / "MoveCube-0").write_text("raise")
     line = (
-        f"evaluate {tiny_buffers} --policy hold {USUAL} --families MoveCube --conditions no-history"
+        f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube --conditions no-history"
     )
     done = type_in(f"{line} --out {tmp_path / 'run'} --max-errors 1")
     assert done.exit_code == 1
@@ -112,7 +112,7 @@ def test_a_stop_tells_of_rollouts_only_where_there_are_some(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run_module, "_run_items" if begun else "plan_work", stop)
-    line = f"evaluate {tiny_buffers} --policy hold {USUAL} --families MoveCube"
+    line = f"evaluate {tiny_buffers} --policy noop {USUAL} --families MoveCube"
     done = type_in(f"{line} --out {tmp_path / 'run'}")
     assert done.exit_code == 130 and "go on with:\nrobomme-interference" in done.stderr
     assert (f"Finished rollouts are in {tmp_path / 'run'}" in done.stderr) == begun

@@ -116,12 +116,12 @@ def test_a_server_that_was_restarted_is_connected_again_at_the_next_reset() -> N
 
 @pytest.mark.parametrize("call", ["prompt", "reset"])
 def test_a_server_that_hangs_is_given_up(server: PolicyServer, call: str) -> None:
-    go_on = threading.Event()
-    server.before = lambda message: go_on.wait(30) and None if call in message else None
+    extrapolate = threading.Event()
+    server.before = lambda message: extrapolate.wait(30) and None if call in message else None
     with client(server, response_s=0.3) as policy:
         with pytest.raises(PolicyServerError, match=r"did not answer within 0\.3 s"):
             rollout(policy, 0, [], [])
-        go_on.set()
+        extrapolate.set()
 
 
 def test_a_server_that_does_not_even_read_is_given_up() -> None:

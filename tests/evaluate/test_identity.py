@@ -41,7 +41,7 @@ def test_every_setting_is_classed() -> None:
     [
         ({"system": "yours"}, "system is 'mine' there, 'yours' here"),
         ({"model_seed": 7}, "model_seed is 0 there, 7 here"),
-        ({"policy": "hold", "policy_options": ()}, f"policy is {STILL!r} there, 'hold' here"),
+        ({"policy": "noop", "policy_options": ()}, f"policy is {STILL!r} there, 'noop' here"),
         ({"policy_options": ("gripper=1",)}, "policy_options.gripper is -1.0 there, 1.0 here"),
     ],
 )

@@ -60,7 +60,7 @@ def test_what_is_read(text: str, spec: PolicySpec, servers: tuple[tuple[str, int
         *(
             (text, InvalidOptionError, f"policy '{text}'; expected {text.partition(':')[0]}")
             for text in (
-                *("oracle:x", "hold:", "replay:", "websocket", "websocket:a:1", "websocket://"),
+                *("oracle:x", "noop:", "replay:", "websocket", "websocket:a:1", "websocket://"),
                 *("websocket://a", "websocket://a:0", "websocket://a:65536", "websocket://a:1/x"),
                 *("websocket://a:1,", "websocket://a:1,websocket://b:1", "websocket://a:1,a:1"),
                 *("lerobot", "lerobot:", "python:module", "python::make", "python:a b:make"),
@@ -117,8 +117,8 @@ def test_options_reach_the_policy_with_the_declared_type() -> None:
 
 @pytest.mark.parametrize("texts", [["gripper"], ["=1"], ["two words=1"], ["a=1", "b=1", "a=2"]])
 def test_what_is_no_option(texts: list[str]) -> None:
-    with pytest.raises(InvalidOptionError, match="policy 'hold': option"):
-        policy_options("hold", texts)
+    with pytest.raises(InvalidOptionError, match="policy 'noop': option"):
+        policy_options("noop", texts)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_what_is_no_option(texts: list[str]) -> None:
         ("websocket://a:1", "port=2", "port"),
         ("websocket://a:1", "connect_s=-1", "expected positive numbers"),
         (f"{OWN}still", "gripper=null", "gripper is None; expected a number"),
-        ("hold", "speed=1", "Its options: none."),
+        ("noop", "speed=1", "Its options: none."),
     ],
 )
 def test_options_that_do_not_fit(text: str, option: str, words: str) -> None:

@@ -153,7 +153,7 @@ def test_a_wrong_model_is_refused_before_the_run(tmp_path: Path) -> None:
 
 def checked(tiny_buffers: Path, system: str, **changes: Any) -> None:
     settings = config(**{"simulator": "tabletop", "policy": "websocket://h:1"} | changes)
-    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("hold"))
+    check_settings(settings, system, load_buffer_set(tiny_buffers), make_policy("noop"))
 
 
 MODEL = {"subgoals": "openai:http://h/v1#m"}

@@ -6,7 +6,7 @@ from support import scoring as made
 from support.scoring import record
 
 from robomme_interference_data.constants import FAMILIES
-from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.schema.conditions import NO_HISTORY
 
@@ -69,7 +69,7 @@ def test_cells_without_any_rollout_are_listed(tmp_path: Path) -> None:
     assert found.grids[0].note.startswith("n = 2 in each cell. ")  # said once where all are equal
     # In no other table, as there is nothing to say of their parts.
     assert len(found.tables["family"].rows) == 3
-    found = made.score(path, grid=Grid.BENCHMARK)
+    found = made.score(path, expected=Expected.BENCHMARK)
     assert [c.system for c in found.cells if not c.part] == [
         *("pi05_baseline", *[made.RETRIEVAL] * 4, *["mine"] * 5)
     ]
@@ -81,12 +81,12 @@ def test_cells_without_any_rollout_are_listed(tmp_path: Path) -> None:
 def test_the_benchmarks_grid_is_nine_families_of_fifty_episodes(tmp_path: Path) -> None:
     lines = [f"my-memory,{f},k0,{n},,easy,fail,0,9" for f in FAMILIES for n in range(50)]
     path = made.released(tmp_path / "a.csv", lines)
-    assert record(made.score(path, grid=Grid.BENCHMARK), "main", condition="k0")["complete"]
+    assert record(made.score(path, expected=Expected.BENCHMARK), "main", condition="k0")["complete"]
     # An episode beside the grid makes a cell incomplete, as a missing one does.
     more = made.released(tmp_path / "b.csv", [*lines, "my-memory,MoveCube,k0,50,,easy,fail,0,9"])
-    found = made.score(more, grid=Grid.BENCHMARK)
+    found = made.score(more, expected=Expected.BENCHMARK)
     assert not record(found, "main", condition="k0")["complete"]
     lacking = record(found, "coverage", condition="k0", family="MoveCube")
     assert (lacking["n"], lacking["other_episodes"]) == (51, "test 50")
-    few = made.score(made.released(tmp_path / "c.csv", lines[:12]), grid=Grid.BENCHMARK)
+    few = made.score(made.released(tmp_path / "c.csv", lines[:12]), expected=Expected.BENCHMARK)
     assert record(few, "main", condition="k0")["missing"] == 450 - 12

@@ -57,10 +57,14 @@ def test_score_and_export_on_the_command_line(
     done = run(*words)
     assert done.exit_code == 0, done.output
     value = json.loads(done.stdout)
-    assert value["rows"] == 1800 and value["grid"] == "benchmark"
+    assert value["rows"] == 1800 and value["expected"] == "benchmark"
     assert [one["successes"] for one in value["tables"]["main"]] == [202, 201, 202, 202]
     assert f"Report: {out / 'report.html'}" in done.stderr
-    beyond = {"interference", "access", "ceiling"}  # what the paper's conditions do not have
+    beyond = {
+        "interference",
+        "by_evidence_kept",
+        "ceiling",
+    }  # what the paper's conditions do not have
     beyond |= {"systems", "ranks", "matrix", "interaction"}  # nor one system alone
     beyond |= {"equivalence", "chance"}  # nobody asked for it, or anybody anything
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {*TABLES} - beyond
@@ -79,7 +83,9 @@ def test_score_and_export_on_the_command_line(
 @pytest.mark.usefixtures("no_pictures")
 def test_what_is_printed(tmp_path: Path) -> None:
     path = made.write_csv(tmp_path / "a.csv", made.rows())
-    done = run("score", path, "--grid", "given", "--against", "paper", "--out", tmp_path / "out")
+    done = run(
+        "score", path, "--expected", "observed", "--against", "paper", "--out", tmp_path / "out"
+    )
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
     assert lines[0] == "Success by system and condition, tabletop"
@@ -99,7 +105,7 @@ def test_what_is_printed(tmp_path: Path) -> None:
 def test_lenient_leaves_bad_rows_out_and_counts_them(tmp_path: Path) -> None:
     lines = ["my-memory,MoveCube,k0,0,7,easy,success,1,9", "my-memory,MoveCub,k0,1,8,easy,fail,0,9"]
     path = made.released(tmp_path / "a.csv", lines)
-    common = ("score", path, "--grid", "given", "--out", tmp_path / "out")
+    common = ("score", path, "--expected", "observed", "--out", tmp_path / "out")
     assert isinstance(run(*common).exception, FormatError)
     assert not (tmp_path / "out").exists()
     done = run(*common, "--lenient")
@@ -150,7 +156,16 @@ def test_without_a_library_nothing_is_written(
 ) -> None:
     path = made.write_csv(tmp_path / "a.csv", made.rows())
     monkeypatch.setitem(sys.modules, library, None)
-    given = ("score", path, "--grid", "given", "--out", tmp_path / "o", "--export", tmp_path / "e")
+    given = (
+        "score",
+        path,
+        "--expected",
+        "observed",
+        "--out",
+        tmp_path / "o",
+        "--export",
+        tmp_path / "e",
+    )
     done = run(*given)
     assert isinstance(done.exception, MissingExtraError) and library in str(done.exception)
     assert "robomme-interference-data[score]" in (done.exception.hint or "")

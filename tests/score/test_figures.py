@@ -151,7 +151,7 @@ def test_twelve_systems_are_named_at_their_values_without_dodge(full: Score, fig
 
     # Of FrameSamp's systems it is known what was kept: at k0 all of it.
     with open_figure() as other:
-        assert draw_figure("access", other, shown)
+        assert draw_figure("by_evidence_kept", other, shown)
         labels = {"all kept", "some kept", "none kept"}
         assert names(other) == [labels] * 3
         lines = [line for line in other.axes[0].lines if len(line.get_xdata()) > 1]

@@ -6,7 +6,7 @@ import pytest
 from support import scoring as made
 from support.scoring import BASE, OWN, RETRIEVAL, cells, record
 
-from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.evaluate.score.tables.paper import by_family, differing, published
 from robomme_interference_data.evaluate.systems import SYSTEMS
@@ -16,9 +16,13 @@ from robomme_interference_data.stats.intervals import wilson
 PAPER = made.RELEASED.parents[2] / "paper" / "robomme-interference-paper.tex"
 
 
-def told(tmp_path: Path, outcomes: dict[tuple[str, str], str], grid: Grid = Grid.GIVEN) -> str:
+def told(
+    tmp_path: Path, outcomes: dict[tuple[str, str], str], expected: Expected = Expected.OBSERVED
+) -> str:
     rows = cells(outcomes)
-    return headline(made.score(made.write_csv(tmp_path / "a.csv", rows), grid=grid), "tabletop")
+    return headline(
+        made.score(made.write_csv(tmp_path / "a.csv", rows), expected=expected), "tabletop"
+    )
 
 
 # --- headlines ---------------------------------------------------------------------------------
@@ -192,7 +196,7 @@ def test_published_rates_are_in_the_papers_source() -> None:
 @made.needs_released
 def test_the_released_rows_give_the_published_numbers() -> None:
     found = made.score(
-        made.RELEASED, system=RETRIEVAL, grid=Grid.BENCHMARK, paper=True, draws=10_000
+        made.RELEASED, system=RETRIEVAL, expected=Expected.BENCHMARK, paper=True, draws=10_000
     )
     whole = {cell.condition: cell for cell in found.cells if not cell.part and cell.n}
     assert all(cell.complete and cell.n == 450 for cell in whole.values())

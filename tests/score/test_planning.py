@@ -11,7 +11,7 @@ from support import scoring as made
 from support.scoring import BASE, RETRIEVAL, cells, record, records, run
 
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.config import Grid, Settings
+from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.power import needed, plan, power, smallest
 from robomme_interference_data.evaluate.score.report.headline import headline
 from robomme_interference_data.stats.intervals import newcombe, newcombe_paired
@@ -21,7 +21,7 @@ from robomme_interference_data.stats.intervals import newcombe, newcombe_paired
 
 @made.needs_released
 def test_the_released_rows_are_equivalent_to_their_own_k0_alone() -> None:
-    options = {"system": RETRIEVAL, "grid": Grid.BENCHMARK, "paper": True}
+    options = {"system": RETRIEVAL, "expected": Expected.BENCHMARK, "paper": True}
     found = made.score(made.RELEASED, margin=3, **options)
     own = record(found, "equivalence", condition="k7", against_system=RETRIEVAL)
     assert (own["low_90"], own["high_90"]) == newcombe_paired(189, 13, 13, 235, level=0.9)

@@ -8,7 +8,7 @@ from support import scoring as made
 from support.scoring import BASE, RETRIEVAL
 
 from robomme_interference_data.evaluate.score.comparisons.compare import compare
-from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.viz.tables import Table
 
@@ -29,7 +29,9 @@ def of_paper() -> tuple[list[Table], Score]:
     ]
     found = made.score(made.write_parquet(Path("small.parquet"), [*rows, *again]), draws=2000)
     robomme = made.changed(rows, simulator="robomme")
-    paper = made.score(made.write_csv(Path("all.csv"), robomme), grid=Grid.BENCHMARK, paper=True)
+    paper = made.score(
+        made.write_csv(Path("all.csv"), robomme), expected=Expected.BENCHMARK, paper=True
+    )
     sides = [
         made.write_csv(Path(name), [row for row in robomme if row.system == system])
         for name, system in (("a.csv", BASE), ("b.csv", RETRIEVAL))

@@ -20,7 +20,7 @@ pytest.importorskip("mani_skill", reason="needs the extra sim")
 
 from robomme_interference_data.simulators.base import Observation
 from robomme_interference_data.simulators.tabletop.drawing import PANDA
-from robomme_interference_data.simulators.tabletop.look import PLACES, TALL, WIDE
+from robomme_interference_data.simulators.tabletop.scene_shift import PLACES, TALL, WIDE
 from robomme_interference_data.simulators.tabletop.simulator import TabletopSimulator
 
 EPISODE = "MoveCube/test/2"

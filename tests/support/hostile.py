@@ -110,7 +110,7 @@ def _dataset(root: Path) -> None:
     dataset = Dataset(LocalFiles(root / "buffer_set/demonstrations"))
     for index, record in zip(range(_MOST_LISTED), dataset.records(), strict=False):
         assert dataset.index_of(record.episode_id) in range(len(dataset))
-        assert dataset.lerobot.place(index).length == record.length
+        assert dataset.lerobot.locate(index).length == record.length
     for camera in dataset.cameras:
         [frame] = dataset.iter_frames(0, camera, 0, 1)
         assert frame.shape == dataset.shape(camera)

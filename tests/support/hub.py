@@ -71,7 +71,7 @@ def push_buffer_set(
     shutil.copytree(root / "manifests", work / "manifests")
     header = read_header(root / MANIFEST_PATH, ManifestHeader)
     places = {DEMONSTRATIONS: f"{BASE}@{base}", DISTRACTORS: "."}
-    datasets = {name: replace(one, place=places[name]) for name, one in header.datasets.items()}
+    datasets = {name: replace(one, location=places[name]) for name, one in header.datasets.items()}
     write_json(work / MANIFEST_PATH, to_dict(replace(header, datasets=datasets)))
     commit = hub.push(f"datasets/{name}", work, "data-1.0.0")
     hub.push(f"datasets/{name}", work)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.score import commands
-from robomme_interference_data.evaluate.score.config import Against, Grid, Settings
+from robomme_interference_data.evaluate.score.config import Against, Expected, Settings
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.score.scoring import score as compute
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
@@ -188,11 +188,15 @@ def released(path: Path, lines: Sequence[str]) -> Path:
 
 
 def score(
-    *paths: Path, grid: Grid = Grid.GIVEN, paper: bool = False, draws: int = 200, **options: Any
+    *paths: Path,
+    expected: Expected = Expected.OBSERVED,
+    paper: bool = False,
+    draws: int = 200,
+    **options: Any,
 ) -> Score:
     """Score rows; by their own grid and with few draws, unless it is said otherwise."""
     against = Against.PAPER if paper else None
-    return compute(Settings(paths, grid=grid, against=against, **options), draws)
+    return compute(Settings(paths, expected=expected, against=against, **options), draws)
 
 
 def records(found: Score, table: str, **equal: Any) -> list[dict[str, Any]]:

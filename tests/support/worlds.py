@@ -108,8 +108,8 @@ class World:
     def subgoal(self) -> Subgoal:
         return Subgoal(f"go on from step {self.steps} to <point>", ((self.steps, 7),))
 
-    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
-        return self.act("obey")
+    def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        return self.act("follow-subgoals")
 
     def close(self) -> None:
         pass

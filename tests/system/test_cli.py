@@ -148,7 +148,7 @@ def test_known_errors(arguments: str, words: tuple[str, ...], run: Run, tiny_buf
         "simulate --family MoveCube --video S/distractors/meta/look.mp4",
         f"retrieve S {EPISODE} k3 --out S/manifests/why.png",
         "retrieval-score S --out S/distractors",
-        "evaluate S --policy hold --out S/demonstrations/run",
+        "evaluate S --policy noop --out S/demonstrations/run",
         "merge a b --out S/manifests/run",
         "score a --out S/distractors/score",
         "score a --out score --export S/demonstrations",

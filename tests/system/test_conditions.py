@@ -94,12 +94,12 @@ def test_rollouts_and_scores_of_other_kinds(buffer_set: Path, run: Run, tmp_path
         (32, 0),
     ]
     out = tmp_path / "score"
-    code, _, err = run("score", tmp_path / "run", "--grid", "given", "--out", out)
+    code, _, err = run("score", tmp_path / "run", "--expected", "observed", "--out", out)
     assert code == 0, err
     assert "before-k1" in (out / "report.html").read_text()
 
 
-FURTHER = ("raw-k1", "stale-k1", "misled-k0")
+OPTIONAL_DATASETS = ("raw-k1", "stale-k1", "misled-k0")
 NEEDED = ("distractors-raw", "contradictions")
 
 
@@ -113,7 +113,15 @@ def test_further_datasets_go_to_the_hub_and_back(
     root, sources = tmp_path / "buffer_set", ("--source", "sample", "--workers", "1")
     wanted = ("--split", "test", "--families", "MoveCube", "--cameras", "front")
     code, _, err = run(
-        *("build", "all", root, *sources, *wanted, "--conditions", ",".join(("k1", *FURTHER))),
+        *(
+            "build",
+            "all",
+            root,
+            *sources,
+            *wanted,
+            "--conditions",
+            ",".join(("k1", *OPTIONAL_DATASETS)),
+        ),
         *("--unit-episodes", "0"),
     )
     assert code == 0, err
@@ -139,7 +147,7 @@ def test_further_datasets_go_to_the_hub_and_back(
     publish(root)
     there = load_buffer_set(UNITS)
     assert there.revision == here.revision
-    for name in ("k1", *FURTHER):
+    for name in ("k1", *OPTIONAL_DATASETS):
         buffer = there.load(QUERY, name, verify=True)
         assert (buffer.frames() == here.load(QUERY, name).frames()).all()
     assert list(verify_buffer_set(there)) == []

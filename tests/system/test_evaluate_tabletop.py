@@ -84,8 +84,8 @@ def test_who_obeys_reaches_the_oracle_with_its_subgoals_and_the_guess_without(
         rows = run_evaluation(RunConfig(policy, buffer_set, out, subgoals=subgoals, workers=2)).rows
         return {(row.family, row.condition): (row.status, row.steps) for row in rows}
 
-    obeyed, guessed = ended("obey", "oracle"), ended("guess")
+    obeyed, guessed = ended("follow-subgoals", "oracle"), ended("guess")
     assert {condition for _, condition in obeyed} == {"no-history", "k0", "k1"}
     assert {status for status, _ in obeyed.values()} == {"success"}
-    assert ended("obey") == guessed  # the floor, to the very step
+    assert ended("follow-subgoals") == guessed  # the floor, to the very step
     assert {status for status, _ in guessed.values()} != {"success"}

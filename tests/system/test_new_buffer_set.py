@@ -51,8 +51,8 @@ def test_a_buffer_set_for_published_demonstrations(
     assert "publish" in err
     buffer_set = load_buffer_set(out)
     assert (
-        buffer_set.header.datasets["demonstrations"].place
-        == buffer_set.place("demonstrations").location
+        buffer_set.header.datasets["demonstrations"].location
+        == buffer_set.dataset_files("demonstrations").location
     )
     buffer = buffer_set.load("MoveCube/test/0", "k2", verify=True)
     assert {one.family for one in buffer.sessions[1:]} == {*FAMILIES}

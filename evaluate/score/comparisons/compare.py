@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
-from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import Outcomes, outcomes_of
 from robomme_interference_data.evaluate.score.rows.reading import Rows, read_rows
 from robomme_interference_data.evaluate.score.rows.values import unshifted
@@ -149,7 +149,7 @@ def _sides(rows: Rows) -> _Sides:
     """Return the systems of a run by simulator and name, in the order of tables."""
     return {
         (simulator, system): _Side(outcomes, system)
-        for simulator, outcomes in outcomes_of(rows, Grid.GIVEN).items()
+        for simulator, outcomes in outcomes_of(rows, Expected.OBSERVED).items()
         for system in outcomes.systems
     }
 

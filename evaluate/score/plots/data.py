@@ -43,7 +43,7 @@ class Data:
         contrasts: The comparisons of the systems that have rows.
         flips: Share of outcomes that differ between repeats; None without repeats.
         apart: Condition and two systems that can be told apart under it.
-        access: The rows of the table `access`, without the simulator.
+        by_evidence_kept: The rows of that table, without the simulator.
         chance: Part of the episodes, or empty for all, to the share that guessing has: of those
             that are all questions, as most episodes have it.
     """
@@ -61,8 +61,10 @@ class Data:
             for one in (score.tables["matrix"].records() if "matrix" in score.tables else ())
             if one["simulator"] == simulator and one["p_holm"] < ALPHA
         }
-        access = score.tables.get("access")
-        self.access = [row[1:] for row in access.rows if row[0] == simulator] if access else []
+        access = score.tables.get("by_evidence_kept")
+        self.by_evidence_kept = (
+            [row[1:] for row in access.rows if row[0] == simulator] if access else []
+        )
         asked = sorted((one for one in found if one.chance >= 0), key=lambda one: one.n)
         self.chance = {one.part: one.chance for one in asked}
         bases = [b for s in self.systems if (b := base_of(s)) and b not in self.systems]

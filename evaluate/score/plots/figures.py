@@ -41,7 +41,7 @@ FIGURES = {
     "retrieval": "Retrieval against the same system without it",
     "kinds": "Success by condition, kind by kind",
     "interference": "What kind of interference hurts",
-    "access": "Success where all, some or none of the evidence was kept",
+    "by_evidence_kept": "Success where all, some or none of the evidence was kept",
     "ceiling": "Gap to the ideal observer with the same memory",
     "matrix": "Which systems can be told apart",
 }
@@ -71,7 +71,14 @@ def draw_figure(kind: str, figure: Any, data: Data) -> bool:
     """Draw one of `FIGURES`, and tell whether there is data for it."""
     drawers = (
         *(forests.effects, _success, _families, _difficulty, forests.retention, _heatmap),
-        *(_retrieval, _kinds, forests.interference, forests.access, forests.ceiling, _matrix),
+        *(
+            _retrieval,
+            _kinds,
+            forests.interference,
+            forests.by_evidence_kept,
+            forests.ceiling,
+            _matrix,
+        ),
     )
     shown = data if kind in _ALL_KINDS else data.of(_PAPER)
     figure.set_layout_engine("constrained")

@@ -175,10 +175,10 @@ def retention(figure: Any, data: Data) -> bool:
     return True
 
 
-def access(figure: Any, data: Data) -> bool:
+def by_evidence_kept(figure: Any, data: Data) -> bool:
     """Draw success where all, some and none of the evidence was kept, system by system."""
     names = {one.name for one in data.conditions}
-    rows = [row for row in data.access if row[1] in names]
+    rows = [row for row in data.by_evidence_kept if row[1] in names]
     systems = list(dict.fromkeys(row[0] for row in rows))
     if not systems:
         return False

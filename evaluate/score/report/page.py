@@ -17,7 +17,7 @@ import numpy as np
 from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.run.log import RunHeader
 from robomme_interference_data.evaluate.score.comparisons.contrast import START
-from robomme_interference_data.evaluate.score.config import Grid
+from robomme_interference_data.evaluate.score.config import Expected
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, success
 from robomme_interference_data.evaluate.score.plots.data import FEW
 from robomme_interference_data.evaluate.score.plots.figures import FIGURES
@@ -39,13 +39,17 @@ _SHOWN_IN = {
     **{"families": ("family", "paper_family"), "heatmap": ("family",)},
     **{"difficulty": ("difficulty",), "retention": ("lift",)},
     **{"retrieval": ("effects", "family"), "kinds": ("main",), "interference": ("interference",)},
-    **{"access": ("access",), "ceiling": ("ceiling",), "matrix": ("matrix", "systems", "ranks")},
+    **{
+        "by_evidence_kept": ("by_evidence_kept",),
+        "ceiling": ("ceiling",),
+        "matrix": ("matrix", "systems", "ranks"),
+    },
 }
 """Figure to the tables that have its numbers."""
 
 _GRIDS = {
-    Grid.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
-    Grid.GIVEN: "those that any of the given rows is of",
+    Expected.BENCHMARK: "the benchmark's: nine families, test episodes 0 to 49 each",
+    Expected.OBSERVED: "those that any of the given rows is of",
 }
 
 
@@ -214,7 +218,7 @@ def _facts(score: Score, command: str | None) -> dict[str, list[str]]:
         **call,
         "scored with": versions(),
         "rows": f"{len(rows):,}",
-        "episodes of a complete cell": _GRIDS[settings.grid],
+        "episodes of a complete cell": _GRIDS[settings.expected],
         "bootstrap": f"{score.draws:,} draws, seeded by the simulator, clustered by episode",
         "model seeds": ", ".join(map(str, seeds[:20])) if len(seeds) > 1 else "",
         **{

@@ -43,7 +43,7 @@ def access_table(every: Iterable[Outcomes]) -> Table:
                     cell = (outcomes.simulator, outcomes.systems[s], outcomes.conditions[c], name)
                     rows.append((*cell, rate.n, rate.value, *rate.interval))
     return Table.make(
-        "access",
+        "by_evidence_kept",
         "Success by the evidence that was kept",
         "simulator system condition kept n:count rate:rate low:rate high:rate",
         rows,

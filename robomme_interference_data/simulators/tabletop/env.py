@@ -31,10 +31,10 @@ from .drawing import PANDA, SHADER, draw_low_polygon
 from .episodes import difficulty_of, turn_of
 from .families import draw_episode
 from .kit import Kit
-from .look import Look
 from .motion import BASE, Arm, Point, Script
-from .obeying import Obeying
 from .renderer import make_renderer
+from .scene_shift import SceneShift
+from .subgoal_follower import SubgoalFollower
 
 _POSSIBLE: dict[str, tuple[Any, ...]] = {
     "num_envs": (1,),
@@ -115,7 +115,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.arm = Arm(self.agent.robot._objs[0], self.episode.pace, self.episode.stick)
         self.status = Status.ONGOING
         self._scripts: dict[str, Script] = {}
-        self._obeying: Obeying | None = None
+        self._follower: SubgoalFollower | None = None
         self._rest()
 
     def _after_control_step(self) -> None:
@@ -151,7 +151,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         observed, info = super().reset(seed=number, options=options)
         if self.drawing:
             cameras = {name: self._camera(name) for name in CAMERAS}
-            self._look = Look(self.scene.sub_scenes[0], cameras, number)
+            self._scene_shift = SceneShift(self.scene.sub_scenes[0], cameras, number)
         if self.demonstrating:
             info["demonstration"] = self._demonstrate()
             if self.shift is not None:
@@ -185,15 +185,15 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         step = self.episode.step(self.answer, min(self.episode.progress(), last))
         return Subgoal(step.text, self.to_pixels(step.at))
 
-    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
-        """Return the next action of a script that obeys, `(8,) float32`; see `Simulator.obey`."""
-        if self._obeying is None:
+    def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        """Return the next action of a script that obeys, `(8,) float32`; see `Simulator.follow_subgoal`."""
+        if self._follower is None:
             if subgoal is None:
                 return self.act("guess")
             self.arm.reset()
             answers = self.episode.shuffled(self.number)
-            self._obeying = Obeying(self.episode, self.arm, answers, self.to_pixels)
-        self._obeying.act(subgoal)
+            self._follower = SubgoalFollower(self.episode, self.arm, answers, self.to_pixels)
+        self._follower.act(subgoal)
         return self.arm.action.copy()
 
     def to_pixels(self, points: Sequence[Point]) -> tuple[Pixel, ...]:
@@ -217,7 +217,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def show(self, shift: Shift | None) -> None:
         """Let the scene look as under a shift from now on; None as it was built."""
         if self.drawing:
-            self._look.show(shift)
+            self._scene_shift.show(shift)
 
     def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
         """Return the view of a camera, front by default, `(1, 256, 256, 3) uint8` RGB."""

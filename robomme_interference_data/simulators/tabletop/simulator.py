@@ -86,10 +86,10 @@ class TabletopSimulator(Simulator):
         self._running()
         return self.env.subgoal()
 
-    def obey(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
-        """Return the next action of the script that obeys; see `Simulator.obey`."""
+    def follow_subgoal(self, subgoal: Subgoal | None) -> NDArray[np.float32]:
+        """Return the next action of the script that obeys; see `Simulator.follow_subgoal`."""
         self._running()
-        return self.env.obey(subgoal)
+        return self.env.follow_subgoal(subgoal)
 
     def views(self, shifts: Iterable[Shift]) -> Iterator[Observation]:
         """Yield what is seen now as under each of several shifts; see `Simulator.views`."""

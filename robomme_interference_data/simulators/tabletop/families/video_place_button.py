@@ -8,7 +8,6 @@ from typing import ClassVar
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
 from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
@@ -18,13 +17,14 @@ from robomme_interference_data.simulators.tabletop.stage import (
     row,
     shuffled,
 )
+from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 
 RADIUS = 0.035  # m, of a target
 OPEN = 0.03  # m, way of a finger that holds nothing
 WHEN = ("before", "after")
 
 
-class PlaceFamily(ExchangeFamily):
+class PlaceFamily(SwapFamily):
     """Cubes, targets that look alike, and a goal to place one cube on the right target.
 
     When hard, the targets change places after the demonstration, in pairs, until each is elsewhere.
@@ -104,7 +104,7 @@ class PlaceFamily(ExchangeFamily):
             cube.restore()
         self.showing = ()
         yield from arm.wait(15)
-        yield from self.exchange(arm, [[target] for target in self.targets], len(self.times))
+        yield from self.swap(arm, [[target] for target in self.targets], len(self.times))
 
     def steps(self) -> int:
         return 2

@@ -3,18 +3,18 @@
 from numpy.random import RandomState
 
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
 from robomme_interference_data.simulators.tabletop.family import Option, Step
 from robomme_interference_data.simulators.tabletop.kit import CUBE, Kit
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
 from robomme_interference_data.simulators.tabletop.stage import push_down, row
+from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 
 LIFTED = 0.06  # m, height of the cube's middle
 OPEN = 0.03  # m, way of a finger that holds nothing
 TIMES = ("once", "twice, putting it down in between", "three times, putting it down in between")
 
 
-class VideoRepick(ExchangeFamily):
+class VideoRepick(SwapFamily):
     """The arm picks one of several cubes; pick the same one again, n times, then press the button.
 
     Easy: three cubes, each of its own colour. Medium: five of the same colour. Hard: they change
@@ -61,7 +61,7 @@ class VideoRepick(ExchangeFamily):
         for cube in self.cubes:
             cube.restore()
             cube.hold(True)
-        yield from self.exchange(arm, [[cube] for cube in self.cubes], 1)
+        yield from self.swap(arm, [[cube] for cube in self.cubes], 1)
 
     def lift(self, arm: Arm, number: int) -> Script:
         """Pick a cube up and put it down where it was."""

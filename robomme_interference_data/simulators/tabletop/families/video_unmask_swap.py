@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 from numpy.random import RandomState
 
-from robomme_interference_data.simulators.tabletop.exchange import ExchangeFamily
 from robomme_interference_data.simulators.tabletop.kit import Body
 from robomme_interference_data.simulators.tabletop.motion import Arm, Script
+from robomme_interference_data.simulators.tabletop.swaps import SwapFamily
 
 from .video_unmask import VideoUnmask
 
 
-class VideoUnmaskSwap(ExchangeFamily, VideoUnmask):
+class VideoUnmaskSwap(SwapFamily, VideoUnmask):
     """As VideoUnmask, then containers change places in pairs, once, twice or three times.
 
     Of three containers one stays, whatever it hides; of four and five each ends elsewhere.
@@ -27,7 +27,7 @@ class VideoUnmaskSwap(ExchangeFamily, VideoUnmask):
     def demonstrate(self, arm: Arm, answer: Sequence[int]) -> Script:
         yield from super().demonstrate(arm, answer)
         groups = [self.group(number) for number in range(len(self.shells))]
-        yield from self.exchange(arm, groups, 1)
+        yield from self.swap(arm, groups, 1)
         yield from arm.wait(10)
 
     def group(self, number: int) -> list[Body]:

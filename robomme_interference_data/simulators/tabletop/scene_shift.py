@@ -47,7 +47,7 @@ _PAINTS: tuple[Colour, ...] = (
 )
 
 
-class Look:
+class SceneShift:
     """The looks of one scene, as it was built or under a shift.
 
     Args:

@@ -35,7 +35,7 @@ def obeyed(
             subgoal = told(simulator.subgoal())
             text = subgoal.simple if subgoal else ""
             heard += [text] * (text not in heard[-1:])
-        _, status = simulator.step(simulator.obey(subgoal), observe=False)
+        _, status = simulator.step(simulator.follow_subgoal(subgoal), observe=False)
         steps += 1
     return status, heard
 
@@ -67,7 +67,7 @@ def test_the_steps_are_told_in_order(blind: TabletopSimulator) -> None:
 @pytest.mark.parametrize("family", families("MoveCube"))
 def test_untold_it_does_what_guess_does(blind: TabletopSimulator, family: str) -> None:
     actions = []
-    for act in (lambda: blind.obey(None), lambda: blind.act("guess")):
+    for act in (lambda: blind.follow_subgoal(None), lambda: blind.act("guess")):
         blind.reset(f"{family}/test/1", demonstration=False)
         actions.append([])
         for _ in range(40):
@@ -100,11 +100,11 @@ def test_words_alone_leave_it_to_the_seed_which_thing_is_meant(blind: TabletopSi
 
 def test_what_is_not_understood_leaves_it_where_it_is(blind: TabletopSimulator) -> None:
     blind.reset("VideoUnmask/test/0", demonstration=False)
-    home = blind.obey(Subgoal("sing a song at <point>", ((3, 3),)))
+    home = blind.follow_subgoal(Subgoal("sing a song at <point>", ((3, 3),)))
     for _ in range(20):
         blind.step(home, observe=False)
-        assert np.array_equal(blind.obey(Subgoal("sing louder")), home)
-    assert not np.array_equal(blind.obey(blind.subgoal()), home)
+        assert np.array_equal(blind.follow_subgoal(Subgoal("sing louder")), home)
+    assert not np.array_equal(blind.follow_subgoal(blind.subgoal()), home)
 
 
 def test_a_thing_that_is_named_wrongly_is_taken(blind: TabletopSimulator) -> None:
@@ -116,7 +116,7 @@ def test_a_thing_that_is_named_wrongly_is_taken(blind: TabletopSimulator) -> Non
     told = Subgoal(wrong.text, blind.env.to_pixels(wrong.at))
     status = Status.ONGOING
     while status is Status.ONGOING:
-        _, status = blind.step(blind.obey(told), observe=False)
+        _, status = blind.step(blind.follow_subgoal(told), observe=False)
     assert status is Status.FAIL
 
 

@@ -15,7 +15,7 @@ from .stage import exchanges, shuffled, swap
 Pair = tuple[int, int]
 
 
-class ExchangeFamily(Family):
+class SwapFamily(Family):
     """A family whose answer is one of several things, or several of them, by their numbers.
 
     They may change places in pairs once the answer was shown. Then each exchange is a part to be
@@ -36,7 +36,7 @@ class ExchangeFamily(Family):
         """Choose what changes places."""
         self.swaps = exchanges(shuffled(rng, self.count))
 
-    def exchange(self, arm: Arm, groups: Sequence[Sequence[Body]], first: int) -> Script:
+    def swap(self, arm: Arm, groups: Sequence[Sequence[Body]], first: int) -> Script:
         """Let groups of bodies change places; the first exchange is the part `first`."""
         for part, pair in enumerate(self.swaps, first):
             self.showing = (part,)

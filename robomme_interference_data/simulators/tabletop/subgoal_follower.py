@@ -16,7 +16,7 @@ _NEAR = 0.6  # of difflib's ratio: wordings that may mean the same
 _HIGH = 0.20  # m, above all that stands on the table
 
 
-class Obeying:
+class SubgoalFollower:
     """Does what it is told in one episode, a time step at a time.
 
     A subgoal names those answers of which a step has its words, the step of now before others,
